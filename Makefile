@@ -1,0 +1,51 @@
+# Every target makes its own .venv when there is none and installs what it needs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out
+TORCH := torch==2.13.0
+SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
+
+.PHONY: help install demo test check docs format clean metaworld
+
+help:  ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+$(BIN)/vlatool: pyproject.toml
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,sim,text]'
+	@touch $@
+
+install: $(BIN)/vlatool  ## install vlatool with what the demo needs
+
+$(VENV)/.dev: $(BIN)/vlatool
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,sim,text,dev]'
+	@touch $@
+
+demo: $(BIN)/vlatool  ## optimise the sample policy vln-babyai for a Raspberry Pi 5, with a report
+	$(BIN)/vlatool optimize sample_models/vln-babyai --profile raspberry-pi-5 --max-drop 1% -o $(OUT)/vln-babyai --force
+
+metaworld: $(BIN)/vlatool  ## install what the sample policy vla-metaworld needs
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,metaworld]'
+	@ldconfig -p | grep -q libEGL.so.1 || apt-get install -y -qq $(SYSTEM_PACKAGES) || \
+	  echo "headless rendering needs the system packages $(SYSTEM_PACKAGES)"
+
+test: $(VENV)/.dev  ## run the tests with coverage
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto
+
+check: $(VENV)/.dev  ## lint, format, types, layers, docs equal code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python docs/generate.py --check
+
+docs: $(VENV)/.dev  ## write docs/reference from the code
+	$(BIN)/python docs/generate.py
+
+format: $(VENV)/.dev  ## format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove what the targets made
+	rm -rf $(VENV) $(OUT) .pytest_cache .mypy_cache .ruff_cache .coverage*

@@ -1,0 +1,122 @@
+"""Write ``docs/reference/`` from the code; ``--check`` fails when the pages and the code differ.
+
+Usage: python docs/generate.py [--check]
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from vlatool import errors, manifest, registry, report, spec
+from vlatool.profile import load_profile, names
+from vlatool.stage import Stage, stage_kinds
+
+REFERENCE = Path(__file__).parent / "reference"
+NOTE = "<!-- written by docs/generate.py from the code; do not edit -->\n"
+
+
+def main() -> None:
+    """Write the pages, or compare them with what the code says."""
+    pages = {
+        "stages.md": stages_page(),
+        "command-line.md": command_line_page(),
+        "manifest.md": fields_page("manifest.json", [manifest.Manifest, spec.PolicySpec, spec.TensorSpec,
+                                                     manifest.ProgramStep, manifest.Graph]),
+        "report.md": fields_page("report.json", [report.Report, report.Row, report.Measurement]),
+        "errors.md": errors_page(),
+        "profiles.md": profiles_page(),
+    }  # fmt: skip
+    if "--check" not in sys.argv:
+        REFERENCE.mkdir(exist_ok=True)
+        for name, text in pages.items():
+            (REFERENCE / name).write_text(NOTE + text, encoding="utf-8")
+        return
+    stale = [name for name, text in pages.items() if _read(REFERENCE / name) != NOTE + text]
+    if stale:
+        sys.exit(f"docs/reference differs from the code in {', '.join(stale)}; run: make docs")
+    print(f"docs/reference equals the code ({len(pages)} pages)")
+
+
+def stages_page() -> str:
+    """Return a section for each stage: what it does and its options."""
+    parts = ["# Stages\n\nEach is one file, `vlatool/<kind>/<name>.py`; a recipe names it `kind.name`.\n"]
+    for kind in stage_kinds():
+        for name in registry.names(kind):
+            stage: type[Stage] = registry.load(kind, name)
+            parts.append(f"## {stage.name()}\n\n{inspect.cleandoc(stage.__doc__ or '')}\n\n{_options(stage)}")
+    return "\n".join(parts)
+
+
+def _options(stage: type[Stage]) -> str:
+    rows = ["| option | type | default | meaning |", "|---|---|---|---|"]
+    for name, field in stage.model_fields.items():
+        kind = str(field.annotation).replace("typing.", "").replace("pathlib._local.", "").replace("pathlib.", "")
+        kind = kind.removeprefix("<class '").removesuffix("'>").replace("|", "or")
+        default = "required" if field.is_required() else f"`{field.default!r}`"
+        rows.append(f"| `{name}` | {kind} | {default} | {field.description or ''} |")
+    return "\n".join(rows) + "\n"
+
+
+def command_line_page() -> str:
+    """Return the help of every command."""
+    os.environ.update({"COLUMNS": "100", "TERMINAL_WIDTH": "100", "NO_COLOR": "1", "TERM": "dumb"})
+    import typer
+    from typer.testing import CliRunner
+
+    from vlatool.cli import app
+
+    command = typer.main.get_command(app)
+    runner = CliRunner()
+    parts = ["# Command line\n"]
+
+    def visit(words: list[str], current: Any) -> None:
+        text = runner.invoke(app, [*words, "--help"], prog_name="vlatool").output
+        title = " ".join(["vlatool", *words])
+        parts.append(f"## {title}\n\n```\n{text.strip()}\n```\n")
+        lister = getattr(current, "list_commands", None)
+        for name in lister(None) if lister else []:
+            visit([*words, name], current.get_command(None, name))
+
+    visit([], command)
+    return "\n".join(parts)
+
+
+def fields_page(title: str, classes: list[Any]) -> str:
+    """Return a table of the fields of dataclasses, with their docstrings."""
+    parts = [f"# {title}\n"]
+    for kind in classes:
+        rows = ["| key | type | default |", "|---|---|---|"]
+        for field in dataclasses.fields(kind):
+            default = "required"
+            if field.default is not dataclasses.MISSING:
+                default = f"`{field.default!r}`"
+            elif field.default_factory is not dataclasses.MISSING:
+                default = f"`{field.default_factory()!r}`"
+            rows.append(f"| `{field.name}` | {str(field.type).replace('|', 'or')} | {default} |")
+        parts.append(f"## {kind.__name__}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n\n" + "\n".join(rows) + "\n")
+    return "\n".join(parts)
+
+
+def errors_page() -> str:
+    """Return the tree of errors and the exit codes."""
+    return f"# Errors and exit codes\n\n```\n{inspect.cleandoc(errors.__doc__ or '')}\n```\n\n130: interrupted.\n"
+
+
+def profiles_page() -> str:
+    """Return a row for each shipped profile."""
+    rows = ["# Hardware profiles\n", "| name | board |", "|---|---|"]
+    rows += [f"| `{name}` | {load_profile(name).title} |" for name in names()]
+    return "\n".join(rows) + "\n\nEvery figure with its source: `vlatool profiles show NAME`.\n"
+
+
+def _read(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+if __name__ == "__main__":
+    main()

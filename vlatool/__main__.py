@@ -1,0 +1,5 @@
+"""``python -m vlatool``."""
+
+from vlatool.cli import main
+
+main()

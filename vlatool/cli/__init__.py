@@ -1,0 +1,90 @@
+"""The command line: parse, call, render; no logic."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from vlatool import __version__
+from vlatool.cli._stages import StageGroup
+from vlatool.cli.compare import compare
+from vlatool.cli.doctor import doctor
+from vlatool.cli.inspect import inspect
+from vlatool.cli.optimize import optimize
+from vlatool.cli.profiles import app as profiles
+from vlatool.cli.samples import app as samples
+from vlatool.errors import VlatoolError
+
+INTERRUPTED = 130
+OUR_BUG = 70
+
+app = typer.Typer(
+    name="vlatool",
+    help="Make a trained robot policy run, fast and safely, on the board that the robot carries.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"vlatool {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Make a trained robot policy run, fast and safely, on the board that the robot carries."""
+
+
+app.command("optimize")(optimize)
+for _kind, _text in (
+    ("export", "Turn a policy into a bundle with graphs that ONNX Runtime was seen to run."),
+    ("quantize", "Make a bundle of lower precision."),
+    ("benchmark", "Measure latency and memory through the runtime."),
+    ("evaluate", "Measure accuracy, on recordings or in the closed loop."),
+):
+    app.add_typer(typer.Typer(cls=StageGroup, help=_text, rich_markup_mode=None), name=_kind)
+app.command("compare")(compare)
+app.command("inspect")(inspect)
+app.command("doctor")(doctor)
+app.add_typer(profiles, name="profiles")
+app.add_typer(samples, name="samples")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit.
+
+    0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
+    """
+    try:
+        app(arguments)
+    except VlatoolError as error:
+        typer.echo(f"error: {error.message}", err=True)
+        if error.fix:
+            typer.echo(f"  fix: {error.fix}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        typer.echo("interrupted; finished stages are kept", err=True)
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except MemoryError:
+        typer.echo("error: out of memory.\n  fix: use a machine with more memory, or a smaller policy", err=True)
+        sys.exit(3)
+    except Exception as error:
+        if os.environ.get("VLATOOL_DEBUG"):
+            raise
+        typer.echo(f"internal error: {type(error).__name__}: {error}", err=True)
+        typer.echo("  fix: this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback", err=True)
+        sys.exit(OUR_BUG)

@@ -1,0 +1,5 @@
+"""``python -m vlatool.cli``."""
+
+from vlatool.cli import main
+
+main()

@@ -1,0 +1,100 @@
+"""What every command does with the terminal: progress on stderr, results on stdout."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+import typer
+
+from vlatool.bundle import writing
+from vlatool.errors import GateFailed, Inconclusive
+from vlatool.report import Report
+from vlatool.stage import Context, Tell
+
+
+def command_line() -> str:
+    """Return the command as a person would type it."""
+    return shlex.join(["vlatool", *sys.argv[1:]])
+
+
+def default_workers() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+@contextlib.contextmanager
+def progress(workers: int = 1) -> Iterator[Context]:
+    """Yield a context whose progress is shown on stderr: a live bar on a terminal, plain lines elsewhere."""
+    if not sys.stderr.isatty():
+        yield Context(_plain_lines(), workers, command_line())
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def tell(what: str, share: float | None) -> None:
+            bar.update(task, description=what, total=None if share is None else 1.0, completed=share or 0.0)
+
+        yield Context(tell, workers, command_line())
+
+
+def _plain_lines() -> Tell:
+    last = [""]
+
+    def tell(what: str, share: float | None) -> None:
+        kind = re.sub(r"[\d.,%]+", "", what)
+        if kind != last[0]:
+            last[0] = kind
+            typer.echo(f"... {what}", err=True)
+
+    return tell
+
+
+def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False) -> None:
+    """Print a report on stdout, write it to a directory where wanted, and leave with the verdict's exit code.
+
+    Raises:
+        GateFailed: for the verdict ``fail``.
+        Inconclusive: for the verdict ``inconclusive``.
+    """
+    from vlatool.render import render, write_reports
+
+    now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    report = replace(report, command=report.command or command_line(), created=report.created or now)
+    if out is not None:
+        with writing(out, force=force) as draft:
+            write_reports(report, draft)
+    typer.echo(render(report, "json" if as_json else "terminal"), nl=False)
+    if out is not None and not as_json:
+        typer.echo(f"report: {out / 'report.html'}")
+    leave(report)
+
+
+def leave(report: Report) -> None:
+    """Raise for a verdict that is not good.
+
+    Raises:
+        GateFailed: for the verdict ``fail``.
+        Inconclusive: for the verdict ``inconclusive``.
+    """
+    if report.verdict == "fail":
+        raise GateFailed(report.summary[0] if report.summary else "The limits are not kept.")
+    if report.verdict == "inconclusive":
+        raise Inconclusive(report.summary[0] if report.summary else "The samples cannot decide.")

@@ -1,0 +1,102 @@
+"""Run one stage from the command line."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from vlatool.bundle import MANIFEST, Bundle
+from vlatool.cli._console import default_workers, progress, show
+from vlatool.launch import cache_directory, run_transform
+from vlatool.stage import Measure, Transform
+
+
+def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any) -> inspect.Parameter:
+    option = typer.Option(default, *flags, **settings)
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
+
+
+SOURCE_FLAG = inspect.Parameter(
+    "source",
+    inspect.Parameter.KEYWORD_ONLY,
+    default=typer.Argument(..., show_default=False, help="a bundle, a policy directory, path.py:make or an .onnx file"),
+    annotation=str,
+)
+_FORCE = _flag("force", bool, False, "--force", help="replace an output that exists")
+_JSON = _flag("as_json", bool, False, "--json", help="print JSON on stdout")
+TRANSFORM_FLAGS = (
+    _flag("out", Path, ..., "-o", "--output", help="directory of the new bundle", show_default=False),
+    _FORCE,
+    _JSON,
+)
+MEASURE_FLAGS = (
+    _flag("out", Path | None, None, "-o", "--output", help="directory for report.html, report.md and report.json"),
+    _flag("profile", str | None, None, "--profile", help="add predictions for this board (see: vlatool profiles list)"),
+    _flag(
+        "workers",
+        int | None,
+        None,
+        "--workers",
+        min=1,
+        help="processes for closed-loop episodes; all cores if unset",
+    ),
+    _FORCE,
+    _JSON,
+)
+
+
+def is_bundle(source: str) -> bool:
+    """Say whether SOURCE is a bundle rather than a policy to export."""
+    path = Path(source)
+    return (path / MANIFEST).is_file() or (path.exists() and path.is_dir() and not (path / "policy.yaml").is_file())
+
+
+def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool) -> None:
+    """Make a bundle from a bundle, or from a policy that is exported first."""
+    from vlatool.pipeline import exported, sourced
+
+    with progress() as context:
+        if is_bundle(source):
+            bundle = Bundle.open(source)
+        elif stage.kind() == "export":
+            bundle = sourced(source, cache_directory(), context)
+        else:
+            bundle = exported(source, cache_directory(), context)
+        made = run_transform(stage, bundle, out, context, force=force)
+    summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
+    precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
+    if as_json:
+        typer.echo(json.dumps({**summary, "precision": precision}))
+        return
+    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
+    for name, shares in precision.items():
+        typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
+
+
+def measure(
+    stage: Measure, source: str, out: Path | None, profile: str | None, workers: int | None, force: bool, as_json: bool
+) -> None:
+    """Measure a bundle, or a policy that is exported first."""
+    from vlatool.pipeline import exported
+
+    board = None
+    if profile:
+        from vlatool.profile import load_profile
+
+        board = load_profile(profile)
+    with progress(workers or default_workers()) as context:
+        bundle = Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
+        stage.check(bundle, board)
+        report = stage.run(bundle, context)
+    if board is not None:
+        from vlatool.predict import predictions
+
+        first = report.rows[-1] if stage.kind() == "evaluate" else report.rows[0]
+        told = replace(first, measurements=(*first.measurements, *predictions(board, bundle)))
+        report = replace(report, rows=tuple(told if row is first else row for row in report.rows))
+    show(report, as_json=as_json, out=out, force=force)

@@ -1,0 +1,102 @@
+"""One command for each stage of a kind, its flags made from the fields of the stage's class."""
+
+from __future__ import annotations
+
+import inspect
+import types
+import typing
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import typer
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+from typer.core import TyperGroup
+
+from vlatool import registry
+from vlatool.cli import _run
+from vlatool.stage import Measure, Stage, validated
+
+DEFAULTS = {"export": "onnx", "quantize": "static-int8", "benchmark": "latency", "evaluate": "recorded"}
+"""The method that is meant when a command names none."""
+
+
+class StageGroup(TyperGroup):
+    """A group whose commands are the files of its kind; each is imported only when it is named."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the methods of this kind."""
+        return [name.replace("_", "-") for name in registry.names(self.name or "")]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Build the command of one method."""
+        if cmd_name.replace("_", "-") not in self.list_commands(ctx):
+            return None
+        stage = registry.load(self.name or "", cmd_name)
+        single = typer.Typer(add_completion=False, rich_markup_mode=None)
+        single.command(cmd_name, help=stage.__doc__)(stage_function(stage))
+        command = typer.main.get_command(single)
+        command.name = cmd_name
+        return command
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the default method when the first word is not a method."""
+        known = self.list_commands(ctx)
+        if args and args[0] not in ("--help",) and args[0].replace("_", "-") not in known:
+            args = [DEFAULTS[self.name or ""], *args]
+        return super().parse_args(ctx, args)
+
+
+def stage_function(stage: type[Stage]) -> Callable[..., None]:
+    """Return a function whose signature has SOURCE, the stage's fields and the common flags."""
+    own = {name: _parameter(name, field) for name, field in stage.model_fields.items()}
+    measures = issubclass(stage, Measure)
+    common = _run.MEASURE_FLAGS if measures else _run.TRANSFORM_FLAGS
+
+    def command(**given: Any) -> None:
+        options = {name: given.pop(name) for name in own}
+        chosen = {name: value for name, value in options.items() if not _unset(value, stage.model_fields[name])}
+        built = validated(stage, chosen, f"vlatool {stage.kind()} {registry_name(stage)}")
+        if measures:
+            _run.measure(typing.cast(Measure, built), **given)
+        else:
+            _run.transform(typing.cast(Any, built), **given)
+
+    parameters = [_run.SOURCE_FLAG, *own.values(), *common]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+def registry_name(stage: type[Stage]) -> str:
+    """Return the method's name as typed on the command line."""
+    return stage.__module__.rpartition(".")[2].replace("_", "-")
+
+
+def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
+    annotation: Any = field.annotation
+    default = field.get_default()
+    if typing.get_origin(annotation) is tuple:
+        annotation = list.__class_getitem__(typing.get_args(annotation)[0])
+        default = list(default or ())
+    elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        annotation = typing.Optional[next(arm for arm in typing.get_args(annotation) if arm is not type(None))]  # noqa: UP045
+    flag = f"--{name.replace('_', '-')}"
+    flags = (f"{flag}/--no-{flag[2:]}",) if annotation is bool else (flag,)
+    required = default is PydanticUndefined
+    option = typer.Option(
+        ... if required else default, *flags, help=field.description, show_default=not isinstance(default, list)
+    )
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
+
+
+def _unset(value: Any, field: FieldInfo) -> bool:
+    """An empty list means that a repeatable flag was not given."""
+    return isinstance(value, list) and not value and not field.is_required()
+
+
+def path_argument(name: str, help_text: str) -> inspect.Parameter:
+    """Return a positional path."""
+    argument = typer.Argument(..., help=help_text, show_default=False)
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=argument, annotation=Path)

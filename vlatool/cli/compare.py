@@ -1,0 +1,48 @@
+"""``vlatool compare``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlatool.bundle import MANIFEST, Bundle
+from vlatool.cli._console import progress, show
+from vlatool.errors import UsageError
+
+
+def compare(
+    paths: Annotated[
+        list[Path], typer.Argument(help="two or more bundles, or two or more reports", show_default=False)
+    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    iterations: Annotated[int, typer.Option(min=20, help="timed inferences of each bundle")] = 200,
+    threads: Annotated[int, typer.Option(min=1, help="intra-op threads")] = 1,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Compare bundles in one interleaved run, or put reports side by side. The first is the baseline."""
+    from vlatool.benchmark.latency import Latency
+    from vlatool.report import Report, read_report
+
+    if len(paths) < 2:
+        raise UsageError("compare needs two or more bundles, or two or more reports.")
+    bundles = [(path / MANIFEST).is_file() for path in paths]
+    if all(bundles):
+        with progress() as context:
+            stage = Latency(against=tuple(paths[1:]), iterations=iterations, threads=threads)
+            stage.check(None, None)
+            report = replace(stage.run(Bundle.open(paths[0]), context), kind="compare")
+    elif any(bundles):
+        raise UsageError("compare takes bundles or reports, not both at once.")
+    else:
+        reports = [read_report(path) for path in paths]
+        rows = [
+            replace(row, name=f"{path}: {row.name}")
+            for path, each in zip(paths, reports, strict=True)
+            for row in each.rows
+        ]
+        report = Report("compare", "Reports side by side", rows=tuple(rows), environment=reports[0].environment)
+    show(report, as_json=as_json, out=output, force=force)

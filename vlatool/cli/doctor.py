@@ -1,0 +1,24 @@
+"""``vlatool doctor``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
+    """Say what this machine has: engines, instruction sets, telemetry, clocks, missing extras; and how to mend it."""
+    from vlatool.doctor import diagnose
+
+    checks = diagnose()
+    if as_json:
+        typer.echo(json.dumps([asdict(check) for check in checks]))
+        return
+    marks = {"ok": "ok     ", "warn": "warn   ", "missing": "missing"}
+    for check in checks:
+        typer.echo(f"{marks[check.status]} {check.name}: {check.finding}")
+        if check.fix and check.status != "ok":
+            typer.echo(f"          fix: {check.fix}")

@@ -1,0 +1,77 @@
+"""``vlatool optimize``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlatool.cli._console import default_workers, leave, progress
+from vlatool.errors import UsageError
+
+
+def optimize(
+    source: Annotated[str, typer.Argument(help="policy directory, path.py:make or .onnx file", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
+    profile: Annotated[
+        str, typer.Option(help="board to optimise for (see: vlatool profiles list)", show_default=False)
+    ],
+    max_drop: Annotated[str, typer.Option(help="largest drop against float32: 1%, or 0.01")] = "1%",
+    hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
+    recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
+    episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
+    iterations: Annotated[int | None, typer.Option(min=20, help="timed inferences of each candidate (200)")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="threads while timing (1)")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes for episodes; all cores if unset")] = None,
+    cache: Annotated[Path | None, typer.Option(help="where finished stages are kept")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON on stdout")] = False,
+) -> None:
+    """Export a policy, quantize it in several ways, measure and evaluate each, and keep the fastest inside the budget.
+
+    Exits 0 when a candidate keeps to the limits, 1 when none does (the nearest one is kept).
+    """
+    from vlatool import pipeline
+    from vlatool.launch import cache_directory
+    from vlatool.profile import load_profile
+    from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
+    from vlatool.render import render
+
+    board = load_profile(profile)
+    given = {"episodes": episodes, "iterations": iterations, "threads": threads}
+    effort = {name: value for name, value in given.items() if value is not None}
+    limits = Limits(max_drop=share(max_drop), hz=hz)
+    if recipe is None:
+        chosen = default_recipe(limits, Effort(**effort), pipeline.brings_calibration(source))
+    else:
+        read = read_recipe(recipe)
+        chosen = read.model_copy(update={"limits": limits, "effort": read.effort.model_copy(update=effort)})
+    plan = pipeline.make_plan(source, board, chosen, cache or cache_directory())
+    if dry_run:
+        for line in plan.lines():
+            typer.echo(line)
+        return
+    with progress(workers or default_workers()) as context:
+        report = pipeline.optimize(plan, output, context, force=force)
+    typer.echo(render(report, "json" if as_json else "terminal"), nl=False)
+    if not as_json:
+        typer.echo(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}")
+    leave(report)
+
+
+def share(text: str) -> float:
+    """Read ``1%`` or ``0.01`` as a share.
+
+    Raises:
+        UsageError: for anything else, or outside 0-100 %.
+    """
+    match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*", text)
+    value = float(match[1]) / (100 if match[2] else 1) if match else -1.0
+    if not 0 <= value <= 1:
+        raise UsageError(
+            f"--max-drop is '{text}'; allowed: a percentage such as 1%, or a share from 0 to 1 such as 0.01."
+        )
+    return value

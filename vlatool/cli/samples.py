@@ -1,0 +1,36 @@
+"""``vlatool samples``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlatool import registry
+from vlatool.bundle import writing
+
+app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
+
+
+@app.command("list")
+def list_samples() -> None:
+    """List the shapes that can be made."""
+    for name in registry.names("samples"):
+        typer.echo(f"{name.replace('_', '-'):16} {registry.module('samples', name).DESCRIPTION}")
+
+
+@app.command("make")
+def make(
+    name: Annotated[str, typer.Argument(help="which shape (see: vlatool samples list)", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new policy", show_default=False)],
+    seed: Annotated[int, typer.Option(min=0, help="seed of weights and data")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+) -> None:
+    """Write a policy with seeded random weights, for latency and memory work."""
+    from vlatool.samples._write import write_sample
+
+    registry.module("samples", name)
+    with writing(output, force=force) as draft:
+        write_sample(name.replace("-", "_"), draft, seed)
+    typer.echo(f"{output}: {name}, seed {seed}")

@@ -1,0 +1,54 @@
+"""Observations to export, check and calibrate with: recorded ones, or synthetic ones when there are none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.bundle import Bundle
+from vlatool.data._recording import read_recording
+from vlatool.spec import PolicySpec, TensorSpec
+
+CALIBRATION = "data/calibration.npz"
+EVALUATION = "data/evaluation.npz"
+
+
+def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
+    """Return up to ``count`` recorded observations, spread over the recording; none when the bundle carries none.
+
+    Args:
+        path: A recording to read in the place of the bundle's own.
+    """
+    own = source.path / CALIBRATION if CALIBRATION in source.manifest.files else None
+    chosen = path or own
+    if chosen is None:
+        return []
+    recording = read_recording(chosen, source.manifest.spec)
+    return [recording.observation(index) for index in recording.spread(count)]
+
+
+def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
+    """Return recorded observations, or synthetic ones when the bundle carries none."""
+    found = recorded_observations(source, count, path)
+    return found or synthetic_observations(source.manifest.spec, count)
+
+
+def synthetic_observations(spec: PolicySpec, count: int, seed: int = 0) -> list[dict[str, Any]]:
+    """Return seeded random observations that fit the spec: good for shapes and timing, not for accuracy."""
+    random = np.random.default_rng(seed)
+    return [{tensor.name: _synthetic(tensor, random) for tensor in spec.inputs} for _ in range(count)]
+
+
+def _synthetic(tensor: TensorSpec, random: np.random.Generator) -> Any:
+    if tensor.kind == "text":
+        return ""
+    shape = tuple(axis if isinstance(axis, int) else 1 for axis in tensor.shape[1:])
+    if tensor.dtype == "uint8":
+        return random.integers(0, 256, shape, np.uint8)
+    if tensor.dtype == "bool":
+        return np.ones(shape, np.bool_)
+    if tensor.dtype.startswith("int"):
+        return np.zeros(shape, tensor.dtype)
+    return random.standard_normal(shape).astype(tensor.dtype)

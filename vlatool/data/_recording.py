@@ -1,0 +1,135 @@
+"""Recorded observations, checked against a spec."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool import registry
+from vlatool.errors import DataError, nearest
+from vlatool.spec import PolicySpec, TensorSpec
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Observations with, where they were recorded, the expert's actions.
+
+    Args:
+        path: Where it was read from.
+        inputs: Input name -> array with a leading sample axis, physical values, text as a unicode array.
+        actions: (N, T, A) float32 in physical units, or (N,) int64 for discrete actions; None when not recorded.
+        episodes: (N,) int64 episode of each sample; None when not recorded.
+    """
+
+    path: Path
+    inputs: Mapping[str, Array]
+    actions: Array | None
+    episodes: Array | None
+
+    def __len__(self) -> int:
+        return len(next(iter(self.inputs.values())))
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for index in range(len(self)):
+            yield self.observation(index)
+
+    def observation(self, index: int) -> dict[str, Any]:
+        """Return one observation without the batch axis; text as ``str``."""
+        return {
+            name: str(values[index]) if values.dtype.kind == "U" else values[index]
+            for name, values in self.inputs.items()
+        }
+
+    def spread(self, count: int) -> list[int]:
+        """Return ``count`` indices (or all) spread evenly over the recording, so that every phase is present."""
+        if count >= len(self):
+            return list(range(len(self)))
+        return sorted({int(index) for index in np.linspace(0, len(self) - 1, count)})
+
+
+def read_recording(path: Path, spec: PolicySpec) -> Recording:
+    """Read recorded observations with the reader that the file's suffix names, and check them against the spec.
+
+    Raises:
+        DataError: when the file is missing, of an unknown format, corrupt, or does not fit the spec.
+    """
+    if not path.exists():
+        raise DataError(f"There is no data file {path}.")
+    known = registry.names("data")
+    suffix = path.suffix.removeprefix(".")
+    if suffix not in known:
+        raise DataError(f"{path} is of an unknown format; {nearest(suffix, known)}.")
+    reader: Any = registry.load("data", suffix)
+    return checked(path, reader.read(path), spec)
+
+
+def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Recording:
+    """Build a recording from arrays and check every one against the spec.
+
+    Raises:
+        DataError: naming the input and the sample.
+    """
+    inputs = {}
+    for tensor in spec.inputs:
+        if tensor.name not in arrays:
+            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.")
+        inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name])
+    lengths = {name: len(values) for name, values in inputs.items()}
+    actions, episodes = arrays.get(spec.action.name, arrays.get("action")), arrays.get("episode")
+    for name, values in (("action", actions), ("episode", episodes)):
+        if values is not None:
+            lengths[name] = len(values)
+    if len(set(lengths.values())) != 1:
+        raise DataError(f"{path} has different numbers of samples: {lengths}.", "each array needs one row a sample")
+    if not next(iter(lengths.values())):
+        raise DataError(f"{path} holds no samples.")
+    return Recording(path, inputs, None if actions is None else _checked_action(path, spec.action, actions), episodes)
+
+
+def _checked_input(path: Path, tensor: TensorSpec, values: Array) -> Array:
+    where = f"'{tensor.name}' in {path}"
+    if tensor.kind == "text":
+        if values.dtype.kind != "U":
+            raise DataError(f"{where} is {values.dtype}; a text input needs unicode strings.")
+        return values
+    if values.ndim == len(tensor.shape) + 1 and values.shape[1] == 1:
+        values = values[:, 0]
+    wanted = tensor.shape[1:]
+    fits = values.ndim == len(wanted) + 1 and all(
+        isinstance(want, str) or want == got for want, got in zip(wanted, values.shape[1:], strict=True)
+    )
+    if not fits:
+        raise DataError(f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, wanted))}].")
+    if tensor.dtype == "uint8" and values.dtype != np.uint8:
+        raise DataError(f"{where} is {values.dtype}; the policy takes uint8.", "store raw pixel values from 0 to 255")
+    return _finite(where, values)
+
+
+def _checked_action(path: Path, action: TensorSpec, values: Array) -> Array:
+    where = f"the expert's action in {path}"
+    if action.kind == "discrete":
+        values = values.reshape(len(values), -1)
+        if values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= len(action.labels):
+            raise DataError(f"{where} must be indices from 0 to {len(action.labels) - 1}; got {values.dtype}.")
+        return values
+    if values.shape[-1] != action.width:
+        raise DataError(f"{where} has {values.shape[-1]} elements; the policy gives {action.width}.")
+    return _finite(where, values.reshape(len(values), -1, action.width))
+
+
+def _finite(where: str, values: Array) -> Array:
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        first = int(np.flatnonzero(bad)[0])
+        raise DataError(
+            f"{where} is not finite in {int(bad.sum())} of {len(values)} samples; the first is sample {first}.",
+            "remove those samples, or repair the recording",
+        )
+    return values

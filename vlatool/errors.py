@@ -1,0 +1,143 @@
+"""The tree of user faults: what was wrong, what to do, and the exit code.
+
+VlatoolError                 70  our bug, unless a subclass says otherwise
+├── UsageError                2  the command line or call makes no sense
+├── InputError                3  something that was handed in is bad
+│   ├── BundleError              a bundle directory: missing, corrupt, half, too new
+│   ├── SpecError                a policy spec: names, shapes, dtypes, statistics
+│   ├── SourceError              a policy source: factory, weights, ONNX file
+│   ├── DataError                calibration / evaluation data or an observation
+│   ├── GraphError               a graph that an engine refuses, or that computes wrong values
+│   ├── ProfileError             a hardware profile
+│   ├── RecipeError              a recipe or stage options
+│   └── OutputError              the place to write to: exists, read-only, full
+├── MissingExtra              4  an optional dependency is absent; names the extra
+├── GateFailed                1  measured, and outside the limits
+└── Inconclusive              5  measured, and the samples cannot decide
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from types import ModuleType
+
+
+class VlatoolError(Exception):
+    """Base of every error that vlatool raises on purpose.
+
+    Args:
+        message: What was wrong, what was got and what is allowed; one or two sentences.
+        fix: What the person can do next; empty when the message already says so.
+    """
+
+    exit_code = 70
+
+    def __init__(self, message: str, fix: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.fix = fix
+
+    def __str__(self) -> str:
+        return f"{self.message}\n  fix: {self.fix}" if self.fix else self.message
+
+    def __reduce__(self) -> tuple[type[VlatoolError], tuple[str, str]]:
+        """Pickle both parts, so that an error crosses a process border unchanged."""
+        return type(self), (self.message, self.fix)
+
+
+class UsageError(VlatoolError):
+    """The command line or the call makes no sense."""
+
+    exit_code = 2
+
+
+class InputError(VlatoolError):
+    """Something that was handed in is missing, corrupt or of the wrong kind."""
+
+    exit_code = 3
+
+
+class BundleError(InputError):
+    """A bundle directory is missing, corrupt, incomplete or too new."""
+
+
+class SpecError(InputError):
+    """A policy spec names something impossible, or statistics do not fit it."""
+
+
+class SourceError(InputError):
+    """A policy source cannot be found, imported, built or run."""
+
+
+class DataError(InputError):
+    """Calibration data, evaluation data or an observation does not fit the spec."""
+
+
+class GraphError(InputError):
+    """A graph that an engine refuses, or that does not compute what it should."""
+
+
+class ProfileError(InputError):
+    """A hardware profile is unknown or malformed."""
+
+
+class RecipeError(InputError):
+    """A recipe or the options of a stage are wrong."""
+
+
+class OutputError(InputError):
+    """The place to write to exists already, is read-only or is full."""
+
+
+class MissingExtra(VlatoolError):
+    """An optional dependency is absent."""
+
+    exit_code = 4
+
+
+class GateFailed(VlatoolError):
+    """The measurement is outside the limits that were asked for."""
+
+    exit_code = 1
+
+
+class Inconclusive(VlatoolError):
+    """The measurement cannot decide; more samples would."""
+
+    exit_code = 5
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a sentence part that lists what is known, with the nearest name first.
+
+    Example:
+        >>> nearest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
+        "did you mean 'raspberry-pi-5'? known: jetson-orin-nano, raspberry-pi-5"
+    """
+    names = sorted(known)
+    hits = difflib.get_close_matches(name, names, n=1)
+    listing = "known: " + (", ".join(names) if names else "none")
+    return f"did you mean '{hits[0]}'? {listing}" if hits else listing
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import ``module``, or say which extra provides it.
+
+    Raises:
+        MissingExtra: when the module is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        top = module.partition(".")[0]
+        if error.name is not None and error.name.partition(".")[0] != top:
+            raise MissingExtra(
+                f"'{module}' is installed, but '{error.name}', which it needs, is not.",
+                f"pip install 'vlatool[{extra}]'",
+            ) from error
+        raise MissingExtra(
+            f"This needs the package '{top}', which the extra '{extra}' provides.",
+            f"pip install 'vlatool[{extra}]'",
+        ) from error

@@ -1,0 +1,1 @@
+"""Measurements of accuracy: against recorded actions, and in the closed loop of an environment."""

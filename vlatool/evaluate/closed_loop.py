@@ -1,0 +1,89 @@
+"""Success rate in the closed loop of a gymnasium environment, on paired seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from vlatool.bundle import MANIFEST, Bundle
+from vlatool.errors import DataError, UsageError, nearest
+from vlatool.evaluate._episodes import Job, run_jobs
+from vlatool.evaluate._paired import compare_success, success_row
+from vlatool.host import fingerprint
+from vlatool.report import Report, Row
+from vlatool.sources._description import read_description
+from vlatool.stage import Context, Measure
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+FIRST_SEED = 5_000_000
+SLICE = 10
+"""Episodes of one task that a worker runs at a time."""
+
+
+class ClosedLoop(Measure):
+    """Run episodes in a gymnasium environment: success rate with Wilson interval, and McNemar's exact test when paired.
+
+    Episode ``k`` of a task has the seed ``first_seed + k`` for every bundle, so that outcomes are paired.
+    """
+
+    policy: Path | None = Field(None, description="policy.yaml (or its directory) that names environment and tasks")
+    environment: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
+    tasks: tuple[str, ...] = Field((), description="tasks; those in policy.yaml when empty")
+    episodes: int = Field(200, ge=1, description="episodes over all tasks, spread evenly")
+    first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode of every task")
+    baseline: Path | None = Field(None, description="bundle to pair with, usually float32")
+    instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
+    engine: str = Field("ort_cpu", description="engine of the runtime")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The baseline's manifest and the environment's file."""
+        described = read_description(self.policy) if self.policy else None
+        where = self.environment or str((described.environment if described else {}).get("make", ""))
+        folder = described.folder if described else Path()
+        file = folder / where.rpartition(":")[0]
+        return (*([self.baseline / MANIFEST] if self.baseline else []), *([file] if file.is_file() else []))
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """Environment and tasks are named."""
+        self._jobs(source)
+
+    def run(self, source: Bundle, context: Context) -> Report:
+        """Run all episodes of the bundle, and of the baseline when there is one."""
+        jobs = self._jobs(source)
+        rows: list[Row] = []
+        if self.baseline:
+            rows.append(
+                success_row("baseline", "baseline", run_jobs(Bundle.open(self.baseline), jobs, self.engine, context))
+            )
+        row = success_row(source.manifest.name, "subject", run_jobs(source, jobs, self.engine, context))
+        rows.append(compare_success(rows[0], row) if rows else row)
+        success = rows[-1].get("success")
+        count = success.samples if success else 0
+        told = "" if self.instruction == "right" else " told the wrong instruction"
+        title = f"{source.manifest.name}{told} in {count} closed-loop episodes"
+        text = f"{row.value('success'):.1%} of {count} episodes succeed{told and ',' + told}."
+        return Report("evaluate", title, summary=(text,), rows=tuple(rows), environment=fingerprint())
+
+    def _jobs(self, source: Bundle | None) -> list[Job]:
+        described = read_description(self.policy) if self.policy else None
+        named = described.environment if described else (source.manifest.environment if source else {})
+        known = tuple(named.get("tasks", ()))
+        tasks = self.tasks or known
+        where = self.environment or str(named.get("make", ""))
+        folder = described.folder if described else Path()
+        if not where or not tasks:
+            raise DataError(
+                "No environment or no tasks are named for the closed loop.",
+                "pass --policy DIR (with a policy.yaml that names them), or --environment FILE.py:make --tasks NAME",
+            )
+        for task in self.tasks:
+            if known and task not in known:
+                raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.")
+        each = -(-self.episodes // len(tasks))
+        seeds = range(self.first_seed, self.first_seed + each)
+        slices = [tuple(seeds[start : start + SLICE]) for start in range(0, each, SLICE)]
+        return [Job(where, str(folder), task, part, self.instruction) for task in tasks for part in slices]

@@ -1,0 +1,129 @@
+"""Accuracy on recorded observations: against the expert's actions, and against a baseline bundle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from vlatool.bundle import MANIFEST, Bundle
+from vlatool.data import Recording, read_recording
+from vlatool.errors import DataError
+from vlatool.host import fingerprint
+from vlatool.report import Measurement, Report, Row
+from vlatool.runtime.policy import Policy
+from vlatool.spec import TensorSpec
+from vlatool.stage import Context, Measure
+from vlatool.statistics import wilson
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+Array = NDArray[Any]
+EVALUATION = "data/evaluation.npz"
+
+
+class Recorded(Measure):
+    """Run a bundle on recorded observations and compare its actions with the expert's and with a baseline's."""
+
+    data: Path | None = Field(None, description="recorded observations and actions; the bundle's own when not given")
+    baseline: Path | None = Field(None, description="bundle to compare with, usually float32")
+    samples: int = Field(100_000, ge=1, description="largest number of samples, spread over the recording")
+    engine: str = Field("ort_cpu", description="engine of the runtime")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """Data and the baseline's manifest."""
+        return (*([self.data] if self.data else []), *([self.baseline / MANIFEST] if self.baseline else []))
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """There is something to evaluate on."""
+        if source is not None:
+            self._data(source)
+
+    def run(self, source: Bundle, context: Context) -> Report:
+        """Evaluate and return a row for the bundle, and one for the baseline when there is one."""
+        recording = read_recording(self._data(source), source.manifest.spec)
+        indices = recording.spread(self.samples)
+        action = source.manifest.spec.action
+        expert = None if recording.actions is None else recording.actions[indices]
+        reference: Array | None = None
+        rows = []
+        if self.baseline:
+            context.tell("running the baseline", None)
+            reference = run_recorded(Bundle.open(self.baseline), recording, indices, self.engine, context)
+            rows.append(Row("baseline", "baseline", measurements=tuple(compare(action, reference, expert, "expert"))))
+        got = run_recorded(source, recording, indices, self.engine, context)
+        measurements = compare(action, got, expert, "expert")
+        if reference is not None:
+            measurements += compare(action, got, reference, "baseline")
+        rows.append(Row(source.manifest.name, measurements=tuple(measurements)))
+        title = f"{source.manifest.name} on {len(indices)} recorded observations"
+        return Report("evaluate", title, summary=(title + ".",), rows=tuple(rows), environment=fingerprint())
+
+    def _data(self, source: Bundle) -> Path:
+        own = source.path / EVALUATION if EVALUATION in source.manifest.files else None
+        chosen = self.data or own
+        if chosen is None:
+            raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
+        return chosen
+
+
+def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], engine: str, context: Context) -> Array:
+    """Return the chunks of the policy: (N, T, A) float32 in physical units, or (N, T) int64."""
+    policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
+    chunks = []
+    episode = None
+    for number, index in enumerate(indices):
+        if number % 16 == 0:
+            context.tell("running recorded observations", number / len(indices))
+        current = None if recording.episodes is None else int(recording.episodes[index])
+        if current != episode:
+            policy.reset()
+            episode = current
+        chunks.append(policy.infer(recording.observation(index)).chunk)
+    return np.stack(chunks)
+
+
+def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) -> list[Measurement]:
+    """Compare actions with the expert's or the baseline's.
+
+    Returns:
+        Discrete: ``agreement_WHOSE`` (share, Wilson interval). Continuous: ``error_WHOSE.LABEL`` (mean absolute error
+        in the element's unit), ``error_WHOSE`` (the mean of those, each divided by the standard deviation of the wanted
+        element), and ``gripper_flips_WHOSE``: the share of steps in which a gripper element has the other sign.
+    """
+    if wanted is None:
+        return []
+    if action.kind == "discrete":
+        hits = int(np.sum(got.reshape(len(got), -1) == wanted.reshape(len(wanted), -1)))
+        low, high = wilson(hits, got.size)
+        return [Measurement(f"agreement_{whose}", hits / got.size, "1", samples=got.size, low=low, high=high)]
+    steps = min(got.shape[1], wanted.shape[1])
+    got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
+    labels = action.labels or tuple(str(index) for index in range(action.width))
+    errors = np.abs(got - wanted)
+    mean, count = errors.mean(axis=(0, 1)), len(got)
+    spread = wanted.std(axis=(0, 1))
+    relative = float(np.mean(mean[spread > 0] / spread[spread > 0])) if np.any(spread > 0) else math.nan
+    found = [Measurement(f"error_{whose}", relative, "1", samples=count, note="mean |error| / standard deviation")]
+    for index, (label, unit) in enumerate(zip(labels, action.units(), strict=True)):
+        found.append(
+            Measurement(f"error_{whose}.{label}", float(mean[index]), unit, samples=count, note="mean |error|")
+        )
+    found += _gripper_flips(labels, got, wanted, whose)
+    return found
+
+
+def _gripper_flips(labels: Sequence[str], got: Array, wanted: Array, whose: str) -> list[Measurement]:
+    columns = [index for index, label in enumerate(labels) if "grip" in label.lower()]
+    if not columns:
+        return []
+    flips = int(np.sum((got[..., columns] > 0) != (wanted[..., columns] > 0)))
+    total = got[..., columns].size
+    low, high = wilson(flips, total)
+    return [Measurement(f"gripper_flips_{whose}", flips / total, "1", samples=total, low=low, high=high)]

@@ -1,0 +1,1 @@
+"""Exporters: from a source bundle to a bundle with graphs."""

@@ -1,0 +1,98 @@
+"""Run a policy's torch modules through the same program as its graphs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle import Bundle, hash_file
+from vlatool.errors import SourceError, nearest, require
+from vlatool.manifest import ProgramStep
+from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import Program
+from vlatool.sources._description import read_location
+from vlatool.sources._factory import call_factory, factory_file
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+def load_modules(source: Bundle) -> dict[str, nn.Module]:
+    """Build the modules of a source bundle, in evaluation mode: graph name -> module.
+
+    Raises:
+        SourceError: when the code has changed since the bundle was made, or gives something else than modules.
+    """
+    torch = require("torch", "build")
+    origin = source.manifest.source
+    if "factory" not in origin:
+        raise SourceError(f"{source.path} was not made from a torch policy; it has nothing to export.")
+    folder = read_location(source.path)
+    _check_code(origin, folder)
+    made = call_factory(origin["factory"], folder, dict(origin.get("arguments", {})))
+    modules = made if isinstance(made, Mapping) else {"main": made}
+    wanted = {step.graph for step in source.manifest.program}
+    for name in wanted:
+        if name not in modules:
+            raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, modules)}.")
+        if not isinstance(modules[name], torch.nn.Module):
+            raise SourceError(f"The factory gave a {type(modules[name]).__name__} for '{name}'; wanted a torch module.")
+    return {name: modules[name].eval() for name in sorted(wanted)}
+
+
+def _check_code(origin: Mapping[str, Any], folder: Path) -> None:
+    path = factory_file(origin["factory"], folder)
+    for name, digest in origin.get("code", {}).items():
+        file = (path.parent if path else folder) / name
+        if not file.is_file() or hash_file(file) != digest:
+            raise SourceError(f"{file} has changed since the source bundle was made.", "start again from the source")
+
+
+def torch_policy(source: Bundle) -> Policy:
+    """Open a source bundle in eager torch behind the interface of the runtime's policy."""
+    modules = load_modules(source)
+    sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
+    return Policy(source, Program(source.manifest.program, sessions), "torch eager")
+
+
+class TorchSession:
+    """One torch module behind the session interface; remembers the feeds of its first run.
+
+    Args:
+        module: The module; takes the feeds positionally in the order of ``step.feeds``.
+        step: The program step that runs it.
+    """
+
+    def __init__(self, module: nn.Module, step: ProgramStep) -> None:
+        self.module = module
+        self.step = step
+        self.first_feeds: dict[str, Any] | None = None
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run the module on numpy arrays.
+
+        Raises:
+            SourceError: when the module fails, or gives another number of outputs than the program says.
+        """
+        torch = require("torch", "build")
+        if self.first_feeds is None:
+            self.first_feeds = dict(feeds)
+        arguments = [torch.from_numpy(np.ascontiguousarray(feeds[name])) for name in self.step.feeds]
+        try:
+            with torch.inference_mode():
+                given = self.module(*arguments)
+        except Exception as error:  # the seam: the user's module may raise anything
+            shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
+            raise SourceError(
+                f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
+                f"{str(error).splitlines()[0] if str(error) else ''} (given {shapes})."
+            ) from error
+        outputs = list(given) if isinstance(given, tuple | list) else [given]
+        if len(outputs) != len(self.step.gives):
+            raise SourceError(
+                f"The module gives {len(outputs)} outputs; the program says {', '.join(self.step.gives)}."
+            )
+        return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}

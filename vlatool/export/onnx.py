@@ -1,0 +1,143 @@
+"""ONNX through torch's dynamo exporter, believed only after ONNX Runtime ran it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlatool.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import GraphError, require
+from vlatool.export._torch_policy import TorchSession, load_modules
+from vlatool.finish import carry_over, finish
+from vlatool.manifest import Graph
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.policy import Policy, relative_error
+from vlatool.runtime.program import Program
+from vlatool.stage import Context, Transform, source_of
+
+if TYPE_CHECKING:
+    from torch import nn
+
+EXTERNAL_DATA_BYTES = 1_500_000_000
+"""Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
+
+
+class ExportOnnx(Transform):
+    """Export every graph of a torch policy to ONNX (dynamo exporter, static shapes).
+
+    The files count only after ONNX Runtime loaded them and gave, through the policy's whole program, what torch gives
+    on calibration observations.
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
+
+    opset: int = Field(20, ge=18, le=23, description="opset of the default ONNX domain")
+    samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
+    tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Export, run, compare, and write the bundle."""
+        bundle = source_of(source, self.name())
+        action = bundle.manifest.spec.action.name
+        modules = load_modules(bundle)
+        sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
+        observations = observations_for(bundle, self.samples)
+        encode = ObservationEncoder(bundle.manifest.spec, bundle.path / "assets")
+        context.tell("running the torch policy", None)
+        torch_program = Program(bundle.manifest.program, sessions, seed=0)
+        expected = [torch_program.run(encode(observation))[action] for observation in observations]
+        graphs = {}
+        for number, (name, session) in enumerate(sessions.items()):
+            context.tell(f"exporting {name}", number / len(sessions))
+            graphs[name] = self._export(name, session, out)
+        carry_over(bundle, out)
+        context.tell("checking in ONNX Runtime", None)
+        made = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
+        self._compare(made, observations, expected)
+        return made
+
+    def _export(self, name: str, session: TorchSession, out: Path) -> Graph:
+        torch = require("torch", "build")
+        for module in ("onnxscript", "onnx"):
+            require(module, "build")
+        arguments = tuple(torch.from_numpy(np.ascontiguousarray(feed)) for feed in (session.first_feeds or {}).values())
+        try:
+            with _quiet():
+                exported = torch.onnx.export(
+                    session.module,
+                    arguments,
+                    dynamo=True,
+                    opset_version=self.opset,
+                    input_names=list(session.step.feeds),
+                    output_names=list(session.step.gives),
+                    verbose=False,
+                )
+        except Exception as error:  # the seam: the exporter raises many foreign types
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
+            raise GraphError(
+                f"torch cannot export the graph '{name}': {reason}.",
+                "split data-dependent control flow out of forward(); see docs/guides/your-own-policy.md",
+            ) from error
+        file = f"graphs/{name}.onnx"
+        (out / "graphs").mkdir(exist_ok=True)
+        strip_notes(exported.model)
+        exported.save(str(out / file), external_data=_weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
+        return Graph(file, {"float32": 1.0}, self.opset)
+
+    def _compare(self, made: Bundle, observations: list[dict[str, Any]], expected: list[Any]) -> None:
+        policy = Policy.open(made, threads=1, seed=0)
+        for number, (observation, wanted) in enumerate(zip(observations, expected, strict=True)):
+            got = policy.infer(observation).outputs[made.manifest.spec.action.name]
+            error = relative_error(got, wanted)
+            if not error <= self.tolerance:
+                raise GraphError(
+                    f"ONNX Runtime and torch differ on calibration sample {number}: relative L2 error {error:.3g}, "
+                    f"allowed {self.tolerance:g}.",
+                    "look for random numbers or in-place state in forward(), or raise --tolerance if you know why",
+                )
+
+
+def strip_notes(model: Any) -> None:
+    """Remove what an exporter notes beside the graph (stack traces with file paths): it would leak and differ."""
+    graphs = [model.graph, *(function.graph for function in model.functions.values())]
+    model.metadata_props.clear()
+    for graph in graphs:
+        graph.metadata_props.clear()
+        graph.doc_string = None
+        values = [*graph.inputs, *graph.outputs, *graph.initializers.values()]
+        for node in graph.all_nodes():
+            node.metadata_props.clear()
+            node.doc_string = None
+            values.extend(node.outputs)
+        for value in values:
+            value.metadata_props.clear()
+            value.doc_string = None
+
+
+def _weight_bytes(module: nn.Module) -> int:
+    return sum(tensor.numel() * tensor.element_size() for tensor in [*module.parameters(), *module.buffers()])
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the exporter's progress prints, log lines and warnings away from the user's terminal."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "torch")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

@@ -1,0 +1,96 @@
+"""The last steps of every stage that makes a bundle: carry over what stays, golden inputs and outputs, hashes."""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.bundle import Bundle, seal
+from vlatool.manifest import FileRecord, Graph, Manifest
+from vlatool.runtime.policy import Policy
+
+GOLDEN = "golden/golden.npz"
+GOLDEN_COUNT = 2
+CARRIED = ("assets", "data")
+
+
+def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
+    """Copy the folders that a derived bundle keeps."""
+    for folder in folders:
+        if (source.path / folder).is_dir():
+            shutil.copytree(source.path / folder, out / folder)
+
+
+def finish(
+    source: Bundle,
+    out: Path,
+    *,
+    made_by: Mapping[str, Any],
+    graphs: Mapping[str, Graph],
+    observations: list[dict[str, Any]],
+) -> Bundle:
+    """Write golden file and manifest of a bundle whose graphs and carried folders are in ``out`` already.
+
+    Args:
+        source: What the bundle was made from.
+        made_by: Stage, options and versions.
+        graphs: Graph name -> graph.
+        observations: Raw observations; the first two become golden.
+
+    Raises:
+        GraphError: when the engine refuses a graph or gives an action that is not finite.
+    """
+    changes: dict[str, Any] = {"parent": source.hash, "made_by": dict(made_by), "graphs": dict(graphs), "accuracy": {}}
+    origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
+    unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
+    draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changes))
+    write_golden(draft, observations, out)
+    return seal(out, replace(draft.manifest, golden=GOLDEN))
+
+
+def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]) -> Bundle:
+    """Copy folders of a bundle to ``out`` and seal it there under another manifest."""
+    carry_over(bundle, out, folders)
+    return seal(out, manifest)
+
+
+def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> None:
+    """Run the first observations and store ``in.NAME``, ``noise.NAME`` and ``out.NAME``, each with a sample axis.
+
+    Args:
+        draft: The bundle as written so far; its graphs are what runs.
+        observations: Raw observations without the batch axis.
+        out: The bundle's directory.
+    """
+    policy = Policy.open(draft, threads=1, seed=0)
+    random = np.random.default_rng(0)
+    arrays: dict[str, list[Any]] = {}
+    for observation in observations[:GOLDEN_COUNT]:
+        noise = {
+            name: random.standard_normal(wanted["shape"], np.float32)
+            for step in draft.manifest.program
+            for name, wanted in step.noise.items()
+        }
+        policy.reset()
+        outputs = policy.infer(observation, noise=noise).outputs
+        for prefix, values in (("in", observation), ("noise", noise), ("out", outputs)):
+            for name, value in values.items():
+                arrays.setdefault(f"{prefix}.{name}", []).append(value)
+    (out / GOLDEN).parent.mkdir(exist_ok=True)
+    save_npz(out / GOLDEN, {name: np.stack([np.asarray(item) for item in items]) for name, items in arrays.items()})
+
+
+def save_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays as ``.npz`` with fixed time stamps, so that equal arrays give equal bytes."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)

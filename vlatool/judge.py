@@ -1,0 +1,157 @@
+"""Which candidate keeps to the limits, which is chosen, and why: in words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from vlatool.recipe import Limits
+from vlatool.report import Measurement, Row
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+DROPS = ("success_drop", "agreement_drop", "error_increase")
+"""Which accuracy decides: the closed loop where there is one, else recorded observations."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A row, whether it keeps to the limits, by how much it misses, and what to say about it."""
+
+    row: Row
+    within: bool
+    drop: float
+    sentences: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def judge(row: Row, baseline: Row, limits: Limits, profile: Profile) -> Judged:
+    """Hold a candidate's row against the limits.
+
+    Returns:
+        The row with its role (``within`` / ``outside``; the baseline keeps its own) and the reason in words.
+    """
+    row = _with_drop(row, baseline)
+    decisive = next((found for name in DROPS if (found := row.get(name)) is not None), None)
+    drop = decisive.value if decisive else math.nan
+    reasons, warnings = [], []
+    if row is not baseline and decisive is not None and drop > limits.max_drop + 1e-12:
+        reasons.append(f"{_drop_words(decisive)}, {_points(drop - limits.max_drop)} over the budget")
+    if row is not baseline and decisive is None:
+        reasons.append("its accuracy is unmeasured: the policy brings neither an environment nor evaluation data")
+    late, warning = _too_slow(row, limits, profile)
+    reasons += late
+    warnings += warning
+    if decisive is not None and not reasons and (decisive.high or 0.0) > limits.max_drop and row.role != "baseline":
+        warnings.append(
+            f"{row.name}: the drop could be as large as {_points(decisive.high or 0.0)} ({decisive.samples} paired "
+            "samples cannot exclude it); more episodes would narrow it: --episodes"
+        )
+    kept = _drop_words(decisive) + f", within {_points(limits.max_drop)}" if decisive and not reasons else ""
+    role = row.role if row.role == "baseline" else ("outside" if reasons else "within")
+    reason = "; ".join(reasons) or (kept if role != "baseline" else "the reference")
+    return Judged(
+        replace(row, role=role, reason=reason), not reasons, 0.0 if role == "baseline" else drop, (), tuple(warnings)
+    )
+
+
+def choose(judged: list[Judged], limits: Limits) -> list[Judged]:
+    """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside."""
+    quantized = [item for item in judged if item.row.role != "baseline"]
+    inside = [item for item in quantized if item.within]
+    if not inside:
+        best = min(quantized, key=lambda item: (item.drop if not math.isnan(item.drop) else math.inf, _p50(item.row)))
+        reason = f"kept as the nearest, though outside the limits: {best.row.reason}"
+        sentences = (
+            f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept.",
+            *(f"{item.row.name}: {item.row.reason}." for item in quantized),
+        )
+    else:
+        baseline = [item for item in judged if item.row.role == "baseline" and item.within]
+        best = min([*inside, *baseline], key=lambda item: _p50(item.row))
+        reason = f"the fastest inside the limits; {best.row.reason}"
+        sentences = _praise(best, judged)
+    chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
+    return [chosen if item is best else item for item in judged]
+
+
+def _praise(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
+    row, base = best.row, judged[0].row
+    if best is judged[0]:
+        return (
+            f"{row.name} was kept: no quantized candidate is faster on this host.",
+            "For a graph this small the quantize and dequantize steps cost more than int8 arithmetic saves.",
+        )
+    speed = f"{row.value('speedup'):.2f}x as fast as {base.name}"
+    times = f"{row.value('latency_p50'):.3g} ms instead of {base.value('latency_p50'):.3g} ms, measured on this host"
+    size = f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
+    accuracy = row.get("success")
+    success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
+    return (f"{row.name} is {speed} ({times}); {size}.{success}", f"{row.reason[:1].upper()}{row.reason[1:]}.")
+
+
+def _with_drop(row: Row, baseline: Row) -> Row:
+    """Add the drop on recorded observations, in the direction in which more is worse."""
+    if row is baseline:
+        return row
+    found: list[Measurement] = []
+    for name, drop, sign in (("agreement_expert", "agreement_drop", -1.0), ("error_expert", "error_increase", 1.0)):
+        own, base = row.get(name), baseline.get(name)
+        if own is not None and base is not None and own.known:
+            found.append(
+                Measurement(
+                    drop, sign * (own.value - base.value), "1", samples=own.samples, note="recorded observations"
+                )
+            )
+    if not found:
+        against = row.get("agreement_baseline") or row.get("error_baseline")
+        if against is not None and against.known:
+            agreement = against.name == "agreement_baseline"
+            value = 1.0 - against.value if agreement else against.value
+            name = "agreement_drop" if agreement else "error_increase"
+            found.append(Measurement(name, value, "1", samples=against.samples, note="against float32"))
+    return replace(row, measurements=(*row.measurements, *found))
+
+
+def _too_slow(row: Row, limits: Limits, profile: Profile) -> tuple[list[str], list[str]]:
+    """Judge the rate by the prediction for the profile; a host's own latency says nothing about another board."""
+    if limits.hz is None:
+        return [], []
+    budget_ms = 1000.0 / limits.hz
+    predicted = row.get("latency_p50", "predicted")
+    if predicted is None or not predicted.known:
+        return [], [f"{row.name}: no latency can be predicted for {profile.name}, so {limits.hz:g} Hz is unjudged"]
+    low, high = predicted.low or predicted.value, predicted.high or predicted.value
+    told = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
+    told += f", {limits.hz:g} Hz needs {budget_ms:.3g} ms"
+    if low > budget_ms:
+        return [told], []
+    if high > budget_ms:
+        return [], [f"{row.name}: {told}: too close to call, measure on the board"]
+    return [], []
+
+
+def _drop_words(drop: Measurement) -> str:
+    subject = {
+        "success_drop": "success",
+        "agreement_drop": "agreement with the expert",
+        "error_increase": "action error",
+    }
+    name = subject[drop.name]
+    if drop.name == "error_increase":
+        return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
+    verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")
+    note = f" ({drop.note})" if drop.note and drop.name == "success_drop" else ""
+    return f"{name} {verb}{'' if drop.value == 0 else f' by {_points(abs(drop.value))}'}{note}"
+
+
+def _points(share: float) -> str:
+    points = f"{100 * share:.3g}"
+    return f"{points} point" + ("" if points == "1" else "s")
+
+
+def _p50(row: Row) -> float:
+    value = row.value("latency_p50")
+    return value if not math.isnan(value) else math.inf

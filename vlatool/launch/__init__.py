@@ -1,0 +1,70 @@
+"""Run one stage somewhere: input directory, stage, output directory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from vlatool.bundle import Bundle, writing
+from vlatool.errors import BundleError, DataError, OutputError
+from vlatool.report import REPORT, Report, read_report
+from vlatool.stage import Context, Measure, Stage, Transform
+
+
+def run_transform(
+    stage: Transform, source: Bundle | None, out: Path, context: Context, *, force: bool = False
+) -> Bundle:
+    """Run a stage that makes a bundle; ``out`` appears whole or not at all.
+
+    Raises:
+        VlatoolError: what the stage raises, and OutputError when the output cannot be written.
+    """
+    if not force and out.exists():
+        raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
+    stage.check(source, None)
+    with writing(out, force=force) as draft:
+        stage.run(source, draft, context)
+    return Bundle.open(out, verify=False)
+
+
+def cache_directory() -> Path:
+    """Return where finished stages are kept: ``$VLATOOL_CACHE``, or ``vlatool`` in the user's cache directory."""
+    named = os.environ.get("VLATOOL_CACHE")
+    if named:
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vlatool"
+
+
+def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
+    """Return where the output of a stage is kept."""
+    return cache / "stages" / f"{stage.name()}-{stage.key(source_hash)}"
+
+
+def is_cached(stage: Stage, source_hash: str, cache: Path) -> bool:
+    """Say whether the output of a stage is there."""
+    return cached_path(stage, source_hash, cache).is_dir()
+
+
+def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
+    """Return the stage's bundle from the cache, or run the stage into the cache."""
+    path = cached_path(stage, source.hash if source else "", cache)
+    if path.is_dir():
+        try:
+            return Bundle.open(path)
+        except BundleError:
+            context.tell(f"the cached {stage.name()} is damaged; making it again", None)
+    return run_transform(stage, source, path, context, force=True)
+
+
+def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context) -> Report:
+    """Return the stage's report from the cache, or measure and keep it."""
+    path = cached_path(stage, source.hash, cache)
+    if path.is_dir():
+        try:
+            return read_report(path)
+        except DataError:
+            context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
+    report = stage.run(source, context)
+    with writing(path, force=True) as draft:
+        (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
+    return report

@@ -1,0 +1,223 @@
+"""``manifest.json``: what a bundle is, which files it has, and how its graphs are run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import PurePosixPath
+from typing import Any
+
+from vlatool.errors import BundleError, SpecError, nearest
+from vlatool.spec import PolicySpec
+
+SCHEMA = 1
+DISTRIBUTIONS = ("normal", "uniform", "zeros")
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """Size in bytes and SHA-256 (hex) of one file of a bundle."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Graph:
+    """One ONNX file of a policy.
+
+    Args:
+        file: Path inside the bundle.
+        precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1).
+        opset: Opset of the default ONNX domain.
+    """
+
+    file: str
+    precision: dict[str, float] = field(default_factory=dict)
+    opset: int = 0
+
+
+@dataclass(frozen=True)
+class ProgramStep:
+    """One entry of a program: run a graph, once or several times.
+
+    Args:
+        graph: Name of the graph.
+        feeds: Graph input name -> value name.
+        gives: Graph output name -> value name.
+        repeat: How often the graph runs.
+        carry: Given value -> the value that it replaces before the next repeat.
+        schedule: Value -> one number for each repeat, presented as an array of shape (1,).
+        noise: Value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
+        keep: Value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
+    """
+
+    graph: str
+    feeds: dict[str, str]
+    gives: dict[str, str]
+    repeat: int = 1
+    carry: dict[str, str] = field(default_factory=dict)
+    schedule: dict[str, list[float]] = field(default_factory=dict)
+    noise: dict[str, dict[str, Any]] = field(default_factory=dict)
+    keep: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.repeat, int) or self.repeat < 1:
+            raise SpecError(f"The program repeats '{self.graph}' {self.repeat!r} times; allowed: from 1.")
+        for value, numbers in self.schedule.items():
+            if len(numbers) != self.repeat:
+                got = f"{len(numbers)} numbers, but '{self.graph}' runs {self.repeat} times"
+                raise SpecError(f"The schedule of '{value}' has {got}.")
+        for value, noise in self.noise.items():
+            if noise.get("distribution", "normal") not in DISTRIBUTIONS or not noise.get("shape"):
+                raise SpecError(f"The noise '{value}' needs a shape and a distribution of {', '.join(DISTRIBUTIONS)}.")
+
+    def sources(self) -> set[str]:
+        """Values that this entry brings into being before its graph runs."""
+        return {*self.schedule, *self.noise, *self.keep}
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The content of ``manifest.json``; see ``docs/reference/manifest.md`` for each key."""
+
+    name: str
+    version: str
+    spec: PolicySpec
+    graphs: dict[str, Graph] = field(default_factory=dict)
+    program: tuple[ProgramStep, ...] = ()
+    files: dict[str, FileRecord] = field(default_factory=dict)
+    parent: str = ""
+    made_by: dict[str, Any] = field(default_factory=dict)
+    source: dict[str, Any] = field(default_factory=dict)
+    environment: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, list[str]] = field(default_factory=dict)
+    golden: str = ""
+    accuracy: dict[str, Any] = field(default_factory=dict)
+    description: str = ""
+    license: str = ""
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        for path in (*self.files, *(graph.file for graph in self.graphs.values())):
+            _inside(path)
+        for graph in self.graphs.values():
+            if graph.file not in self.files:
+                raise BundleError(f"The manifest names the graph {graph.file}, but records no hash for it.")
+        if self.program:
+            check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Manifest:
+        """Build from the parsed JSON.
+
+        Raises:
+            BundleError: for a newer schema, a missing key or a wrong type.
+            SpecError: for an impossible spec or program.
+        """
+        if not isinstance(data, Mapping):
+            raise BundleError(f"The manifest must be a mapping; got {type(data).__name__}.")
+        _check_schema(data.get("schema"))
+        known = {item.name for item in fields(cls)}
+        values = {key: data[key] for key in data if key in known}
+        for key in ("name", "version", "spec"):
+            if key not in values:
+                raise BundleError(f"The manifest has no '{key}'.", "export the policy again")
+        try:
+            values["spec"] = PolicySpec.from_dict(values["spec"])
+            values["graphs"] = {name: Graph(**graph) for name, graph in data.get("graphs", {}).items()}
+            values["program"] = program_from(data.get("program", []))
+            values["files"] = {path: FileRecord(**record) for path, record in data.get("files", {}).items()}
+        except (TypeError, AttributeError) as error:
+            raise BundleError(f"The manifest is malformed: {error}.", "export the policy again") from error
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``from_dict`` turns back into an equal manifest; empty values are left out."""
+        plain: dict[str, Any] = {"schema": self.schema, "name": self.name, "version": self.version}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name not in plain and value:
+                plain[item.name] = value
+        plain["spec"] = self.spec.to_dict()
+        plain["graphs"] = {name: _nonempty(graph) for name, graph in self.graphs.items()}
+        plain["program"] = [_nonempty(step) for step in self.program]
+        plain["files"] = {path: _nonempty(record) for path, record in sorted(self.files.items())}
+        return plain
+
+
+def program_from(data: Any) -> tuple[ProgramStep, ...]:
+    """Build a program from a list of mappings.
+
+    Raises:
+        SpecError: for anything but a list of mappings with ``graph``, ``feeds`` and ``gives``.
+    """
+    known = [item.name for item in fields(ProgramStep)]
+    if not isinstance(data, list | tuple):
+        raise SpecError(f"The program must be a list of steps; got {type(data).__name__}.")
+    steps = []
+    for number, entry in enumerate(data):
+        if not isinstance(entry, Mapping) or not {"graph", "feeds", "gives"} <= set(entry):
+            raise SpecError(f"Step {number} of the program needs 'graph', 'feeds' and 'gives'; got {entry!r}.")
+        for key in entry:
+            if key not in known:
+                raise SpecError(f"Step {number} of the program has the unknown key '{key}'; {nearest(key, known)}.")
+        steps.append(ProgramStep(**entry))
+    return tuple(steps)
+
+
+def single_graph(spec: PolicySpec, graph: str = "main") -> tuple[ProgramStep, ...]:
+    """Return the program of a policy that is one graph whose inputs and outputs are the spec's."""
+    feeds = {tensor.name: tensor.name for tensor in spec.inputs}
+    gives = {tensor.name: tensor.name for tensor in spec.outputs}
+    return (ProgramStep(graph, feeds, gives),)
+
+
+def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: PolicySpec) -> None:
+    """Check that every value is there when it is needed and that every output of the spec is given.
+
+    Raises:
+        SpecError: naming the step and the value.
+    """
+    graph_names = list(graphs)
+    values = {tensor.name for tensor in spec.inputs}
+    for number, step in enumerate(program):
+        if step.graph not in graph_names:
+            raise SpecError(f"Step {number} runs the graph '{step.graph}'; {nearest(step.graph, graph_names)}.")
+        values |= step.sources()
+        for name in step.feeds.values():
+            if name not in values:
+                raise SpecError(
+                    f"Step {number} ({step.graph}) needs the value '{name}' before it exists; {nearest(name, values)}."
+                )
+        for given in step.carry:
+            if given not in step.gives.values():
+                raise SpecError(f"Step {number} carries '{given}', which '{step.graph}' does not give.")
+        values |= set(step.gives.values())
+    for tensor in spec.outputs:
+        if tensor.name not in values:
+            raise SpecError(f"No step of the program gives the output '{tensor.name}'; {nearest(tensor.name, values)}.")
+
+
+def _check_schema(schema: Any) -> None:
+    if not isinstance(schema, int) or schema < 1:
+        raise BundleError(f"The manifest has the schema {schema!r}; this vlatool reads 1 to {SCHEMA}.")
+    if schema > SCHEMA:
+        raise BundleError(
+            f"The bundle has the manifest schema {schema}; this vlatool reads up to {SCHEMA}.", "upgrade vlatool"
+        )
+
+
+def _inside(path: str) -> None:
+    pure = PurePosixPath(path)
+    if pure.is_absolute() or ".." in pure.parts or not path:
+        raise BundleError(f"The manifest names the file '{path}', which is not inside the bundle.")
+
+
+def _nonempty(value: Any) -> dict[str, Any]:
+    found = {}
+    for item in fields(value):
+        content = getattr(value, item.name)
+        if content not in ({}, [], "", 0) and not (item.name == "repeat" and content == 1):
+            found[item.name] = content
+    return found

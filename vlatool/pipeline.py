@@ -1,0 +1,284 @@
+"""``optimize``: export, quantize in several ways, measure and evaluate each, keep the fastest inside the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vlatool.benchmark.latency import Latency
+from vlatool.bundle import Bundle, writing
+from vlatool.errors import RecipeError, SourceError, VlatoolError
+from vlatool.evaluate._paired import compare_success
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.evaluate.recorded import EVALUATION, Recorded
+from vlatool.export.onnx import ExportOnnx
+from vlatool.finish import reseal
+from vlatool.judge import Judged, choose, judge
+from vlatool.launch import cached_measure, cached_transform
+from vlatool.predict import predictions
+from vlatool.profile import Profile
+from vlatool.recipe import Recipe, stage_entries
+from vlatool.render import write_reports
+from vlatool.report import Measurement, Report, Row
+from vlatool.sources._description import FILE, read_description
+from vlatool.sources.onnx import OnnxFile
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage import Context, Stage, Transform, build_stage
+
+BASELINE = "float32"
+ROBOT_FOLDERS = ("assets", "graphs", "golden")
+"""What of a bundle a robot needs; recorded data stays behind."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that ``optimize`` will do, checked, before anything runs."""
+
+    source: Transform
+    policy: Path | None
+    export: tuple[Transform, ...]
+    candidates: dict[str, tuple[Transform, ...]]
+    recipe: Recipe
+    profile: Profile
+    cache: Path
+
+    @property
+    def closed_loop(self) -> ClosedLoop | None:
+        """The closed-loop evaluation, None when the policy names no environment or no episodes are wanted."""
+        if self.policy is None or not self.recipe.effort.episodes:
+            return None
+        described = read_description(self.policy)
+        if not described.environment:
+            return None
+        return ClosedLoop(policy=self.policy, episodes=self.recipe.effort.episodes)
+
+    def lines(self) -> Iterator[str]:
+        """Describe the plan, a line for each stage."""
+        yield f"source      {self.source.name()} {self.policy or ''}".rstrip()
+        for stage in self.export:
+            yield f"export      {stage.name()} {_options(stage)}".rstrip()
+        for name, stages in self.candidates.items():
+            yield f"candidate   {name}: " + ", ".join(f"{stage.name()} {_options(stage)}".rstrip() for stage in stages)
+        effort = self.recipe.effort
+        yield f"benchmark   {effort.iterations} inferences of each, interleaved, {effort.threads} thread(s), this host"
+        loop = self.closed_loop
+        yield "evaluate    recorded observations" + (f", {loop.episodes} paired closed-loop episodes" if loop else "")
+        limits = self.recipe.limits
+        yield f"limits      drop <= {100 * limits.max_drop:g} points" + (f", {limits.hz:g} Hz" if limits.hz else "")
+        yield f"profile     {self.profile.name} (predicted, unless this host is that board)"
+        yield f"cache       {self.cache}"
+
+
+def source_stage(source: str) -> tuple[Transform, Path | None]:
+    """Turn what a person types as SOURCE into a stage and the policy's description.
+
+    Args:
+        source: A directory with ``policy.yaml``, a ``policy.yaml``, ``path.py:make`` (beside a ``policy.yaml``) or an
+            ONNX file.
+
+    Raises:
+        SourceError: when it is none of them.
+    """
+    path = Path(source)
+    if path.suffix == ".onnx":
+        beside = path.parent / FILE
+        return OnnxFile(model=path, policy=beside if beside.is_file() else None), None
+    if path.is_dir() or path.suffix in (".yaml", ".yml"):
+        read_description(path)
+        return TorchModule(policy=path), path
+    where, _, function = source.rpartition(":")
+    if where.endswith(".py") and function:
+        folder = Path(where).parent
+        if not Path(where).is_file():
+            raise SourceError(f"There is no file {where} (from '{source}').")
+        return TorchModule(policy=folder, factory=f"{Path(where).name}:{function}"), folder
+    raise SourceError(
+        f"'{source}' is no policy source.",
+        "give a directory with a policy.yaml, path/to/policy.py:make, or a .onnx file",
+    )
+
+
+def make_plan(source: str, profile: Profile, recipe: Recipe, cache: Path) -> Plan:
+    """Build and check every stage; nothing has run when this returns.
+
+    Raises:
+        VlatoolError: for the first thing that cannot work.
+    """
+    stage, policy = source_stage(source)
+    stage.check(None, profile)
+    export = () if isinstance(stage, OnnxFile) else _transforms(recipe.export)
+    candidates = {name: _transforms(stages) for name, stages in recipe.candidates.items()}
+    for name in candidates:
+        if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
+            raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
+    return Plan(stage, policy, export, candidates, recipe, profile, cache)
+
+
+def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) -> Report:
+    """Run a plan and write the chosen bundle with reports and the recipe that makes it again.
+
+    Finished stages are kept in the cache, so that an interrupted run continues where it was.
+
+    Returns:
+        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept).
+    """
+    with writing(out, force=force) as draft:
+        source = cached_transform(plan.source, None, plan.cache, context)
+        baseline = _chain(plan.export, source, plan, context)
+        bundles, failures = _candidates(plan, baseline, context)
+        rows = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
+        judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile) for row in rows.values()]
+        judged = choose(judged, plan.recipe.limits)
+        report = _report(plan, baseline, judged, failures, context)
+        chosen = next(item.row for item in judged if item.row.role == "chosen")
+        chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
+        _write_bundle(plan, chosen, chosen_bundle, draft)
+        write_reports(report, draft / "reports")
+    return report
+
+
+def _transforms(stages: Any) -> tuple[Transform, ...]:
+    built = []
+    for name, options in stage_entries(stages):
+        stage = build_stage(name, options or {})
+        if not isinstance(stage, Transform):
+            raise RecipeError(f"The stage {name} measures; a recipe lists stages that make a bundle.")
+        built.append(stage)
+    return tuple(built)
+
+
+def _chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: Context) -> Bundle:
+    bundle = source
+    for stage in stages:
+        context.tell(stage.name(), None)
+        stage.check(bundle, plan.profile)
+        bundle = cached_transform(stage, bundle, plan.cache, context)
+    return bundle
+
+
+def _candidates(plan: Plan, baseline: Bundle, context: Context) -> tuple[dict[str, Bundle], list[Row]]:
+    """Make every candidate; one that cannot be made becomes a row that says why."""
+    bundles, failures = {}, []
+    for name, stages in plan.candidates.items():
+        try:
+            bundles[name] = _chain(stages, baseline, plan, context)
+        except VlatoolError as error:
+            if error.exit_code not in (3, 4):
+                raise
+            failures.append(Row(name, "failed", error.message))
+    if not bundles:
+        raise RecipeError("No candidate could be made: " + "; ".join(f"{row.name}: {row.reason}" for row in failures))
+    return bundles, failures
+
+
+def _measure(plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context) -> dict[str, Row]:
+    """Return one row for each bundle with latency, memory, accuracy and predictions; the baseline is first."""
+    rows = _latency_rows(plan, source, bundles, context)
+    loop = plan.closed_loop
+    success: dict[str, Row] = {}
+    for name, bundle in bundles.items():
+        found: list[Measurement] = []
+        if EVALUATION in bundle.manifest.files:
+            recorded = Recorded(baseline=None if name == BASELINE else bundles[BASELINE].path)
+            found += cached_measure(recorded, bundle, plan.cache, context).rows[-1].measurements
+        row = rows[name]
+        if loop is not None:
+            success[name] = cached_measure(loop, bundle, plan.cache, context).rows[-1]
+            paired = success[name] if name == BASELINE else compare_success(success[BASELINE], success[name])
+            found += paired.measurements
+            row = replace(row, raw={**row.raw, **paired.raw}, details={**row.details, **paired.details})
+        found += predictions(plan.profile, bundle)
+        rows[name] = replace(row, measurements=(*row.measurements, *found))
+    return rows
+
+
+def _latency_rows(plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context) -> dict[str, Row]:
+    effort = plan.recipe.effort
+    torch = [source] if source.manifest.source and source.path != bundles[BASELINE].path else []
+    others = [bundle for name, bundle in bundles.items() if name != BASELINE]
+    against = tuple(bundle.path for bundle in [*others, *torch])
+    stage = Latency(against=against, iterations=effort.iterations, threads=effort.threads)
+    report = cached_measure(stage, bundles[BASELINE], plan.cache, context)
+    rows = dict(zip(bundles, report.rows, strict=False))
+    named = {name: replace(row, name=name) for name, row in rows.items()}
+    if torch:
+        eager = report.rows[-1].get("latency_p50")
+        if eager is not None:
+            own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
+            named[BASELINE] = replace(named[BASELINE], measurements=(*named[BASELINE].measurements, own))
+    return named
+
+
+def _report(plan: Plan, baseline: Bundle, judged: list[Judged], failures: list[Row], context: Context) -> Report:
+    from vlatool.host import fingerprint
+
+    rows = tuple(item.row for item in judged) + tuple(failures)
+    chosen = next(item for item in judged if item.row.role == "chosen")
+    limits = {"max_drop": plan.recipe.limits.max_drop, "hz": plan.recipe.limits.hz, "profile": plan.profile.name}
+    warnings = tuple(dict.fromkeys(warning for item in judged for warning in item.warnings))
+    return Report(
+        "optimize",
+        f"{baseline.manifest.name} for {plan.profile.name}",
+        "pass" if chosen.within else "fail",
+        summary=chosen.sentences,
+        rows=rows,
+        limits={key: value for key, value in limits.items() if value is not None},
+        command=context.command,
+        created=_now(),
+        environment=fingerprint(),
+        warnings=warnings,
+    )
+
+
+def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
+    accuracy = {}
+    for name in ("success", "success_drop", "agreement_expert", "error_expert"):
+        found = chosen.get(name)
+        if found is not None and found.known:
+            interval = {"low": found.low, "high": found.high} if found.low is not None else {}
+            accuracy[name] = {"value": found.value, **interval, "samples": found.samples}
+    made_by = {**bundle.manifest.made_by, "candidate": chosen.name, "profile": plan.profile.name}
+    manifest = replace(
+        bundle.manifest,
+        parent=bundle.hash,
+        made_by=made_by,
+        accuracy=accuracy,
+        source={},
+        files={graph.file: bundle.manifest.files[graph.file] for graph in bundle.manifest.graphs.values()},
+    )
+    reseal(bundle, draft, manifest, ROBOT_FOLDERS)
+    stages = plan.recipe.candidates.get(chosen.name)
+    repeat = plan.recipe if stages is None else plan.recipe.model_copy(update={"candidates": {chosen.name: stages}})
+    (draft / "recipe.yaml").write_text(repeat.to_yaml(), encoding="utf-8")
+
+
+def _options(stage: Stage) -> str:
+    return " ".join(f"{key}={value}" for key, value in stage.options().items())
+
+
+def _now() -> str:
+    from datetime import datetime, timezone
+
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def sourced(source: str, cache: Path, context: Context) -> Bundle:
+    """Return the source bundle of what a person typed as SOURCE."""
+    stage, _ = source_stage(source)
+    stage.check(None, None)
+    return cached_transform(stage, None, cache, context)
+
+
+def exported(source: str, cache: Path, context: Context) -> Bundle:
+    """Return a float32 bundle with graphs of what a person typed as SOURCE, exported with the default options."""
+    bundle = sourced(source, cache, context)
+    return bundle if bundle.manifest.graphs else cached_transform(ExportOnnx(), bundle, cache, context)
+
+
+def brings_calibration(source: str) -> bool:
+    """Say whether SOURCE brings calibration data, which static quantization needs."""
+    stage, policy = source_stage(source)
+    described = policy or getattr(stage, "policy", None)
+    return described is not None and read_description(described).calibration is not None

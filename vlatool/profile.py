@@ -1,0 +1,338 @@
+"""A hardware target: what a board has, who says so, and where the profiles are found.
+
+Every figure says where it comes from. ``kind`` is ``vendor`` (a data sheet), ``measured`` (on that board), ``derived``
+(computed from figures that were seen), ``estimate`` (a judgement) or ``unverified`` (recalled, to be checked).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+
+from vlatool.errors import ProfileError, nearest
+
+SEARCH_PATH = "VLATOOL_PROFILES"
+SUFFIXES = (".yaml", ".yml")
+
+Kind = Literal["vendor", "measured", "derived", "estimate", "unverified"]
+DTYPES = ("float32", "tf32", "float16", "bfloat16", "float8", "int8", "int4", "float4")
+GROUNDED: tuple[Kind, ...] = ("vendor", "measured", "derived")
+"""The kinds that rest on something that was seen."""
+
+
+def _known_dtype(name: str) -> str:
+    if name not in DTYPES:
+        raise ValueError(f"is not a dtype; {nearest(name, DTYPES)}")
+    return name
+
+
+Dtype = Annotated[str, AfterValidator(_known_dtype)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Figure(_Strict):
+    """A number with its source; the unit is in the name of the field that holds it.
+
+    Args:
+        value: Above zero.
+        kind: How well the number is founded.
+        source: A key of the profile's ``sources``.
+        note: Formula or reservation.
+    """
+
+    value: float = Field(gt=0)
+    kind: Kind
+    source: str
+    note: str = ""
+
+
+class Price(Figure):
+    """A list price in the year in which it was asked."""
+
+    year: int = Field(ge=2000)
+
+
+class Unit(_Strict):
+    """A part of the board that computes: its processor cores or its GPU.
+
+    Args:
+        cores: Processor cores, or streaming multiprocessors / execution units of a GPU.
+        clock_mhz: The highest clock; the peaks hold at it.
+        peak_tops: dtype -> 10^12 operations per second, dense, where a multiply-accumulate is two operations.
+        isa: Instruction set features that inference libraries use.
+        absent: Features that a reader might expect and that are not there.
+    """
+
+    title: str
+    cores: Figure
+    clock_mhz: Figure
+    peak_tops: dict[Dtype, Figure]
+    isa: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
+
+
+class Efficiency(_Strict):
+    """What an engine reaches in one dtype: shares of dense peak and bandwidth (0-1), microseconds for each layer.
+
+    ``peak`` names the dtype whose peak ``compute`` is a share of, where it is another one (TF32 for float32).
+    """
+
+    peak: Dtype | None = None
+    compute: float = Field(gt=0, le=1)
+    bandwidth: float = Field(gt=0, le=1)
+    layer_us: float = Field(ge=0)
+    kind: Kind
+    source: str
+    note: str = ""
+
+
+class EngineFigures(_Strict):
+    """An engine that runs on the board.
+
+    Args:
+        unit: Which of the profile's units computes.
+        int8_layout: Types of activations and weights that int8 is fastest in; empty where int8 is not supported.
+        dynamic_int8: Whether the engine computes dynamically quantized MatMul itself.
+        base_mb: Memory of a process that holds the engine and no model.
+        efficiency: dtype -> what the engine reaches; a dtype without published figures is left out.
+    """
+
+    unit: str
+    int8_layout: Literal["u8s8", "s8s8", ""]
+    dynamic_int8: bool
+    base_mb: Figure
+    efficiency: dict[Dtype, Efficiency] = Field(default_factory=dict)
+    note: str = ""
+
+
+class PowerMode(_Strict):
+    """Caps of a power mode, in absolute numbers for each unit; ``kind`` and ``source`` speak for all of them.
+
+    ``power_w`` is None when the mode has no budget.
+    """
+
+    power_w: float | None = Field(None, gt=0)
+    cores: dict[str, PositiveFloat]
+    clock_mhz: dict[str, PositiveFloat]
+    bandwidth_gb_s: float = Field(gt=0)
+    kind: Kind
+    source: str
+    note: str = ""
+
+
+class Software(_Strict):
+    """What comes with one release of the board's system."""
+
+    release: str
+    os: str
+    python: str
+    cuda: str | None = None
+    tensorrt: str | None = None
+    kind: Kind
+    source: str
+
+
+class Profile(_Strict):
+    """A hardware target.
+
+    Args:
+        name: As on the command line; lower case, digits and hyphens.
+        model_strings: What the board's firmware or processor calls itself (see ``vlatool.host.matches``).
+        memory_gb: Memory in GB (10^9 bytes), shared by CPU and GPU where ``unified``.
+        usable_memory_gb: What is left for a policy beside system, desktop and drivers.
+        bandwidth_gb_s: Peak memory bandwidth.
+        power_w: The most that the board draws.
+        units: Name -> what computes (``cpu``, ``gpu``).
+        engines: Engine -> how well it does here, the preferred one first.
+        modes: Name -> power mode.
+        default_mode: The mode in which the board starts.
+        caveats: What a person should know before trusting a plan for this board.
+        sources: Key -> public reference.
+    """
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    title: str
+    architecture: Literal["aarch64", "x86_64"]
+    model_strings: tuple[str, ...] = Field(min_length=1)
+    memory_gb: Figure
+    memory_options_gb: tuple[float, ...] = ()
+    usable_memory_gb: Figure
+    unified: bool = True
+    bandwidth_gb_s: Figure
+    power_w: Figure
+    price_usd: Price
+    units: dict[str, Unit] = Field(min_length=1)
+    engines: dict[str, EngineFigures] = Field(min_length=1)
+    modes: dict[str, PowerMode] = Field(min_length=1)
+    default_mode: str
+    software: tuple[Software, ...] = ()
+    caveats: tuple[str, ...] = ()
+    sources: dict[str, str] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Profile:
+        problems = [*_wrong_sources(self, self.sources), *_wrong_names(self)]
+        if self.usable_memory_gb.value > self.memory_gb.value:
+            problems.append("usable_memory_gb.value: is more than memory_gb")
+        if problems:
+            raise ProfileError("\n".join(problems))
+        return self
+
+    @property
+    def engine(self) -> str:
+        """The preferred engine."""
+        return next(iter(self.engines))
+
+    @property
+    def int8_layout(self) -> str:
+        """Types of activations and weights that the preferred engine computes int8 in: ``u8s8`` or ``s8s8``."""
+        return self.engines[self.engine].int8_layout
+
+    def mode(self, name: str | None = None) -> PowerMode:
+        """Return a power mode, the default one for None.
+
+        Raises:
+            ProfileError: when the board has no such mode.
+        """
+        wanted = self.default_mode if name is None else name
+        if wanted not in self.modes:
+            raise ProfileError(f"{self.name} has no power mode '{wanted}'; {nearest(wanted, self.modes)}.")
+        return self.modes[wanted]
+
+    def peak_tops(self, unit: str, dtype: str, mode: str | None = None) -> float | None:
+        """Return the dense peak in 10^12 operations per second in a power mode; None where it is not known.
+
+        The peak scales with the cores that are on and with their clock.
+        """
+        caps, part = self.mode(mode), self.units[unit]
+        if dtype not in part.peak_tops:
+            return None
+        cores = caps.cores.get(unit, part.cores.value) / part.cores.value
+        clock = caps.clock_mhz.get(unit, part.clock_mhz.value) / part.clock_mhz.value
+        return part.peak_tops[dtype].value * cores * clock
+
+
+KEYS = {
+    key
+    for model in (Profile, Unit, EngineFigures, Efficiency, PowerMode, Software, Price)
+    for key in model.model_fields
+}
+
+
+def names() -> list[str]:
+    """List the profiles that ``load_profile`` finds by name."""
+    return sorted(_found())
+
+
+def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
+    """Read a profile by name, or from a YAML file of the user.
+
+    Directories named in ``VLATOOL_PROFILES`` (separated by ``:``) come before the profiles that are shipped.
+
+    Raises:
+        ProfileError: when there is no such profile, or with one line for each thing that is wrong in it.
+
+    Example:
+        >>> load_profile("raspberry-pi-5").units["cpu"].cores.value
+        4.0
+    """
+    wanted = os.fspath(name_or_path)
+    if wanted.endswith(SUFFIXES) or os.sep in wanted:
+        path = Path(wanted)
+    elif wanted in (found := _found()):
+        path = found[wanted]
+    else:
+        fix = f"name one of these or a YAML file, or add a directory to {SEARCH_PATH}"
+        raise ProfileError(f"There is no profile '{wanted}'; {nearest(wanted, found)}.", fix)
+    data = _read(path)
+    try:
+        return Profile.model_validate(data)
+    except ValidationError as error:
+        problems = [_problem(item) for item in error.errors(include_url=False)]
+    except ProfileError as error:  # from the checks between fields; pydantic lets foreign exceptions through
+        problems = error.message.splitlines()
+    listed = "\n".join(f"  {problem}" for problem in problems)
+    raise ProfileError(f"The profile {path} is malformed:\n{listed}", "correct these lines of the file")
+
+
+def _found() -> dict[str, Path]:
+    """Profile name -> file; the first directory that has it wins."""
+    package = Path(__file__).resolve().parent
+    shipped = next((place for place in (package / "_profiles", package.parent / "profiles") if place.is_dir()), None)
+    own = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
+    files = [path for folder in (*own, shipped) if folder and folder.is_dir() for path in sorted(folder.iterdir())]
+    return {path.stem: path for path in reversed(files) if path.suffix in SUFFIXES}
+
+
+def _read(path: Path) -> Any:
+    import yaml
+
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ProfileError(f"The profile {path} cannot be read: {error.strerror}.") from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ProfileError(f"The profile {path} is not valid YAML: {' '.join(str(error).split())}.") from error
+    if not isinstance(data, dict):
+        raise ProfileError(f"The profile {path} must be a mapping; got {type(data).__name__}.")
+    return data
+
+
+WORDS = {
+    "missing": "is missing",
+    "model_type": "must be a mapping",
+    "dict_type": "must be a mapping",
+    "too_short": "needs at least one entry",
+    "float_parsing": "must be a number",
+    "string_pattern_mismatch": "must be lower-case letters, digits and hyphens",
+}
+
+
+def _problem(error: ErrorDetails) -> str:
+    """Return ``field: what is wrong`` for one finding of pydantic."""
+    kind, got = error["type"], f"; got {error['input']!r}"
+    where = ".".join(str(part) for part in error["loc"] if part != "[key]")
+    if kind == "extra_forbidden":
+        hint, _, _ = nearest(str(error["loc"][-1]), KEYS).rpartition(" known: ")
+        return f"{where}: is not a known key; {hint}".removesuffix("; ")
+    if kind == "value_error":
+        return f"{where}: {error['msg'].removeprefix('Value error, ')}"
+    words = error["msg"].replace("Input should be", "must be").replace("greater than 0", "above 0")
+    return f"{where}: {WORDS.get(kind, words)}{'' if kind == 'missing' else got}"
+
+
+def _wrong_sources(value: Any, sources: Mapping[str, str], where: str = "") -> Iterator[str]:
+    """Yield a problem for each figure below ``value`` whose source is not listed."""
+    if isinstance(value, BaseModel):
+        source = getattr(value, "source", None)
+        if source is not None and source not in sources:
+            yield f"{where}source: '{source}' is not in sources; {nearest(source, sources)}"
+        value = dict(value)
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple) else ()
+    for key, item in items:
+        yield from _wrong_sources(item, sources, f"{where}{key}.")
+
+
+def _wrong_names(profile: Profile) -> Iterator[str]:
+    """Yield a problem for each reference to a unit or mode that does not exist."""
+    if profile.default_mode not in profile.modes:
+        yield f"default_mode: '{profile.default_mode}' is not in modes; {nearest(profile.default_mode, profile.modes)}"
+    for name, engine in profile.engines.items():
+        if engine.unit not in profile.units:
+            yield f"engines.{name}.unit: '{engine.unit}' is not in units; {nearest(engine.unit, profile.units)}"
+            continue
+        peaks = profile.units[engine.unit].peak_tops
+        for dtype, efficiency in engine.efficiency.items():
+            if (efficiency.peak or dtype) not in peaks:
+                yield f"engines.{name}.efficiency.{dtype}: {engine.unit} has no peak_tops.{efficiency.peak or dtype}"
+    for name, mode in profile.modes.items():
+        for unit in {*mode.cores, *mode.clock_mhz} - {*profile.units}:
+            yield f"modes.{name}: '{unit}' is not in units; {nearest(unit, profile.units)}"

@@ -1,0 +1,1 @@
+"""Quantization methods: from a bundle to a bundle of lower precision."""

@@ -1,0 +1,48 @@
+"""Dynamic int8: weights ahead of time, activations at run time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import ClassVar
+
+from pydantic import Field
+
+from vlatool.bundle import Bundle
+from vlatool.quantize._graphs import Quantization, load, quantization_library, quiet_quantizer, save
+from vlatool.stage import Context
+
+OPS = ("MatMul", "Gemm")
+
+
+class DynamicInt8(Quantization):
+    """Quantize weights of MatMul and Gemm to int8; activations get their scale at run time (uint8, per tensor).
+
+    Needs no calibration data. Convolutions stay in float32: dynamic int8 convolutions (ConvInteger) are slower than
+    float32 ones on every CPU measured.
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
+
+    per_channel: bool = Field(True, description="one weight scale for each output channel")
+    reduce_range: bool = Field(False, description="7-bit weights, for x86 processors without VNNI")
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Quantize every selected graph."""
+        return self.transform(source, out, context, self._quantize)
+
+    def _quantize(self, name: str, original: Path, target: Path) -> None:
+        quantization = quantization_library()
+        model = load(original)
+        excluded = self.excluded_nodes(model, OPS)
+        with quiet_quantizer() as scratch:
+            quantization.quantize_dynamic(
+                model,
+                scratch / "model.onnx",
+                op_types_to_quantize=list(OPS),
+                per_channel=self.per_channel,
+                reduce_range=self.reduce_range,
+                weight_type=quantization.QuantType.QInt8,
+                nodes_to_exclude=excluded,
+                extra_options={"MatMulConstBOnly": True},
+            )
+            save(load(scratch / "model.onnx"), target)

@@ -1,0 +1,102 @@
+"""A recipe: what ``optimize`` does with a policy, as YAML that a person can read, keep and repeat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vlatool.errors import RecipeError, require
+
+StageList = tuple[dict[str, dict[str, Any]], ...]
+"""Stages in order, each a mapping of one name to its options."""
+
+
+class Limits(BaseModel):
+    """What a candidate must keep to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_drop: float = Field(0.01, ge=0, le=1, description="largest drop against float32, a share (0.01 = 1 point)")
+    hz: float | None = Field(None, gt=0, description="inferences per second")
+
+
+class Effort(BaseModel):
+    """How much is measured."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    episodes: int = Field(200, ge=0, description="closed-loop episodes of each candidate; 0 for none")
+    iterations: int = Field(200, ge=20, description="timed inferences of each candidate")
+    threads: int = Field(1, ge=1, description="intra-op threads while timing")
+
+
+class Recipe(BaseModel):
+    """Export, candidates and limits of one ``optimize`` run."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_: int = Field(1, alias="schema", ge=1, le=1)
+    export: StageList = ({"export.onnx": {}},)
+    candidates: dict[str, StageList] = Field(min_length=1)
+    limits: Limits = Limits()
+    effort: Effort = Effort()
+
+    def to_yaml(self) -> str:
+        """Return YAML that ``read_recipe`` turns back into an equal recipe."""
+        yaml = require("yaml", "build")
+        plain = self.model_dump(mode="json", by_alias=True)
+        text: str = yaml.safe_dump(plain, sort_keys=False, default_flow_style=False)
+        return text
+
+
+def default_recipe(limits: Limits, effort: Effort, calibrated: bool) -> Recipe:
+    """Return the candidates that are tried when the user names none.
+
+    Args:
+        calibrated: Whether the policy brings calibration data, without which static quantization is impossible.
+    """
+    candidates: dict[str, StageList] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
+    if calibrated:
+        candidates["static_int8"] = ({"quantize.static_int8": {}},)
+        candidates["static_int8_percentile"] = ({"quantize.static_int8": {"method": "percentile"}},)
+    return Recipe(candidates=candidates, limits=limits, effort=effort)
+
+
+def read_recipe(path: Path) -> Recipe:
+    """Read a recipe file.
+
+    Raises:
+        RecipeError: when the file is missing, is not YAML, or says something impossible; lists every problem.
+    """
+    yaml = require("yaml", "build")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise RecipeError(f"There is no recipe {path}.") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise RecipeError(f"The recipe {path} cannot be read: {error}.") from error
+    except yaml.YAMLError as error:
+        raise RecipeError(f"The recipe {path} is not valid YAML: {' '.join(str(error).split())}.") from error
+    if not isinstance(data, dict):
+        raise RecipeError(f"The recipe {path} must be a mapping; got {type(data).__name__}.")
+    try:
+        return Recipe.model_validate(data)
+    except ValidationError as error:
+        problems = [f"{'.'.join(map(str, item['loc'])) or 'recipe'}: {item['msg']}" for item in error.errors()]
+        raise RecipeError(f"The recipe {path}: {'; '.join(problems)}.") from error
+
+
+def stage_entries(stages: StageList) -> list[tuple[str, dict[str, Any]]]:
+    """Return (name, options) of each stage.
+
+    Raises:
+        RecipeError: when an entry is not a mapping of one name to options.
+    """
+    found: list[tuple[str, dict[str, Any]]] = []
+    for entry in stages:
+        if len(entry) != 1:
+            raise RecipeError(f"A stage is one name with its options; got {entry}.")
+        found.extend(entry.items())
+    return found

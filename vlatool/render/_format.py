@@ -1,0 +1,226 @@
+"""Numbers and names for a reader: three significant digits, the unit beside, intervals as precise as their value."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from typing import Any
+
+from vlatool.report import Measurement
+
+UNMEASURED = "unmeasured"
+NARROW_SPACE = "\u202f"
+MINUS = "\u2212"
+LABELS = {
+    "speedup": "speed-up",
+    "peak_rss": "peak memory",
+    "mcnemar_p": "McNemar p",
+    "success_drop": "success drop",
+}
+LIMIT_UNITS = {
+    "ms": "ms", "s": "s", "mb": "MB", "gb": "GB", "hz": "Hz", "w": "W", "mj": "mJ", "j": "J", "m": "m", "rad": "rad",
+    "points": "points", "percent": "%",
+}  # fmt: skip
+POINTS = ("_drop", "_points", "_difference")
+NOT_SHARES = re.compile(r"^error|(^|_)p(_?value)?$|ratio")
+
+
+def plain(text: object) -> str:
+    """Return text on one line without control characters, so that a name cannot steer a terminal or break a table."""
+    spaced = re.sub(r"[^\S\xa0\u202f]+", " ", str(text))
+    return "".join(char for char in spaced if unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Co", "Cn"))
+
+
+def label(name: str) -> str:
+    """Return a measurement's name as words: ``latency_p50`` -> ``latency p50``."""
+    if name in LABELS:
+        return LABELS[name]
+    whole, dot, part = name.partition(".")
+    words = re.sub(r"^(error|agreement|gripper_flips)_(baseline|expert)$", r"\1 vs \2", whole).replace("_", " ")
+    return plain(f"{words}, {part}" if dot else words)
+
+
+def decimals_of(value: float, digits: int = 3) -> int:
+    """Return the decimals that show ``digits`` significant digits of a number."""
+    if value == 0 or not math.isfinite(value):
+        return 0
+    places = digits - 1 - math.floor(math.log10(abs(value)))
+    rounded = round(value, places)
+    return max(0, digits - 1 - math.floor(math.log10(abs(rounded))))
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Return a number with that many decimals, a true minus sign, and thin spaces in thousands from 10 000 on."""
+    if math.isinf(value):
+        return "∞" if value > 0 else f"{MINUS}∞"
+    rounded = round(value, decimals) + 0.0
+    text = f"{abs(rounded):,.{decimals}f}"
+    text = text.replace(",", NARROW_SPACE if abs(rounded) >= 10_000 else "")
+    return f"{MINUS}{text}" if rounded < 0 else text
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with ``digits`` significant digits; NaN is ``unmeasured``.
+
+    Example:
+        >>> number(0.012345), number(1234.5), number(5)
+        ('0.0123', '1234', '5')
+    """
+    if math.isnan(value):
+        return UNMEASURED
+    if float(value).is_integer() and abs(value) < 1e9:
+        return fixed(value, 0)
+    if _scientific(value):
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa.replace('-', MINUS)}e{int(exponent)}"
+    return fixed(value, decimals_of(value, digits))
+
+
+def significant(value: float) -> str:
+    """Return a measured number: three significant digits, trailing zeros kept, because they are known."""
+    if value == 0 or not math.isfinite(value) or _scientific(value):
+        return number(value)
+    return fixed(value, decimals_of(value))
+
+
+def tick(value: float) -> str:
+    """Return a round number without trailing zeros, for an axis."""
+    return number(value) if _scientific(value) else f"{value:.10g}".replace("-", MINUS)
+
+
+def _scientific(value: float) -> bool:
+    return math.isfinite(value) and value != 0 and not 1e-4 <= abs(value) < 1e9
+
+
+def count(samples: int) -> str:
+    """Return ``n = 1000``, or nothing when the count is not known."""
+    return f"n = {fixed(samples, 0)}" if samples > 0 else ""
+
+
+def is_share(measurement: Measurement) -> bool:
+    """Return whether a number without a unit is a share of something, to be shown in per cent."""
+    if measurement.unit != "1" or NOT_SHARES.search(measurement.name):
+        return False
+    return not measurement.known or abs(measurement.value) <= 1
+
+
+def is_points(measurement: Measurement) -> bool:
+    """Return whether a share is a difference of shares, to be shown in percentage points."""
+    return is_share(measurement) and measurement.name.endswith(POINTS)
+
+
+def _factor(measurement: Measurement) -> float:
+    if is_share(measurement):
+        return 100.0
+    return 1000.0 if _in_millimetres(measurement) else 1.0
+
+
+def _in_millimetres(measurement: Measurement) -> bool:
+    return measurement.unit == "m" and measurement.name.startswith("error")
+
+
+def unit(measurement: Measurement) -> str:
+    """Return the unit as it is printed beside the number; action errors in metres are shown in millimetres."""
+    if is_points(measurement):
+        return "points"
+    if is_share(measurement):
+        return "%"
+    if _in_millimetres(measurement):
+        return "mm"
+    return {"1": "", "x": "×"}.get(measurement.unit, plain(measurement.unit))
+
+
+def _decimals(measurement: Measurement, value: float) -> int:
+    if not is_share(measurement):
+        return decimals_of(value) if value else decimals_of(measurement.high or 0.0)
+    edge = 100.0 if abs(value) > 50 else 0.0
+    decimals = 1 if is_points(measurement) or abs(value) >= 1 or value == 0 else min(4, decimals_of(value, 2))
+    while decimals < 4 and abs(value) != edge and round(abs(value), decimals) == edge:
+        decimals += 1
+    return decimals
+
+
+def value(measurement: Measurement) -> str:
+    """Return the number without its unit, shares in per cent."""
+    if not measurement.known:
+        return UNMEASURED
+    shown = measurement.value * _factor(measurement)
+    if not is_share(measurement) and _scientific(shown):
+        return number(shown)
+    return fixed(shown, _decimals(measurement, shown) if shown or is_share(measurement) else 0)
+
+
+def interval(measurement: Measurement) -> str:
+    """Return ``97.4–99.0``, in the unit and with the decimals of the value; nothing when there is no interval."""
+    low, high = measurement.low, measurement.high
+    if low is None or high is None or not measurement.known:
+        return ""
+    factor = _factor(measurement)
+    low, high = low * factor, high * factor
+    decimals = _decimals(measurement, measurement.value * factor)
+    while decimals < 6 and low != high and round(low, decimals) == round(high, decimals):
+        decimals += 1
+    if not is_share(measurement) and (_scientific(measurement.value * factor) or math.isinf(low) or math.isinf(high)):
+        ends = [number(low), number(high)]
+    else:
+        ends = [fixed(low, decimals), fixed(high, decimals)]
+    return " to ".join(ends) if low < 0 else "–".join(ends)
+
+
+def is_usual(measurement: Measurement) -> bool:
+    """Return whether the interval covers the usual 95 %, so that it needs no mark."""
+    return abs(measurement.confidence - 0.95) < 1e-9
+
+
+def span(measurement: Measurement) -> str:
+    """Return the interval, marked with its coverage when that is not 95 %."""
+    found = interval(measurement)
+    return found if is_usual(measurement) or not found else f"{number(measurement.confidence * 100)} %: {found}"
+
+
+def aside(measurement: Measurement) -> str:
+    """Return what stands in brackets behind a number: interval and count."""
+    return ", ".join(part for part in (span(measurement), count(measurement.samples)) if part)
+
+
+def quantity(measurement: Measurement) -> str:
+    """Return the number with its unit, or ``unmeasured``."""
+    text, beside = value(measurement), unit(measurement)
+    if not measurement.known or not beside:
+        return text
+    return text + beside if beside == "×" else f"{text} {beside}"
+
+
+def full(measurement: Measurement) -> str:
+    """Return the number with everything that qualifies it.
+
+    Example:
+        >>> full(Measurement("success", 0.984, "1", samples=1000, low=0.974, high=0.99))
+        '98.4 % (97.4–99.0, n = 1000)'
+    """
+    if not measurement.known:
+        return f"{UNMEASURED}: {plain(measurement.note)}" if measurement.note else UNMEASURED
+    brackets = aside(measurement)
+    return f"{quantity(measurement)} ({brackets})" if brackets else quantity(measurement)
+
+
+def limit(name: str, wanted: Any) -> tuple[str, str]:
+    """Return a limit's name as words and its value with the unit that ends the name."""
+    words, _, last = name.rpartition("_")
+    if words and last in LIMIT_UNITS:
+        return plain(words.replace("_", " ")), f"{cell(wanted)} {LIMIT_UNITS[last]}"
+    return plain(name.replace("_", " ")), cell(wanted)
+
+
+def cell(content: Any) -> str:
+    """Return a cell of a details table, or a fact of the environment, as text."""
+    if content is None:
+        return "–"
+    if isinstance(content, bool):
+        return "yes" if content else "no"
+    if isinstance(content, float):
+        return "–" if math.isnan(content) else f"{content:.4g}".replace("-", MINUS)
+    if isinstance(content, list | tuple):
+        return ", ".join(cell(item) for item in content)
+    return plain(content)

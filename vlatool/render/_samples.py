@@ -1,0 +1,55 @@
+"""Thousands of raw samples as a few points that keep their shape: quantiles, a histogram, an envelope."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+
+def finite(samples: Sequence[float | None]) -> list[float]:
+    """Return the samples that are numbers (a NaN is null in JSON)."""
+    return [float(sample) for sample in samples if sample is not None and math.isfinite(sample)]
+
+
+def quantile(ordered: Sequence[float], share: float) -> float:
+    """Return the smallest sample that at least that share of the samples does not exceed."""
+    return ordered[max(0, math.ceil(share * len(ordered) - 1e-9) - 1)]
+
+
+def ecdf(ordered: Sequence[float], points: int = 120) -> list[tuple[float, float]]:
+    """Return (sample, share of samples that are not larger), at most about ``points`` of them, the tail kept finer."""
+    size = len(ordered)
+    if size <= points:
+        return [(sample, (index + 1) / size) for index, sample in enumerate(ordered)]
+    shares = sorted({*(index / points for index in range(1, points)), 0.995, 0.999, 1.0})
+    return [(ordered[0], 1 / size), *((quantile(ordered, share), share) for share in shares)]
+
+
+def histogram(samples: Sequence[float], place: Callable[[float], float], bins: int) -> list[int]:
+    """Count samples in equal bins of ``place(sample)``, which is 0-1 inside; those outside are not counted."""
+    counts = [0] * bins
+    for sample in samples:
+        position = place(sample)
+        if 0 <= position <= 1:
+            counts[min(bins - 1, int(position * bins))] += 1
+    return counts
+
+
+def envelope(samples: Sequence[float], bins: int) -> list[tuple[float, float, float]]:
+    """Return (smallest, median, largest) of consecutive stretches, in the order of time."""
+    bins = min(bins, len(samples))
+    edges = [round(index * len(samples) / bins) for index in range(bins + 1)]
+    stretches = [sorted(samples[start:end]) for start, end in pairwise(edges)]
+    return [(part[0], part[len(part) // 2], part[-1]) for part in stretches]
+
+
+def sparkline(samples: Sequence[float], bins: int) -> str:
+    """Return a histogram of one line of text, from the smallest sample to the 99th percentile."""
+    ordered = sorted(samples)
+    low, high = ordered[0], quantile(ordered, 0.99)
+    if high <= low:
+        return "█"
+    counts = histogram(ordered, lambda sample: (sample - low) / (high - low), bins)
+    peak = max(counts)
+    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * found / peak)] for found in counts)

@@ -1,0 +1,271 @@
+"""What a report holds, sorted for a reader; shared by all formats, so that they show the same in the same order."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vlatool.render._format import cell, fixed, interval, is_usual, label, plain
+from vlatool.report import Measurement, Report, Row
+
+ACCURACY = ("success", "agreement", "agreement_expert", "agreement_baseline")
+ERRORS = ("error", "error_expert", "error_baseline")
+ROLES = {"subject": "measured", "within": "within limits", "outside": "outside limits"}
+ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
+SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts; ``numeric`` tells which columns to align right."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numeric: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The latency that a chart shows, and the limit on it when one was asked for."""
+
+    name: str
+    limit: float | None
+    limit_name: str = ""
+
+
+def measured(report: Report, name: str) -> list[Measurement | None]:
+    """Return the measured number of that name, one for each row."""
+    return [row.get(name) for row in report.rows]
+
+
+def names(report: Report, origin: str = "measured", where: str | None = None) -> list[str]:
+    """Return the names of measurements in the order of their first appearance."""
+    found: dict[str, None] = {}
+    for row in report.rows:
+        for item in row.measurements:
+            if item.origin == origin and where in (None, item.where):
+                found[item.name] = None
+    return list(found)
+
+
+def headline(report: Report) -> list[str]:
+    """Return the names of the few measured numbers that decide."""
+    present = names(report)
+    accuracy = ["success", "success_drop"] if "success" in present else [*ACCURACY[1:], *ERRORS]
+    wanted = ["latency_p50", "speedup", *accuracy, "size", "peak_rss"]
+    return [name for name in wanted if name in present]
+
+
+def other_names(report: Report) -> list[str]:
+    """Return the measured names that neither the headline nor the error table shows."""
+    shown = set(headline(report))
+    return [name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name)]
+
+
+def short(name: str) -> str:
+    """Return the column title of a headline number."""
+    return SHORT.get(name, label(name))
+
+
+def error_groups(report: Report) -> dict[str, list[str]]:
+    """Return ``error_baseline`` -> the full names of its measured dimensions."""
+    groups: dict[str, list[str]] = {}
+    for name in names(report):
+        if found := ERROR_OF_DIMENSION.match(name):
+            groups.setdefault(found[1], []).append(name)
+    return groups
+
+
+def dimension(name: str) -> str:
+    """Return ``dx`` of ``error_baseline.dx``."""
+    return plain(name.partition(".")[2])
+
+
+def places(report: Report, origin: str) -> list[str]:
+    """Return where the numbers of an origin were measured, or what they were predicted for."""
+    return list(dict.fromkeys(item.where for row in report.rows for item in row.measurements if item.origin == origin))
+
+
+def processor(report: Report) -> str:
+    """Return the processor of the machine that made the report, or nothing."""
+    found = report.environment.get("cpu") or report.environment.get("processor") or ""
+    if isinstance(found, Mapping):
+        found = next((found[key] for key in ("model", "name", "brand") if found.get(key)), "")
+    return plain(found)
+
+
+def place(report: Report, where: str) -> str:
+    """Return a place for a reader; ``this host`` gets its processor."""
+    cpu = processor(report) if where == "this host" else ""
+    return f"{plain(where)}: {cpu}" if cpu else plain(where)
+
+
+def measured_where(report: Report) -> str:
+    """Return the heading of the measured block."""
+    found = places(report, "measured")
+    return "Measured on " + "; ".join(place(report, where) for where in found) if found else "Nothing was measured"
+
+
+def brackets(report: Report, origin: str, where: str | None = None) -> str:
+    """Return a sentence on what the ranges are; nothing when there are none of the usual coverage."""
+    spans = [
+        item
+        for row in report.rows
+        for item in row.measurements
+        if item.origin == origin and where in (None, item.where) and interval(item)
+    ]
+    usual = sum(is_usual(item) for item in spans)
+    if not usual:
+        return ""
+    what = "95 % intervals" if origin == "measured" else "the model's 95 % error intervals"
+    return f"Ranges are {what}{'' if usual == len(spans) else ' unless marked'}."
+
+
+def notes(
+    report: Report, origin: str, chosen: Callable[[Measurement], bool] = lambda item: True, where: str | None = None
+) -> dict[str, list[str]]:
+    """Return note -> the labels of the measurements that carry it."""
+    found: dict[str, list[str]] = {}
+    for row in report.rows:
+        for item in row.measurements:
+            if item.note and item.origin == origin and where in (None, item.where) and chosen(item):
+                labels = found.setdefault(plain(item.note), [])
+                group = ERROR_OF_DIMENSION.match(item.name)
+                words = f"{label(group[1])} by dimension" if group else label(item.name)
+                if words not in labels:
+                    labels.append(words)
+    return found
+
+
+def matrix(
+    report: Report, shown: Sequence[str], origin: str, where: str | None
+) -> tuple[list[str], list[list[Measurement | None]]]:
+    """Return the names of the variants that have such numbers, and for each number what each of them has."""
+    found = [
+        {item.name: item for item in row.measurements if item.origin == origin and where in (None, item.where)}
+        for row in report.rows
+    ]
+    kept = [index for index, items in enumerate(found) if any(name in items for name in shown)]
+    cells = [[found[index].get(name) for index in kept] for name in shown]
+    return [report.rows[index].name for index in kept], cells
+
+
+def unmeasured(report: Report) -> list[str]:
+    """Return a sentence for each number that could not be had."""
+    found = []
+    for row in report.rows:
+        for item in row.measurements:
+            if not item.known:
+                reason = f": {plain(item.note)}" if item.note else ""
+                found.append(
+                    f"{plain(row.name)}, {label(item.name)}, {item.origin} for {plain(item.where)}{reason}"
+                    if item.origin == "predicted"
+                    else f"{plain(row.name)}, {label(item.name)}{reason}"
+                )
+    return found
+
+
+def role(row: Row) -> str:
+    """Return the role in words."""
+    return ROLES.get(row.role, row.role)
+
+
+def latency(report: Report) -> Latency:
+    """Return which latency percentile the limit speaks of, and the limit."""
+    present = names(report)
+    for name, wanted in report.limits.items():
+        numeric = isinstance(wanted, int | float) and not isinstance(wanted, bool)
+        if numeric and name.endswith("_ms") and ("latency" in name or "deadline" in name):
+            hit = re.search(r"p\d+", name)
+            chosen = f"latency_{hit[0]}" if hit else "latency_p50"
+            if chosen in present:
+                return Latency(chosen, float(wanted), plain(name))
+    return Latency("latency_p50", None)
+
+
+def accuracy(report: Report) -> str:
+    """Return the name of the number that says how well the variants do their task; empty when there is none."""
+    for name in (*ACCURACY, *ERRORS):
+        if any(item is not None and math.isfinite(item.value) for item in measured(report, name)):
+            return name
+    return ""
+
+
+def floor(report: Report, name: str) -> float | None:
+    """Return the least success that the limits allow: given, or the baseline's less the allowed drop."""
+    for key, wanted in report.limits.items():
+        if name != "success" or "success" not in key or isinstance(wanted, bool) or not isinstance(wanted, int | float):
+            continue
+        share = wanted / 100 if key.endswith(("_points", "_percent")) else float(wanted)
+        if "drop" not in key:
+            return share
+        for row in report.rows:
+            if row.role == "baseline" and (found := row.get(name)) and found.known:
+                return found.value - share
+    return None
+
+
+def facts(environment: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Return the environment as (dotted name, text) pairs."""
+    found: list[tuple[str, str]] = []
+    for key, content in environment.items():
+        name = f"{prefix}{plain(key)}"
+        if isinstance(content, Mapping):
+            found += facts(content, f"{name}.")
+        else:
+            found.append((name, cell(content)))
+    return found
+
+
+def details(report: Report) -> list[Table]:
+    """Return the details of all rows; the same table of several variants becomes one, with a column for the variant."""
+    by_title: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for row in report.rows:
+        for title, records in row.details.items():
+            records = [record for record in records if record]
+            by_title.setdefault(title, []).extend((row.name, dict(record)) for record in records)
+    return [_details_table(plain(title), records) for title, records in by_title.items() if records]
+
+
+def _details_table(title: str, records: list[tuple[str, dict[str, Any]]]) -> Table:
+    columns = list(dict.fromkeys(key for _, record in records for key in record))
+    several = len({name for name, _ in records}) > 1
+    if several:
+        order = list(dict.fromkeys(cell(record.get(columns[0])) for _, record in records))
+        records = sorted(records, key=lambda item: order.index(cell(item[1].get(columns[0]))))
+    numeric = [
+        all(
+            isinstance(record.get(key), int | float | None) and not isinstance(record.get(key), bool)
+            for _, record in records
+        )
+        for key in columns
+    ]
+    by_column = [_cells([record.get(key) for _, record in records]) for key in columns]
+    rows = list(zip(*by_column, strict=True))
+    heads = tuple(plain(key) for key in columns)
+    if not several:
+        only = plain(records[0][0])
+        return Table(f"{title}: {only}", heads, tuple(rows), tuple(numeric))
+    lead: list[tuple[str, ...]] = []
+    group = ""
+    for (name, _), row in zip(records, rows, strict=True):
+        again = bool(lead) and row[0] == group
+        group = row[0]
+        lead.append(("" if again and not numeric[0] else row[0], plain(name), *row[1:]))
+    return Table(title, (heads[0], "variant", *heads[1:]), tuple(lead), (numeric[0], False, *numeric[1:]))
+
+
+def _cells(contents: list[Any]) -> list[str]:
+    """Return the texts of one column; its floats get the same decimals."""
+    floats = [item for item in contents if isinstance(item, float) and math.isfinite(item)]
+    texts = [f"{item:.4g}" for item in floats]
+    if any("e" in text for text in texts):
+        return [cell(item) for item in contents]
+    decimals = max((len(text.partition(".")[2]) for text in texts), default=0)
+    return [
+        fixed(item, decimals) if isinstance(item, float) and math.isfinite(item) else cell(item) for item in contents
+    ]

@@ -1,0 +1,76 @@
+"""The report as one HTML file: no script, no network, no font; light, dark, narrow and on paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from vlatool.render import _sections as part
+from vlatool.render._css import stylesheet
+from vlatool.render._distribution import beyond, distribution, left_out, over_time, sampled
+from vlatool.render._format import label
+from vlatool.render._scatter import points, scatter
+from vlatool.render._view import accuracy, details, latency, measured_where
+from vlatool.report import Report
+
+WIDTHS = {"wide": 996, "narrow": 366}
+
+
+class HtmlRenderer:
+    """Writes one self-contained page, with charts as inline SVG."""
+
+    def render(self, report: Report) -> str:
+        """Return the page."""
+        body = "".join(
+            (
+                part.head(report),
+                part.variants(report),
+                self._spread(report),
+                self._trade(report),
+                part.errors(report),
+                part.others(report),
+                part.tables(details(report)),
+                part.predicted(report),
+                self._time(report),
+                part.circumstances(report),
+            )
+        )
+        return (
+            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width,initial-scale=1">'
+            f'<meta name="color-scheme" content="light dark"><title>{part.safe(report.title)}</title>'
+            f"<style>{stylesheet()}</style></head>\n<body><main>{body}</main></body></html>\n"
+        )
+
+    def _spread(self, report: Report) -> str:
+        if not sampled(report):
+            return ""
+        limit = latency(report).limit
+        sub = "Each curve climbs to the share of inferences that were at least as fast. Below, the same samples as "
+        sub += f"histograms; the two ticks are median and 99th percentile. {beyond(report, limit)} {left_out(report)}"
+        drawing = self._both(lambda width: distribution(report, limit, width))
+        return part.section("How latency is spread", drawing, f"{measured_where(report)}. {sub}", "measured")
+
+    def _trade(self, report: Report) -> str:
+        found = points(report)
+        if len(found) < 2:
+            return ""
+        title = f"{label(accuracy(report))} against {label(latency(report).name)}"
+        sub = (
+            "Up and to the left is better. Lines through the points are intervals; the dotted line joins the variants "
+        )
+        sub += "that no other beats in both. Square: baseline. Ringed: chosen. Hollow: outside the limits."
+        drawing = self._both(lambda width: scatter(report, width))
+        return part.section(part.capital(title), drawing, f"{measured_where(report)}. {sub}", "measured")
+
+    def _time(self, report: Report) -> str:
+        if not sampled(report):
+            return ""
+        limit = latency(report).limit
+        sub = "Line: median of consecutive samples. Band: smallest to largest. A slope means warming up or throttling. "
+        sub += "Each variant has its own scale in ms; a band that touches the top goes beyond it. "
+        sub += left_out(report)
+        drawing = self._both(lambda width: over_time(report, limit, width))
+        return part.section("Latency along the run", drawing, f"{measured_where(report)}. {sub}", "measured")
+
+    def _both(self, draw: Callable[[int], str]) -> str:
+        return "".join(f'<div class="{css}">{draw(width)}</div>' for css, width in WIDTHS.items())

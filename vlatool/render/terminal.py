@@ -1,0 +1,235 @@
+"""The report on a terminal: the result in the first line, nothing wider than the screen."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping, Sequence
+
+from rich.console import Console
+from rich.text import Text
+
+from vlatool.render._format import UNMEASURED, aside, count, label, limit, plain, quantity, span
+from vlatool.render._grid import grid
+from vlatool.render._samples import finite, sparkline
+from vlatool.render._view import (
+    brackets,
+    details,
+    error_groups,
+    facts,
+    headline,
+    matrix,
+    measured,
+    measured_where,
+    names,
+    notes,
+    other_names,
+    place,
+    places,
+    role,
+    short,
+    unmeasured,
+)
+from vlatool.report import Report, Row
+
+STYLES = {"pass": "bold green", "fail": "bold red", "inconclusive": "bold yellow", "info": "bold cyan"}
+MOST_RECORDS = 24
+HEADING = "bold"
+
+
+class TerminalRenderer:
+    """Writes text for a terminal.
+
+    Args:
+        width: Columns that no line exceeds, at least 40.
+        color: Whether to write ANSI colours.
+    """
+
+    def __init__(self, width: int = 80, color: bool = False) -> None:
+        self.width = max(40, width)
+        self.color = color
+        self._stream = io.StringIO()
+        self._console = self._open()
+
+    def _open(self) -> Console:
+        return Console(
+            file=self._stream,
+            width=self.width,
+            force_terminal=self.color,
+            no_color=not self.color,
+            color_system="standard" if self.color else None,
+            legacy_windows=False,
+            _environ={},
+        )
+
+    def render(self, report: Report) -> str:
+        """Return the text, with a line break at the end."""
+        lines = [
+            *self._verdict(report),
+            *self._variants(report),
+            *self._further(report),
+            *self._details(report),
+            *self._predicted(report),
+            *self._circumstances(report),
+        ]
+        self._stream.seek(0)
+        self._stream.truncate()
+        for line in lines:
+            self._console.print(line, soft_wrap=True)
+        return self._stream.getvalue()
+
+    def _verdict(self, report: Report) -> list[Text]:
+        verdict = report.verdict.upper()
+        first, *more = report.summary or (report.title,)
+        indent = " " * (len(verdict) + 2)
+        lines = self._wrapped(first, f"{verdict}  ", indent)
+        lines = lines or [Text(verdict)]
+        lines[0].stylize(STYLES[report.verdict], 0, len(verdict))
+        for sentence in more:
+            lines += self._wrapped(sentence, indent)
+        about = " · ".join(part for part in (report.title if report.summary else "", report.created) if part)
+        lines += self._wrapped(about, indent, style="dim")
+        asked = ", ".join(" ".join(limit(name, wanted)) for name, wanted in report.limits.items())
+        return lines + (self._wrapped(asked, "Limits asked for: ", "  ") if asked else [])
+
+    def _variants(self, report: Report) -> list[Text]:
+        if not report.rows:
+            return self._heading("The report has no rows")
+        shown = headline(report)
+        same = [self._same_count(report, name) for name in shown]
+        body = [["", *same]] if any(same) else []
+        styles: dict[int, str] = {0: "dim"} if body else {}
+        for row in report.rows:
+            styles[len(body)] = "bold green" if row.role == "chosen" else ""
+            body += self._variant(row, shown, same, report)
+        lines = self._heading(self._origin(report))
+        lines += self._table(["variant", *(short(name) for name in shown)], body, styles=styles)
+        lines += self._wrapped(brackets(report, "measured"), style="dim")
+        return [*lines, Text(), *self._reasons(report), *self._spread(report)]
+
+    def _origin(self, report: Report) -> str:
+        return measured_where(report).replace("Measured", "MEASURED", 1)
+
+    def _same_count(self, report: Report, name: str) -> str:
+        found = {count(item.samples) for item in measured(report, name) if item is not None and item.known}
+        return found.pop() if len(found) == 1 else ""
+
+    def _variant(self, row: Row, shown: Sequence[str], same: Sequence[str], report: Report) -> list[list[str]]:
+        items = [row.get(name) for name in shown]
+        lines = [
+            [plain(row.name), *(quantity(item) if item else "–" for item in items)],
+            ["", *(span(item) if item else "" for item in items)],
+            ["", *(count(item.samples) if item and not once else "" for item, once in zip(items, same, strict=True))],
+        ]
+        if len(places(report, "measured")) > 1 and (where := next((item.where for item in items if item), "")):
+            lines[1][0] = f"  on {place(report, where)}"
+        return lines
+
+    def _reasons(self, report: Report) -> list[Text]:
+        lines = []
+        for row in report.rows:
+            if row.role == "subject" and not row.reason:
+                continue
+            because = f": {row.reason}" if row.reason else ""
+            style = "green" if row.role == "chosen" else ""
+            lines += self._wrapped(f"{row.name}, {role(row)}{because}", "", "  ", style)
+        return lines
+
+    def _spread(self, report: Report) -> list[Text]:
+        body = []
+        for row in report.rows:
+            samples = finite(row.raw.get("latency_ms") or [])
+            if len(samples) > 1:
+                tail = row.get("latency_p99")
+                beside = f"{quantity(tail)} ({aside(tail)})" if tail and aside(tail) else quantity(tail) if tail else ""
+                body.append([plain(row.name), sparkline(samples, 20), beside or count(len(samples))])
+        heads = ["spread of latency", "min … p99", "latency p99"]
+        return [Text(), *self._table(heads, body, [False, False, True])] if body else []
+
+    def _further(self, report: Report) -> list[Text]:
+        dimensions = [name for group in error_groups(report).values() for name in group]
+        shown = [
+            *dimensions,
+            *(name for name in other_names(report) if name != "latency_p99" or not self._spread(report)),
+        ]
+        lines: list[Text] = []
+        if shown:
+            lines += [
+                *self._heading(f"Further, {self._origin(report)}"),
+                *self._matrix(report, shown, "measured", None),
+            ]
+        lines += self._notes(notes(report, "measured", lambda item: item.known))
+        for sentence in unmeasured(report):
+            lines += self._wrapped(sentence, f"{UNMEASURED}: ", "  ", "yellow")
+        return lines
+
+    def _notes(self, found: Mapping[str, Iterable[str]]) -> list[Text]:
+        lines: list[Text] = []
+        for note, labels in found.items():
+            lines += self._wrapped(f"{', '.join(labels)}: {note}", "", "  ", "dim")
+        return [Text(), *lines] if lines else []
+
+    def _matrix(self, report: Report, shown: Sequence[str], origin: str, where: str | None) -> list[Text]:
+        columns, cells = matrix(report, shown, origin, where)
+        body = []
+        for name, items in zip(shown, cells, strict=True):
+            body.append([label(name), *(quantity(item) if item else "–" for item in items)])
+            counts = [count(item.samples) if item and item.known else "" for item in items]
+            same = len({text for text in counts if text}) == 1
+            body.append([f"  {max(counts)}" if same else "", *(span(item) if item else "" for item in items)])
+            body.append(["", *([""] * len(items) if same else counts)])
+        return self._table(["", *(plain(name) for name in columns)], body)
+
+    def _details(self, report: Report) -> list[Text]:
+        lines: list[Text] = []
+        for table in details(report):
+            lines += self._heading(table.title)
+            lines += self._table(table.columns, table.rows[:MOST_RECORDS], table.numeric)
+            if len(table.rows) > MOST_RECORDS:
+                lines.append(Text(f"… {len(table.rows) - MOST_RECORDS} more rows in report.json", "dim"))
+        return lines
+
+    def _predicted(self, report: Report) -> list[Text]:
+        lines: list[Text] = []
+        for where in places(report, "predicted"):
+            lines += self._heading(f"PREDICTED for {plain(where)}: computed by a model, not measured")
+            lines += self._matrix(report, names(report, "predicted", where), "predicted", where)
+            lines += self._wrapped(brackets(report, "predicted", where), style="dim")
+            lines += self._notes(notes(report, "predicted", where=where))
+        return lines
+
+    def _circumstances(self, report: Report) -> list[Text]:
+        lines: list[Text] = []
+        if found := facts(report.environment):
+            lines += self._heading("Environment")
+            lines += self._wrapped(" · ".join(f"{name} {text}" for name, text in found))
+        if report.warnings:
+            lines += self._heading("Warnings")
+            for text in report.warnings:
+                lines += self._wrapped(text, "! ", "  ", "yellow")
+        if report.command:
+            lines += [*self._heading("Command"), *self._wrapped(report.command, "", "  ")]
+        return lines
+
+    def _heading(self, text: str) -> list[Text]:
+        return [Text(), *self._wrapped(text, style=HEADING)]
+
+    def _wrapped(self, text: str, first: str = "", indent: str | None = None, style: str = "") -> list[Text]:
+        """Return lines that fit: the first begins with ``first``, the others with ``indent``."""
+        indent = first if indent is None else indent
+        text = plain(text)
+        if not text.strip():
+            return []
+        head = Text(first + text).wrap(self._console, self.width)[0]
+        rest = Text((first + text)[len(head.plain) :].lstrip())
+        lines = list(rest.wrap(self._console, self.width - len(indent))) if rest.plain else []
+        return [Text(line.rstrip(), style) for line in (head.plain, *(indent + line.plain for line in lines))]
+
+    def _table(
+        self,
+        heads: Sequence[str],
+        body: Sequence[Sequence[str]],
+        numeric: Sequence[bool] | None = None,
+        styles: Mapping[int, str] | None = None,
+    ) -> list[Text]:
+        marked = styles or {}
+        return [Text(line, marked.get(row, "")) for row, line in grid(heads, body, self.width, numeric)]

@@ -1,0 +1,185 @@
+"""Measurements with units, raw samples kept, and the report that holds them. JSON with a versioned schema."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import DataError
+
+SCHEMA = 1
+REPORT = "report.json"
+ORIGINS = ("measured", "predicted")
+VERDICTS = ("pass", "fail", "inconclusive", "info")
+ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One number, and what it is.
+
+    Args:
+        name: What was measured, for example ``latency_p50``.
+        value: The number; NaN when it could not be had (then ``note`` says why).
+        unit: ``ms``, ``MB``, ``1`` (a share), ``x`` (a ratio), or the unit of an action element.
+        origin: ``measured`` (on ``where``) or ``predicted`` (for ``where``).
+        where: The host, or the profile.
+        samples: How many observations the number rests on.
+        low, high: Bounds of the interval, None when there is none.
+        confidence: Coverage of the interval, 0-1.
+        note: Method, model or reservation in a few words.
+    """
+
+    name: str
+    value: float
+    unit: str
+    origin: str = "measured"
+    where: str = "this host"
+    samples: int = 0
+    low: float | None = None
+    high: float | None = None
+    confidence: float = 0.95
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if self.origin not in ORIGINS:
+            raise ValueError(f"origin is {self.origin!r}; allowed: {', '.join(ORIGINS)}")
+
+    @property
+    def known(self) -> bool:
+        """False when the number could not be had."""
+        return not math.isnan(self.value)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One policy variant in a report.
+
+    Args:
+        name: Name of the variant, for example ``static_int8``.
+        role: One of ``ROLES``.
+        reason: Why it has this role, in words.
+        measurements: By no particular order; names are unique within a row and origin.
+        raw: Series name -> raw samples in the order in which they were taken, for example ``latency_ms``.
+        details: Tables that belong to the row: title -> list of {column: cell}.
+    """
+
+    name: str
+    role: str = "subject"
+    reason: str = ""
+    measurements: tuple[Measurement, ...] = ()
+    raw: Mapping[str, list[float]] = field(default_factory=dict)
+    details: Mapping[str, list[dict[str, Any]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.role not in ROLES:
+            raise ValueError(f"role is {self.role!r}; allowed: {', '.join(ROLES)}")
+
+    def get(self, name: str, origin: str = "measured") -> Measurement | None:
+        """Return the measurement of that name and origin, or None."""
+        for measurement in self.measurements:
+            if measurement.name == name and measurement.origin == origin:
+                return measurement
+        return None
+
+    def value(self, name: str) -> float:
+        """Return a measured value, NaN when it is not there."""
+        found = self.get(name)
+        return found.value if found else math.nan
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a command found out.
+
+    Args:
+        kind: ``benchmark``, ``evaluate``, ``optimize`` or ``compare``.
+        title: One line.
+        verdict: One of ``VERDICTS``.
+        summary: Sentences for a person; the first is the result.
+        rows: The variants, baseline first.
+        limits: Limit name -> the value that was asked for, with its unit in the name.
+        command: The command line that made the report.
+        created: UTC time, ISO 8601.
+        environment: The machine, its state and the versions (see ``vlatool.host``).
+        warnings: What a reader should know before trusting the numbers, with the remedy.
+    """
+
+    kind: str
+    title: str
+    verdict: str = "info"
+    summary: tuple[str, ...] = ()
+    rows: tuple[Row, ...] = ()
+    limits: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+    created: str = ""
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        if self.verdict not in VERDICTS:
+            raise ValueError(f"verdict is {self.verdict!r}; allowed: {', '.join(VERDICTS)}")
+
+    def to_json(self) -> str:
+        """Return JSON; NaN is written as null."""
+        return json.dumps(_without_nan(asdict(self)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Report:
+        """Read what ``to_json`` wrote.
+
+        Raises:
+            DataError: when the text is no report, or of a newer schema.
+        """
+        try:
+            data = json.loads(text)
+            if data["schema"] > SCHEMA:
+                raise DataError(
+                    f"The report has the schema {data['schema']}; this vlatool reads up to {SCHEMA}.", "upgrade vlatool"
+                )
+            known = {item.name for item in fields(cls)}
+            values = {key: data[key] for key in data if key in known}
+            values["rows"] = tuple(_row(row) for row in data.get("rows", ()))
+            values["summary"] = tuple(data.get("summary", ()))
+            values["warnings"] = tuple(data.get("warnings", ()))
+            return cls(**values)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise DataError(f"This is no vlatool report: {error}.") from error
+
+
+def read_report(path: Path) -> Report:
+    """Read a report file, or ``report.json`` (``reports/report.json``) of a directory.
+
+    Raises:
+        DataError: when there is none, or it cannot be read.
+    """
+    for candidate in (path, path / REPORT, path / "reports" / REPORT):
+        if candidate.is_file():
+            try:
+                return Report.from_json(candidate.read_text(encoding="utf-8"))
+            except (OSError, UnicodeDecodeError) as error:
+                raise DataError(f"The report {candidate} cannot be read: {error}.") from error
+    raise DataError(f"There is no report at {path}.", "name a report.json, or a directory that holds one")
+
+
+def _row(data: Mapping[str, Any]) -> Row:
+    measurements = [
+        Measurement(**{**item, "value": math.nan if item["value"] is None else item["value"]})
+        for item in data.get("measurements", ())
+    ]
+    return Row(**{**data, "measurements": tuple(measurements)})
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return value

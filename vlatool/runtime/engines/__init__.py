@@ -1,0 +1,1 @@
+"""Inference libraries behind one small interface; one file each, loaded only when named."""

@@ -1,0 +1,125 @@
+"""An observation as the controller has it -> the arrays that the graphs take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import DataError, nearest
+from vlatool.runtime.statistics import load_normaliser
+from vlatool.runtime.tokenizer import Tokenizer
+from vlatool.spec import PolicySpec, TensorSpec
+
+Array = NDArray[Any]
+Encoder = Callable[[Any], Array]
+
+
+class ObservationEncoder:
+    """Checks an observation against the spec, normalises it and turns text into ids.
+
+    Args:
+        spec: The policy's spec.
+        assets: Directory of statistics and tokenizers.
+
+    Raises:
+        SpecError: when statistics or a tokenizer are missing or do not fit.
+    """
+
+    def __init__(self, spec: PolicySpec, assets: Path) -> None:
+        self.names = [tensor.name for tensor in spec.inputs]
+        self._encoders = [(tensor.name, _encoder(tensor, assets)) for tensor in spec.inputs]
+
+    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Array]:
+        """Return one array with a batch axis for each input of the spec.
+
+        Args:
+            observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
+
+        Raises:
+            DataError: when an input is missing or has another shape or dtype, or holds NaN or infinity.
+        """
+        values = {}
+        for name, encode in self._encoders:
+            try:
+                value = observation[name]
+            except KeyError:
+                raise DataError(
+                    f"The observation has no '{name}' (it has: {', '.join(map(str, observation)) or 'nothing'}); "
+                    f"the policy takes {', '.join(self.names)}."
+                ) from None
+            values[name] = encode(value)
+        return values
+
+
+def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
+    if tensor.kind == "text":
+        return _text_encoder(tensor, assets)
+    dtype = np.dtype(tensor.dtype)
+    normaliser = load_normaliser(tensor, assets)
+    floating = dtype.kind == "f"
+
+    def encode(value: Any) -> Array:
+        array = value if isinstance(value, np.ndarray) else np.asarray(value)
+        if array.dtype != dtype:
+            array = _cast(array, dtype, tensor)
+        shape = array.shape
+        if shape != tensor.shape:
+            array = _batched(array, tensor)
+        if floating and not np.isfinite(array).all():
+            raise DataError(
+                f"The input '{tensor.name}' holds {_not_finite(array)}.", "check the sensor or the recording"
+            )
+        return array if normaliser is None else normaliser.forward(array)
+
+    return encode
+
+
+def _text_encoder(tensor: TensorSpec, assets: Path) -> Encoder:
+    tokenizer = Tokenizer(assets / tensor.tokenizer, tensor.max_tokens, tensor.name)
+
+    def encode(value: Any) -> Array:
+        if isinstance(value, str):
+            return tokenizer(value)
+        if isinstance(value, np.ndarray) and value.dtype.kind == "U" and value.size == 1:
+            return tokenizer(str(value.reshape(())))
+        raise DataError(f"The input '{tensor.name}' is text; got {type(value).__name__}.", "pass a str")
+
+    return encode
+
+
+def _cast(array: Array, dtype: np.dtype[Any], tensor: TensorSpec) -> Array:
+    """Widen within a kind (int32 -> int64, float64 -> float32), refuse everything that changes what values mean."""
+    integers = array.dtype.kind in "iu" and dtype.kind in "iu" and np.can_cast(array.dtype, dtype)
+    to_float = dtype.kind == "f" and array.dtype.kind in "iuf" and dtype != np.uint8
+    if not (integers or to_float):
+        hint = "raw pixel values from 0 to 255 as uint8" if tensor.dtype == "uint8" else f"cast it to {tensor.dtype}"
+        raise DataError(f"The input '{tensor.name}' is {array.dtype}; the policy takes {tensor.dtype}.", hint)
+    return array.astype(dtype)
+
+
+def _batched(array: Array, tensor: TensorSpec) -> Array:
+    if array.ndim == len(tensor.shape) - 1:
+        array = array[None]
+    fits = array.ndim == len(tensor.shape) and all(
+        isinstance(want, str) or want == got for want, got in zip(tensor.shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise DataError(
+            f"The input '{tensor.name}' has the shape {list(array.shape)}; the policy takes {list(tensor.shape)} "
+            "(the first axis may be left out)."
+        )
+    return array
+
+
+def _not_finite(array: Array) -> str:
+    nans = int(np.isnan(array).sum())
+    return f"{nans} NaN of {array.size} values" if nans else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
+
+
+def missing_input(name: str, spec: PolicySpec) -> DataError:
+    """Return the error for a name that is no input of the policy."""
+    return DataError(f"The policy has no input '{name}'; {nearest(name, [tensor.name for tensor in spec.inputs])}.")

@@ -1,0 +1,163 @@
+"""The policy that a controller holds: ``infer`` and ``reset``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool import registry
+from vlatool.bundle import Bundle
+from vlatool.errors import BundleError, DataError, GraphError
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.program import Program, Session
+from vlatool.runtime.statistics import Normaliser, load_normaliser
+from vlatool.spec import PolicySpec, TensorSpec
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Action:
+    """What the policy wants the robot to do.
+
+    Args:
+        chunk: (T, A) float32 in the units of the spec, or (T,) int64 indices of discrete actions.
+        labels: For discrete actions, the name of each index; for others, the name of each element.
+        latency_ms: From the call of ``infer`` to this object, in milliseconds.
+        sequence: Number of this inference since the last reset, from 0.
+        outputs: Every output of the spec by name, as the graph gave it (not un-normalised).
+    """
+
+    chunk: Array
+    labels: tuple[str, ...]
+    latency_ms: float
+    sequence: int
+    outputs: Mapping[str, Array]
+
+
+class Policy:
+    """An open bundle. ``infer`` maps an observation to an ``Action``; ``reset`` starts a new episode.
+
+    Not safe for calls from several threads at once: open one policy for each thread.
+    """
+
+    def __init__(self, bundle: Bundle, program: Program, engine: str) -> None:
+        self.bundle = bundle
+        self.engine = engine
+        self.spec: PolicySpec = bundle.manifest.spec
+        self.program = program
+        self.encode = ObservationEncoder(self.spec, bundle.path / "assets")
+        self._decode = _Decoder(self.spec, bundle.path / "assets")
+        self._outputs = [tensor.name for tensor in self.spec.outputs]
+        self._sequence = 0
+        self.golden_error: float | None = None
+
+    @classmethod
+    def open(
+        cls, bundle: Bundle, *, engine: str = "ort_cpu", threads: int | None = None, seed: int | None = None
+    ) -> Policy:
+        """Open every graph of a verified bundle; see ``vlatool.runtime.load``."""
+        manifest = bundle.manifest
+        if not manifest.graphs:
+            raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+        session = registry.load("engines", engine)
+        sessions: dict[str, Session] = {
+            name: session(bundle.file(graph.file), threads) for name, graph in manifest.graphs.items()
+        }
+        return cls(bundle, Program(manifest.program, sessions, seed), engine)
+
+    def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
+        """Return the next action chunk.
+
+        Args:
+            observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
+            noise: Value name -> float32 array, in the place of what the program would draw.
+
+        Raises:
+            DataError: when the observation does not fit the spec.
+            GraphError: when the engine fails or the action is not finite.
+        """
+        start = time.perf_counter_ns()
+        values = self.program.run(self.encode(observation), noise)
+        outputs = {name: values[name] for name in self._outputs}
+        chunk, labels = self._decode(outputs[self._outputs[0]])
+        sequence = self._sequence
+        self._sequence += 1
+        return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
+
+    def reset(self) -> None:
+        """Start a new episode: forget kept values, restart the noise from its seed."""
+        self._sequence = 0
+        self.program.reset()
+
+    def warm_up(self, inferences: int, tolerance: float) -> None:
+        """Run the golden observation and compare the action with the recorded one.
+
+        Raises:
+            GraphError: when the relative L2 difference is above ``tolerance`` or not a number.
+        """
+        golden = load_golden(self.bundle)
+        if golden is None:
+            return
+        observation, noise, expected = golden
+        for _ in range(inferences):
+            got = self.infer(observation, noise=noise).outputs[self.spec.action.name]
+            self.golden_error = relative_error(got, expected)
+            self.reset()
+        if inferences and not (self.golden_error or 0.0) <= tolerance:
+            raise GraphError(
+                f"This machine computes another golden action than recorded: relative error {self.golden_error:.3g}, "
+                f"allowed {tolerance:g}.",
+                "the engine or processor may lack what this precision needs; run: vlatool doctor",
+            )
+
+
+class _Decoder:
+    """The action output -> a chunk in physical units, or indices of discrete actions."""
+
+    def __init__(self, spec: PolicySpec, assets: Path) -> None:
+        self.tensor: TensorSpec = spec.action
+        self.normaliser: Normaliser | None = load_normaliser(spec.action, assets)
+
+    def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
+        tensor = self.tensor
+        if raw.dtype.kind == "f" and not np.isfinite(raw).all():
+            raise GraphError(
+                f"The output '{tensor.name}' is not finite.", "do not execute it; check the last observation"
+            )
+        if tensor.kind == "discrete":
+            chunk = raw.argmax(-1).reshape(-1)
+            return chunk, tuple(tensor.labels[index] for index in chunk)
+        physical = raw if self.normaliser is None else self.normaliser.inverse(raw)
+        return physical.reshape(-1, physical.shape[-1]), tensor.labels
+
+
+def load_golden(bundle: Bundle) -> tuple[dict[str, Any], dict[str, Array], Array] | None:
+    """Return the first golden (observation, noise, raw action output), or None when the bundle has none.
+
+    Raises:
+        DataError: when the file cannot be read.
+    """
+    if not bundle.manifest.golden:
+        return None
+    path = bundle.file(bundle.manifest.golden)
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            observation = {tensor.name: stored[f"in.{tensor.name}"][0] for tensor in bundle.manifest.spec.inputs}
+            noise = {key[6:]: stored[key][0] for key in stored.files if key.startswith("noise.")}
+            return observation, noise, stored[f"out.{bundle.manifest.spec.action.name}"][0]
+    except (ValueError, KeyError, OSError) as error:
+        raise DataError(f"The golden file {path} cannot be read: {error}.") from error
+
+
+def relative_error(got: Array, expected: Array) -> float:
+    """Return ``|got - expected|₂ / |expected|₂`` (the absolute norm when expected is zero)."""
+    wide = np.asarray(expected, np.float64).reshape(-1)
+    distance = float(np.linalg.norm(np.asarray(got, np.float64).reshape(-1) - wide))
+    return distance / (float(np.linalg.norm(wide)) or 1.0)

@@ -1,0 +1,89 @@
+"""Normalisation statistics: read, checked for width, and turned into one multiply and one add."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import SpecError, nearest
+from vlatool.spec import STATISTICS_OF, TensorSpec
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """Maps physical values to normalised ones and back: ``normalised = (physical - offset) / scale``.
+
+    ``mean_std``: offset = mean, scale = std. ``min_max`` and ``quantiles`` map [low, high] to [-1, 1]:
+    offset = (low + high) / 2, scale = (high - low) / 2.
+
+    Args:
+        offset: float32 (A,), in the unit of the tensor.
+        scale: float32 (A,), in the unit of the tensor.
+    """
+
+    offset: Array
+    scale: Array
+
+    def forward(self, physical: Array) -> Array:
+        """Physical to normalised, float32, any shape (..., A)."""
+        return (physical - self.offset) / self.scale
+
+    def inverse(self, normalised: Array) -> Array:
+        """Normalised to physical, float32, any shape (..., A)."""
+        return normalised * self.scale + self.offset
+
+
+def load_normaliser(tensor: TensorSpec, assets: Path) -> Normaliser | None:
+    """Return the normaliser of a tensor, or None when its spec says ``normalisation: none``.
+
+    Raises:
+        SpecError: when statistics are missing, of another width than the tensor, not finite, or without spread.
+    """
+    if tensor.normalisation == "none":
+        return None
+    first, second = STATISTICS_OF[tensor.normalisation]
+    low = _row(tensor, assets, first)
+    high = _row(tensor, assets, second)
+    offset, scale = (low, high) if first == "mean" else ((low + high) / 2, (high - low) / 2)
+    if not np.all(scale > 0):
+        raise SpecError(
+            f"The statistics of '{tensor.name}' have no spread in the elements {np.flatnonzero(scale <= 0).tolist()}.",
+            "give those elements a positive std (or a wider range)",
+        )
+    return Normaliser(offset.astype(np.float32), scale.astype(np.float32))
+
+
+def _row(tensor: TensorSpec, assets: Path, key: str) -> Array:
+    file, _, entry = tensor.statistics.partition("#")
+    path = assets / file
+    fix = "normalisation is never skipped in silence: put the training statistics into the policy's folder"
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SpecError(f"The statistics of '{tensor.name}' are missing: {path} ({error.strerror}).", fix) from error
+    except ValueError as error:
+        raise SpecError(f"The statistics of '{tensor.name}' are not valid JSON: {path}: {error}.", fix) from error
+    if not isinstance(table, dict) or entry not in table:
+        known = table if isinstance(table, dict) else ()
+        raise SpecError(f"{path} has no statistics '{entry}' for '{tensor.name}'; {nearest(entry, known)}.", fix)
+    if not isinstance(table[entry], dict) or key not in table[entry]:
+        raise SpecError(f"The statistics '{entry}' in {path} lack '{key}', which {tensor.normalisation} needs.", fix)
+    return _checked(table[entry][key], tensor, f"'{key}' of '{entry}' in {path}")
+
+
+def _checked(values: object, tensor: TensorSpec, where: str) -> Array:
+    try:
+        row = np.asarray(values, np.float32)
+    except (TypeError, ValueError) as error:
+        raise SpecError(f"{where} is not a list of numbers.") from error
+    if row.shape != (tensor.width,):
+        raise SpecError(f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {tensor.width} elements.")
+    if not np.all(np.isfinite(row)):
+        raise SpecError(f"{where} has values that are not finite.")
+    return row

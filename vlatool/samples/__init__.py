@@ -1,0 +1,1 @@
+"""Policies with random weights and realistic shapes, for latency and memory work; one file for each."""

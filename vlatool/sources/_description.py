@@ -1,0 +1,138 @@
+"""``policy.yaml``: the description of a policy that a person writes beside its code and weights."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle import LOCATION
+from vlatool.errors import SourceError, nearest, require
+from vlatool.manifest import ProgramStep, check_program, program_from, single_graph
+from vlatool.spec import PolicySpec
+
+FILE = "policy.yaml"
+KEYS = (
+    "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
+    "parts", "calibration", "evaluation",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Description:
+    """What ``policy.yaml`` says.
+
+    Args:
+        folder: Where relative paths start.
+        factory: ``path.py:make`` or ``package.module:make``; empty for a policy that is an ONNX file.
+        arguments: Keyword arguments of the factory.
+        program: How the graphs are run.
+        environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation.
+        parts: Part name -> globs of module names.
+        calibration, evaluation: Recorded observations, or None.
+    """
+
+    folder: Path
+    name: str
+    version: str
+    spec: PolicySpec
+    factory: str = ""
+    arguments: dict[str, Any] = field(default_factory=dict)
+    program: tuple[ProgramStep, ...] = ()
+    environment: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, list[str]] = field(default_factory=dict)
+    calibration: Path | None = None
+    evaluation: Path | None = None
+    description: str = ""
+    license: str = ""
+
+    def assets(self) -> set[str]:
+        """Files, relative to the folder, that the spec needs on the robot."""
+        inputs = [*self.spec.inputs, *self.spec.outputs]
+        statistics = {tensor.statistics.partition("#")[0] for tensor in inputs if tensor.statistics}
+        return statistics | {tensor.tokenizer for tensor in inputs if tensor.tokenizer}
+
+
+def read_description(path: Path) -> Description:
+    """Read ``policy.yaml``, or the one in a directory.
+
+    Raises:
+        SourceError: when it is missing, is not YAML, or lacks something.
+        SpecError: when the spec or the program is impossible.
+    """
+    file = path / FILE if path.is_dir() else path
+    data = _mapping(file)
+    for key in data:
+        if key not in KEYS:
+            raise SourceError(f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.")
+    for key in ("name", "spec"):
+        if key not in data:
+            raise SourceError(f"{file} has no '{key}'.", "see docs/guides/your-own-policy.md for a complete example")
+    spec = PolicySpec.from_dict(data["spec"])
+    program = program_from(data["program"]) if "program" in data else single_graph(spec)
+    check_program(program, {step.graph for step in program}, spec)
+    return Description(
+        folder=file.parent,
+        name=str(data["name"]),
+        version=str(data.get("version", "0.0.0")),
+        spec=spec,
+        factory=str(data.get("source", "")),
+        arguments=dict(data.get("arguments") or {}),
+        program=program,
+        environment=dict(data.get("environment") or {}),
+        parts=dict(data.get("parts") or {}),
+        calibration=_data_file(file, data, "calibration"),
+        evaluation=_data_file(file, data, "evaluation"),
+        description=str(data.get("description", "")),
+        license=str(data.get("license", "")),
+    )
+
+
+def write_location(out: Path, folder: Path) -> None:
+    """Note where the policy's code is; the note is no part of the bundle's identity."""
+    (out / LOCATION).write_text(json.dumps({"folder": str(folder.resolve())}) + "\n", encoding="utf-8")
+
+
+def read_location(bundle: Path) -> Path:
+    """Return the folder of the policy's code.
+
+    Raises:
+        SourceError: when the bundle has no note, or the folder is gone.
+    """
+    try:
+        folder = Path(json.loads((bundle / LOCATION).read_text(encoding="utf-8"))["folder"])
+    except (OSError, ValueError, KeyError) as error:
+        raise SourceError(
+            f"{bundle} does not say where the policy's code is.", "start again from the source"
+        ) from error
+    if not folder.is_dir():
+        raise SourceError(f"The policy's code was in {folder}, which is gone.", "start again from the source")
+    return folder
+
+
+def _mapping(file: Path) -> Mapping[str, Any]:
+    yaml = require("yaml", "build")
+    try:
+        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise SourceError(
+            f"There is no {file}.", "a policy needs a description; see docs/guides/your-own-policy.md"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{file} cannot be read: {error}.") from error
+    except yaml.YAMLError as error:
+        raise SourceError(f"{file} is not valid YAML: {' '.join(str(error).split())}.") from error
+    if not isinstance(data, Mapping):
+        raise SourceError(f"{file} must be a mapping; got {type(data).__name__}.")
+    return data
+
+
+def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
+    """The named file must exist; the default name may be absent."""
+    named = data.get(key)
+    path = file.parent / str(named or f"{key}.npz")
+    if named and not path.is_file():
+        raise SourceError(f"{file} names the {key} data {named}, which does not exist.")
+    return path if path.is_file() else None

@@ -1,0 +1,122 @@
+"""Import what ``path.py:make`` or ``package.module:make`` names."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from vlatool.errors import MissingExtra, SourceError, VlatoolError, nearest
+
+
+def split_factory(factory: str) -> tuple[str, str]:
+    """Split ``WHERE:FUNCTION``.
+
+    Raises:
+        SourceError: when it is not of that form.
+    """
+    where, _, function = factory.rpartition(":")
+    if not where or not function.isidentifier():
+        raise SourceError(f"'{factory}' names no factory.", "write path/to/policy.py:make or package.module:make")
+    return where, function
+
+
+def factory_file(factory: str, folder: Path) -> Path | None:
+    """Return the Python file of ``path.py:make`` (relative to ``folder``), None for ``package.module:make``."""
+    where, _ = split_factory(factory)
+    return (folder / where).resolve() if where.endswith(".py") else None
+
+
+def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
+    """Import the factory function.
+
+    Args:
+        factory: ``path.py:make`` (relative to ``folder``) or ``package.module:make``.
+
+    Raises:
+        SourceError: when the file or the function does not exist, or the import fails.
+        MissingExtra: when the import lacks a package.
+    """
+    where, function = split_factory(factory)
+    path = factory_file(factory, folder)
+    if path is not None and not path.is_file():
+        raise SourceError(f"There is no file {path} (from '{factory}').")
+    try:
+        module = _import_path(path) if path is not None else importlib.import_module(where)
+    except VlatoolError:
+        raise
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"Importing '{where}' needs the package '{error.name}', which is not installed.",
+            _install_hint(str(error.name)),
+        ) from error
+    except Exception as error:  # the seam: user code may raise anything while it is imported
+        raise SourceError(f"Importing '{where}' failed: {type(error).__name__}: {error}.") from error
+    found = getattr(module, function, None)
+    if not callable(found):
+        known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
+        raise SourceError(f"'{where}' has no function '{function}'; {nearest(function, known)}.")
+    return found  # type: ignore[no-any-return]
+
+
+def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
+    """Import the factory and call it.
+
+    Raises:
+        SourceError: when the call raises.
+    """
+    make = import_factory(factory, folder)
+    try:
+        with _importable(factory_file(factory, folder)):
+            return make(**arguments)
+    except (VlatoolError, MemoryError):
+        raise
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"'{factory}' needs the package '{error.name}', which is not installed.", _install_hint(str(error.name))
+        ) from error
+    except Exception as error:  # the seam: user code may raise anything
+        raise SourceError(f"The factory '{factory}' failed: {type(error).__name__}: {error}.") from error
+
+
+def _import_path(path: Path) -> ModuleType:
+    name = f"vlatool_source_{abs(hash(str(path))):x}_{path.stem}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise SourceError(f"{path} is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        with _importable(path):
+            spec.loader.exec_module(module)
+    except BaseException:
+        sys.modules.pop(name, None)
+        raise
+    return module
+
+
+@contextlib.contextmanager
+def _importable(path: Path | None) -> Iterator[None]:
+    """Let the file import its neighbours."""
+    if path is None:
+        yield
+        return
+    sys.path.insert(0, str(path.parent))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):
+            sys.path.remove(str(path.parent))
+
+
+def _install_hint(package: str) -> str:
+    extra = {"torch": "build", "minigrid": "sim", "gymnasium": "sim", "metaworld": "metaworld", "mujoco": "metaworld"}
+    known = extra.get(package.partition(".")[0])
+    return f"pip install 'vlatool[{known}]'" if known else f"pip install {package}"

@@ -1,0 +1,124 @@
+"""A policy that is one ONNX file already."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from vlatool.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import SourceError, nearest, require
+from vlatool.finish import finish
+from vlatool.manifest import Graph, Manifest, single_graph
+from vlatool.sources._description import Description, read_description
+from vlatool.sources.torch_module import copy_assets
+from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.stage import Context, Transform
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+DTYPE_OF = {1: "float32", 2: "uint8", 6: "int32", 7: "int64", 9: "bool", 10: "float16"}
+"""ONNX element type -> dtype of a spec."""
+
+
+class OnnxFile(Transform):
+    """A policy that is one ONNX file; the spec comes from a description, or from the file's inputs and outputs."""
+
+    packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
+
+    model: Path = Field(description="the ONNX file; external data is found beside it")
+    policy: Path | None = Field(
+        None, description="policy.yaml with spec and assets; the file's own shapes when not given"
+    )
+    control_hz: float = Field(10.0, gt=0, description="rate of the control loop when there is no policy.yaml, in Hz")
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The file exists."""
+        if not self.model.is_file():
+            raise SourceError(f"There is no ONNX file {self.model}.")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The model, its external data and what the description names."""
+        described = read_description(self.policy) if self.policy else None
+        data = [path for path in (described.calibration, described.evaluation) if path] if described else []
+        beside = sorted(self.model.parent.glob(self.model.name + "*"))
+        return (*beside, *data, *([self.policy] if self.policy and self.policy.is_file() else []))
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Load the file, store it, and run it once."""
+        self.check(None, None)
+        model = _load(self.model)
+        described = read_description(self.policy) if self.policy else self._described(model)
+        _check_names(model, described.spec)
+        copy_assets(described, out)
+        (out / "graphs").mkdir()
+        onnx = require("onnx", "build")
+        large = model.ByteSize() > 1_500_000_000
+        onnx.save(model, str(out / "graphs/main.onnx"), save_as_external_data=large, location="main.onnx.data")
+        manifest = Manifest(
+            name=described.name,
+            version=described.version,
+            spec=described.spec,
+            program=single_graph(described.spec),
+            environment=described.environment,
+            parts=described.parts,
+            description=described.description,
+            license=described.license,
+        )
+        opset = max((entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")), default=0)
+        graphs = {"main": Graph("graphs/main.onnx", {"float32": 1.0}, opset)}
+        made_by = {**self.made_by(), "options": {"model": self.model.name}}
+        origin = Bundle(out, manifest)
+        return finish(origin, out, made_by=made_by, graphs=graphs, observations=_observations(described, out, manifest))
+
+    def _described(self, model: Any) -> Description:
+        initializers = {tensor.name for tensor in model.graph.initializer}
+        inputs = tuple(_tensor(value) for value in model.graph.input if value.name not in initializers)
+        spec = PolicySpec(inputs, tuple(_tensor(value) for value in model.graph.output), self.control_hz)
+        return Description(self.model.parent, self.model.stem, "0.0.0", spec)
+
+
+def _load(path: Path) -> Any:
+    onnx = require("onnx", "build")
+    try:
+        model = onnx.load(str(path))
+    except Exception as error:  # the seam: protobuf and onnx raise many foreign types
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+        raise SourceError(f"{path} is not a readable ONNX file: {reason}.") from error
+    if not model.graph.node:
+        raise SourceError(f"{path} is not an ONNX model: its graph has no nodes.")
+    return model
+
+
+def _tensor(value: Any) -> TensorSpec:
+    kind = value.type.tensor_type
+    if kind.elem_type not in DTYPE_OF:
+        raise SourceError(
+            f"'{value.name}' has the ONNX type {kind.elem_type}; allowed: {', '.join(DTYPE_OF.values())}."
+        )
+    axes = [axis.dim_value if axis.HasField("dim_value") else (axis.dim_param or "n") for axis in kind.shape.dim]
+    if axes and axes[0] != 1 and isinstance(axes[0], str):
+        axes[0] = 1
+    if math.prod(axis for axis in axes if isinstance(axis, int)) < 1 or not axes:
+        raise SourceError(f"'{value.name}' has the shape {axes}; a policy needs at least one axis of 1 or more.")
+    return TensorSpec(value.name, tuple(axes), DTYPE_OF[kind.elem_type])
+
+
+def _check_names(model: Any, spec: PolicySpec) -> None:
+    for wanted, found in ((spec.inputs, model.graph.input), (spec.outputs, model.graph.output)):
+        names = [value.name for value in found]
+        for tensor in wanted:
+            if tensor.name not in names:
+                raise SourceError(
+                    f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}."
+                )
+
+
+def _observations(described: Description, out: Path, manifest: Manifest) -> list[dict[str, Any]]:
+    from vlatool.bundle import seal
+
+    return observations_for(seal(out, manifest), 2)

@@ -1,0 +1,106 @@
+"""A policy that a Python function builds as a torch module."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from vlatool.bundle import Bundle, hash_file, seal
+from vlatool.errors import SourceError
+from vlatool.manifest import Manifest
+from vlatool.sources._description import Description, read_description, write_location
+from vlatool.sources._factory import factory_file, split_factory
+from vlatool.stage import Context, Transform
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+CODE = ("*.py", "*.safetensors", "*.pt", "*.pth", "*.bin", "*.ckpt")
+
+
+class TorchModule(Transform):
+    """A policy that a Python function builds as a torch module (or, for several graphs, as a dict of modules).
+
+    The bundle holds the spec, the assets and the recorded data; code and weights stay where they are and are recorded
+    by hash, so that nothing large is copied.
+    """
+
+    policy: Path = Field(description="policy.yaml, or the directory that holds it")
+    factory: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The description is readable and names a factory that exists."""
+        self._factory(read_description(self.policy))
+
+    def inputs(self) -> tuple[Path, ...]:
+        """Everything that the policy is made of."""
+        described = read_description(self.policy)
+        data = [path for path in (described.calibration, described.evaluation) if path]
+        assets = [described.folder / name for name in sorted(described.assets())]
+        description = self.policy / "policy.yaml" if self.policy.is_dir() else self.policy
+        return (description, *assets, *data, *self._code(described))
+
+    def key(self, source_hash: str) -> str:
+        """The bundle notes where the code is, so the place belongs to the key."""
+        return super().key(str(read_description(self.policy).folder.resolve()))
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Write the spec, the assets and the recorded data."""
+        described = read_description(self.policy)
+        copy_assets(described, out)
+        factory = self._factory(described)
+        code = {path.name: hash_file(path) for path in self._code(described)}
+        write_location(out, described.folder)
+        manifest = Manifest(
+            name=described.name,
+            version=described.version,
+            spec=described.spec,
+            program=described.program,
+            made_by={**self.made_by(), "options": {}},
+            source={"factory": factory, "arguments": described.arguments, "code": code},
+            environment=described.environment,
+            parts=described.parts,
+            description=described.description,
+            license=described.license,
+        )
+        return seal(out, manifest)
+
+    def _factory(self, described: Description) -> str:
+        factory = self.factory or described.factory
+        if not factory:
+            raise SourceError(
+                f"{described.folder} names no factory.",
+                "add 'source: policy.py:make' to policy.yaml, or pass --factory",
+            )
+        split_factory(factory)
+        path = factory_file(factory, described.folder)
+        if path is not None and not path.is_file():
+            raise SourceError(f"There is no file {path} (from '{factory}').")
+        return factory
+
+    def _code(self, described: Description) -> list[Path]:
+        path = factory_file(self._factory(described), described.folder)
+        if path is None:
+            return []
+        return sorted({found for pattern in CODE for found in path.parent.glob(pattern)})
+
+
+def copy_assets(described: Description, out: Path) -> None:
+    """Copy tokenizers and statistics to ``assets/``, recorded data to ``data/``.
+
+    Raises:
+        SourceError: when a file that the spec names is missing.
+    """
+    for name in sorted(described.assets()):
+        if not (described.folder / name).is_file():
+            raise SourceError(f"The spec names {name}, which is not in {described.folder}.")
+        target = out / "assets" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(described.folder / name, target)
+    for key, path in (("calibration", described.calibration), ("evaluation", described.evaluation)):
+        if path is not None:
+            (out / "data").mkdir(exist_ok=True)
+            shutil.copyfile(path, out / "data" / f"{key}.npz")

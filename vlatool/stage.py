@@ -1,0 +1,172 @@
+"""A stage: a function from a directory to a directory, described by a small frozen object that round-trips as JSON.
+
+The class of a stage is its options (the fields), its method (``run``), its command-line flags and its row in the
+reference docs. No module, session or open file crosses the border of a stage.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from vlatool import __version__, registry
+from vlatool.bundle import Bundle
+from vlatool.errors import RecipeError, nearest
+from vlatool.report import Report
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+Tell = Callable[[str, float | None], None]
+AnyStage = TypeVar("AnyStage", bound="Stage")
+
+
+def _silent(_what: str, _share: float | None) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a stage may use while it runs, none of which changes its result.
+
+    Args:
+        tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
+        workers: Processes that a stage may start.
+        command: The command line, for reports.
+    """
+
+    tell: Tell = field(default=_silent)
+    workers: int = 1
+    command: str = ""
+
+
+class Stage(BaseModel):
+    """Base of every stage: options as fields, extra keys refused, frozen."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Distributions whose versions change the result; part of the cache key."""
+
+    @classmethod
+    def kind(cls) -> str:
+        """Folder of the stage, for example ``quantize``."""
+        return cls.__module__.split(".")[-2]
+
+    @classmethod
+    def name(cls) -> str:
+        """Name in a recipe, for example ``quantize.static_int8``."""
+        return ".".join(cls.__module__.split(".")[-2:])
+
+    def options(self) -> dict[str, Any]:
+        """Return the options that differ from their defaults, as JSON values."""
+        return self.model_dump(mode="json", exclude_defaults=True)
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """Raise a user error when this stage cannot run on that source; cheap."""
+
+    def inputs(self) -> tuple[Path, ...]:
+        """Files outside the source whose content changes the result; part of the cache key."""
+        return ()
+
+    def key(self, source_hash: str) -> str:
+        """Return the cache key of this stage's output: 16 hex digits."""
+        from importlib import metadata
+
+        versions: dict[str, str | None] = {}
+        for package in self.packages:
+            try:
+                versions[package] = metadata.version(package)
+            except metadata.PackageNotFoundError:
+                versions[package] = None
+        files = [_content(path) for path in self.inputs()]
+        content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, __version__]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Transform(Stage):
+    """A stage that makes a bundle."""
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Write the new bundle into the empty directory ``out`` and return it."""
+        raise NotImplementedError(self.name())
+
+    def made_by(self, seed: int | None = None) -> dict[str, Any]:
+        """Return the ``made_by`` entry of the manifest."""
+        from importlib import metadata
+
+        versions = {package: metadata.version(package) for package in self.packages}
+        made: dict[str, Any] = {"vlatool": __version__, "stage": self.name(), "options": self.options()}
+        return {**made, "versions": versions, **({} if seed is None else {"seed": seed})}
+
+
+class Measure(Stage):
+    """A stage that makes a report."""
+
+    def run(self, source: Bundle, context: Context) -> Report:
+        """Measure and return the report; the caller writes it."""
+        raise NotImplementedError(self.name())
+
+
+def source_of(source: Bundle | None, stage: str) -> Bundle:
+    """Return the source, which only the stages that start a chain may lack.
+
+    Raises:
+        RecipeError: when there is none.
+    """
+    if source is None:
+        raise RecipeError(f"{stage} needs a bundle to start from; begin the recipe with a sources stage.")
+    return source
+
+
+def stage_class(name: str) -> type[Stage]:
+    """Return the class of a stage by its recipe name.
+
+    Raises:
+        RecipeError: when the name is not ``kind.name`` of a known stage.
+    """
+    kind, _, entry = name.partition(".")
+    known = [f"{each}.{found}" for each in stage_kinds() for found in registry.names(each)]
+    if name.replace("-", "_") not in known:
+        raise RecipeError(f"There is no stage '{name}'; {nearest(name, known)}.")
+    found: type[Stage] = registry.load(kind, entry)
+    return found
+
+
+def stage_kinds() -> tuple[str, ...]:
+    """Folders that hold stages."""
+    return ("sources", "export", "prune", "distill", "quantize", "benchmark", "evaluate")
+
+
+def build_stage(name: str, options: Mapping[str, Any]) -> Stage:
+    """Build a stage from its recipe name and options.
+
+    Raises:
+        RecipeError: listing each option that is unknown or has an impossible value.
+    """
+    return validated(stage_class(name), options, f"stage {name}")
+
+
+def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> AnyStage:
+    """Build ``kind`` from options, with a sentence for each problem."""
+    try:
+        return kind.model_validate(dict(options))
+    except ValidationError as error:
+        problems = [_problem(item, list(kind.model_fields)) for item in error.errors()]
+        raise RecipeError(f"{where}: " + "; ".join(problems) + ".") from error
+
+
+def _problem(item: Mapping[str, Any], known: list[str]) -> str:
+    field_name = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"unknown option '{field_name}'; {nearest(field_name, known)}"
+    return f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
+
+
+def _content(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else f"absent:{path.name}"
