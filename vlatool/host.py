@@ -13,9 +13,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from vlatool import __version__
+
 ROOT = Path("/")
 DISTRIBUTIONS = (
-    "vlatool",
     "numpy",
     "onnxruntime",
     "onnxruntime-gpu",
@@ -78,7 +79,7 @@ def fingerprint(root: Path = ROOT) -> dict[str, Any]:
         "container": container(root),
         "virtual_machine": virtual_machine(root),
         "python": platform.python_version(),
-        "versions": versions(),
+        "versions": {"vlatool": __version__, **versions()},
     }
 
 
@@ -265,8 +266,4 @@ def versions(distributions: Iterable[str] = DISTRIBUTIONS) -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    if "vlatool" in distributions and "vlatool" not in found:
-        from vlatool import __version__
-
-        found = {"vlatool": __version__, **found}
     return found

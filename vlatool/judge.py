@@ -12,6 +12,7 @@ from vlatool.report import Measurement, Row
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
+MEASURED_ENGINE = "ort_cpu"
 DROPS = ("success_drop", "agreement_drop", "error_increase")
 """Which accuracy decides: the closed loop where there is one, else recorded observations."""
 
@@ -57,8 +58,17 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile) -> Judged:
     )
 
 
-def choose(judged: list[Judged], limits: Limits) -> list[Judged]:
-    """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside."""
+def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
+    """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside.
+
+    Args:
+        judged: The baseline first.
+        engine: The engine of the board. When it is not the one that was measured here, predictions for the board rank
+            the candidates, where every candidate has one.
+    """
+    origin = "measured"
+    if engine != MEASURED_ENGINE and all(_p50(item.row, "predicted") < math.inf for item in judged):
+        origin = "predicted"
     quantized = [item for item in judged if item.row.role != "baseline"]
     inside = [item for item in quantized if item.within]
     if not inside:
@@ -70,9 +80,9 @@ def choose(judged: list[Judged], limits: Limits) -> list[Judged]:
         )
     else:
         baseline = [item for item in judged if item.row.role == "baseline" and item.within]
-        best = min([*inside, *baseline], key=lambda item: _p50(item.row))
-        reason = f"the fastest inside the limits; {best.row.reason}"
-        sentences = _praise(best, judged)
+        best = min([*inside, *baseline], key=lambda item: _p50(item.row, origin))
+        reason = f"the fastest inside the limits ({origin}); {best.row.reason}"
+        sentences = _praise(best, judged) if origin == "measured" else _foretell(best, judged)
     chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
     return [chosen if item is best else item for item in judged]
 
@@ -90,6 +100,22 @@ def _praise(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     accuracy = row.get("success")
     success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
     return (f"{row.name} is {speed} ({times}); {size}.{success}", f"{row.reason[:1].upper()}{row.reason[1:]}.")
+
+
+def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
+    """Say what was chosen by prediction, since this host cannot run the board's engine."""
+    row, base = best.row, judged[0].row
+    own, reference = row.get("latency_p50", "predicted"), base.get("latency_p50", "predicted")
+    if own is None or reference is None:
+        return (f"{row.name} was chosen.",)
+    low, high = own.low or own.value, own.high or own.value
+    ratio = reference.value / own.value
+    return (
+        f"{row.name} is predicted to need {own.value:.3g} ms ({low:.3g} to {high:.3g}) on {own.where}, "
+        f"{ratio:.2f}x as fast as {base.name}; not measured there.",
+        f"{row.reason[:1].upper()}{row.reason[1:]}.",
+        "The board's engine does not run on this host: the latencies measured here are ONNX Runtime's on this CPU.",
+    )
 
 
 def _with_drop(row: Row, baseline: Row) -> Row:
@@ -152,6 +178,6 @@ def _points(share: float) -> str:
     return f"{points} point" + ("" if points == "1" else "s")
 
 
-def _p50(row: Row) -> float:
-    value = row.value("latency_p50")
-    return value if not math.isnan(value) else math.inf
+def _p50(row: Row, origin: str = "measured") -> float:
+    found = row.get("latency_p50", origin)
+    return found.value if found is not None and found.known else math.inf

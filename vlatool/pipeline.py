@@ -130,7 +130,7 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         bundles, failures = _candidates(plan, baseline, context)
         rows = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
         judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile) for row in rows.values()]
-        judged = choose(judged, plan.recipe.limits)
+        judged = choose(judged, plan.profile.engine)
         report = _report(plan, baseline, judged, failures, context)
         chosen = next(item.row for item in judged if item.row.role == "chosen")
         chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
@@ -216,7 +216,8 @@ def _report(plan: Plan, baseline: Bundle, judged: list[Judged], failures: list[R
 
     rows = tuple(item.row for item in judged) + tuple(failures)
     chosen = next(item for item in judged if item.row.role == "chosen")
-    limits = {"max_drop": plan.recipe.limits.max_drop, "hz": plan.recipe.limits.hz, "profile": plan.profile.name}
+    wanted = plan.recipe.limits
+    limits = {"max_success_drop_points": 100 * wanted.max_drop, "hz": wanted.hz, "profile": plan.profile.name}
     warnings = tuple(dict.fromkeys(warning for item in judged for warning in item.warnings))
     return Report(
         "optimize",

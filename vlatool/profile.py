@@ -100,14 +100,15 @@ class EngineFigures(_Strict):
     Args:
         unit: Which of the profile's units computes.
         int8_layout: Types of activations and weights that int8 is fastest in; empty where int8 is not supported.
-        dynamic_int8: Whether the engine computes dynamically quantized MatMul itself.
+        integer_ops: Whether the int8 figures also hold for integer operators (MatMulInteger and its kin), not for QDQ
+            alone.
         base_mb: Memory of a process that holds the engine and no model.
         efficiency: dtype -> what the engine reaches; a dtype without published figures is left out.
     """
 
     unit: str
     int8_layout: Literal["u8s8", "s8s8", ""]
-    dynamic_int8: bool
+    integer_ops: bool
     base_mb: Figure
     efficiency: dict[Dtype, Efficiency] = Field(default_factory=dict)
     note: str = ""

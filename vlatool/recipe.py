@@ -51,16 +51,24 @@ class Recipe(BaseModel):
         return text
 
 
-def default_recipe(limits: Limits, effort: Effort, calibrated: bool) -> Recipe:
+def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str = "ort_cpu") -> Recipe:
     """Return the candidates that are tried when the user names none.
 
     Args:
+        limits: What a candidate must keep to.
+        effort: How much is measured.
         calibrated: Whether the policy brings calibration data, without which static quantization is impossible.
+        engine: The engine of the board. ONNX Runtime on a CPU takes its own integer operators and dynamic
+            quantization; every other engine takes standard QDQ operators with symmetric int8.
     """
-    candidates: dict[str, StageList] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
+    own = engine == "ort_cpu"
+    layout: dict[str, Any] = {} if own else {"layout": "qdq", "activations": "int8"}
+    candidates: dict[str, StageList] = {}
+    if own or not calibrated:
+        candidates["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
     if calibrated:
-        candidates["static_int8"] = ({"quantize.static_int8": {}},)
-        candidates["static_int8_percentile"] = ({"quantize.static_int8": {"method": "percentile"}},)
+        candidates["static_int8"] = ({"quantize.static_int8": layout},)
+        candidates["static_int8_percentile"] = ({"quantize.static_int8": {"method": "percentile", **layout}},)
     return Recipe(candidates=candidates, limits=limits, effort=effort)
 
 

@@ -74,17 +74,28 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
         GateFailed: for the verdict ``fail``.
         Inconclusive: for the verdict ``inconclusive``.
     """
-    from vlatool.render import render, write_reports
+    from vlatool.render import write_reports
 
     now = datetime.now(timezone.utc).isoformat(timespec="seconds")
     report = replace(report, command=report.command or command_line(), created=report.created or now)
     if out is not None:
         with writing(out, force=force) as draft:
             write_reports(report, draft)
-    typer.echo(render(report, "json" if as_json else "terminal"), nl=False)
+    typer.echo(report.to_json() if as_json else terminal_text(report), nl=False)
     if out is not None and not as_json:
         typer.echo(f"report: {out / 'report.html'}")
     leave(report)
+
+
+def terminal_text(report: Report, *, brief: bool = False) -> str:
+    """Return the report for this terminal: its width, its colours."""
+    import shutil
+
+    from vlatool.render.terminal import TerminalRenderer
+
+    color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+    width = min(shutil.get_terminal_size((80, 24)).columns, 120)
+    return TerminalRenderer(width, color, brief).render(report)
 
 
 def leave(report: Report) -> None:

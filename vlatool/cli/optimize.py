@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vlatool.cli._console import default_workers, leave, progress
+from vlatool.cli._console import default_workers, leave, progress, terminal_text
 from vlatool.errors import UsageError
 
 
@@ -38,14 +38,13 @@ def optimize(
     from vlatool.launch import cache_directory
     from vlatool.profile import load_profile
     from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
-    from vlatool.render import render
 
     board = load_profile(profile)
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
     limits = Limits(max_drop=share(max_drop), hz=hz)
     if recipe is None:
-        chosen = default_recipe(limits, Effort(**effort), pipeline.brings_calibration(source))
+        chosen = default_recipe(limits, Effort(**effort), pipeline.brings_calibration(source), board.engine)
     else:
         read = read_recipe(recipe)
         chosen = read.model_copy(update={"limits": limits, "effort": read.effort.model_copy(update=effort)})
@@ -56,7 +55,7 @@ def optimize(
         return
     with progress(workers or default_workers()) as context:
         report = pipeline.optimize(plan, output, context, force=force)
-    typer.echo(render(report, "json" if as_json else "terminal"), nl=False)
+    typer.echo(report.to_json() if as_json else terminal_text(report, brief=True), nl=False)
     if not as_json:
         typer.echo(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}")
     leave(report)

@@ -7,12 +7,11 @@ from typing import Any
 
 from vlatool.hwselect._shapes import Shape, Tensors, bits
 
-INT8_OPS = {
+INTEGER_OPS = {
     *("MatMulInteger", "ConvInteger", "QLinearMatMul", "QLinearConv"),
     *("QGemm", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"),
 }
-DYNAMIC_OPS = {"MatMulInteger", "ConvInteger", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
-"""Their activation scales are computed at run time: in a graph that a quantizer wrote, dynamic quantization."""
+"""They compute in int8 whatever surrounds them."""
 WEIGHT_AT = {"QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3}
 """Position of the second operand where it is not 1."""
 MATMULS = {"MatMul", "MatMulInteger", "QLinearMatMul", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
@@ -29,7 +28,7 @@ def precision_of(node: Any, tensors: Tensors) -> str:
     A float layer counts as int8 when both operands come out of DequantizeLinear (QDQ form); when only the weight does,
     it is computed in float.
     """
-    if node.op_type in INT8_OPS:
+    if node.op_type in INTEGER_OPS:
         return "int8"
     if node.op_type == "MatMulNBits":
         return f"int{tensors.attribute(node, 'bits', 4)}"

@@ -107,8 +107,8 @@ def _no_ground(profile: Profile, figures: EngineFigures, workload: Workload, mod
         return "the graphs have no matrix product or convolution to count"
     if absent := sorted(macs - {*figures.efficiency}):
         return f"no published latencies in {', '.join(absent)} to predict from"
-    if not figures.dynamic_int8 and any(graph.dynamic for graph in workload.graphs.values()):
-        return "it does not compute dynamically quantized layers; quantize statically"
+    if not figures.integer_ops and any(graph.integer_ops for graph in workload.graphs.values()):
+        return "the published int8 latencies are of QDQ graphs, and this policy uses integer operators"
     return ""
 
 

@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from vlatool.errors import require
+
 Shape = tuple[int, ...]
 
 SAME_SHAPE_AS = {
     "DynamicQuantizeMatMul": "MatMul",
-    "MatMulIntegerToFloat": "MatMul",
+    "MatMulIntegerToFloat": "MatMulInteger",
     "FusedConv": "Conv",
     "QGemm": "Gemm",
 }
@@ -79,7 +81,11 @@ class Tensors:
         return sum(self.bytes_of(item.name) or 0 for item in self._graph.initializer)
 
     def peak_bytes(self) -> int:
-        """Return the most bytes of inputs, intermediate values and outputs that are alive at one node."""
+        """Return the most bytes of inputs, intermediate values and outputs that are alive at one node.
+
+        What is computed from weights alone (a dequantized weight) is not counted: engines fold it or keep it packed.
+        """
+        constant = {*self._stored}
         last = {name: index for index, node in enumerate(self.nodes) for name in node.input}
         kept = {value.name for value in (*self._graph.input, *self._graph.output)}
         alive = {
@@ -87,6 +93,9 @@ class Tensors:
         }
         peak = sum(alive.values())
         for index, node in enumerate(self.nodes):
+            if all(name in constant for name in node.input if name):
+                constant.update(node.output)
+                continue
             alive.update({name: self.bytes_of(name) or 0 for name in node.output if name})
             peak = max(peak, sum(alive.values()))
             for name in (*node.input, *node.output):
@@ -105,7 +114,7 @@ def open_graph(onnx: Any, path: Path) -> Tensors:
     """Read an ONNX file without its external weights and infer shapes, a free first axis of an input being 1."""
     model = onnx.load(str(path), load_external_data=False)
     if model.functions:
-        model = onnx.inliner.inline_local_functions(model)
+        model = require("onnx.inliner", "build").inline_local_functions(model)
     graph = model.graph
     nodes = copy.deepcopy([*graph.node])
     for value in graph.input:
@@ -113,35 +122,38 @@ def open_graph(onnx: Any, path: Path) -> Tensors:
         if axes and not axes[0].HasField("dim_value"):
             axes[0].dim_value = 1
     for value in graph.output:  # what was declared may name the axis that is now 1
-        if value.type.HasField("tensor_type"):
-            value.type.tensor_type.ClearField("shape")
+        value.ClearField("type")
     for item in graph.initializer:  # shapes do not depend on weights; this keeps a copy of them out of the inference
         if len(item.raw_data) > LARGE:
             item.ClearField("raw_data")
-    for node in graph.node:
-        _standardise(onnx, node, graph)
+    standard = [item for node in nodes for item in _standard(onnx, node, graph)]
+    del graph.node[:]
+    graph.node.extend(standard)
     inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
     return Tensors(onnx, nodes, inferred.graph)
 
 
-def _standardise(onnx: Any, node: Any, graph: Any) -> None:
-    """Turn a contributed operator into a standard one with the same output shape."""
-    kind = node.op_type
+def _standard(onnx: Any, node: Any, graph: Any) -> list[Any]:
+    """Return standard operators with the same output shape and dtype as a contributed one; other nodes as they are."""
+    kind, out = node.op_type, list(node.output)
     if kind == "MatMulNBits":
         sizes = {item.name: item.i for item in node.attribute}
-        weight = onnx.helper.make_tensor_value_info(
-            f"{node.output[0]}::weight", onnx.TensorProto.FLOAT, [sizes["K"], sizes["N"]]
-        )
-        graph.value_info.append(weight)
-        inputs = [node.input[0], weight.name]
-    elif kind in SAME_SHAPE_AS:
-        inputs = [node.input[0], node.input[3 if kind == "QGemm" else 1]]
-    else:
-        return
-    kept = [item for item in node.attribute if kind == "FusedConv" or item.name in ("transA", "transB")]
-    replacement = onnx.helper.make_node(SAME_SHAPE_AS.get(kind, "MatMul"), inputs, list(node.output))
-    replacement.attribute.extend(kept)
-    node.CopyFrom(replacement)
+        weight = f"{out[0]}::weight"
+        shape = [sizes["K"], sizes["N"]]
+        graph.value_info.append(onnx.helper.make_tensor_value_info(weight, onnx.TensorProto.FLOAT, shape))
+        return [onnx.helper.make_node("MatMul", [node.input[0], weight], out)]
+    if kind not in SAME_SHAPE_AS:
+        return [node]
+    inputs = [node.input[0], node.input[3 if kind == "QGemm" else 1]]
+    if kind == "MatMulIntegerToFloat":
+        integers = f"{out[0]}::int32"
+        cast = onnx.helper.make_node("Cast", [integers], out, to=onnx.TensorProto.FLOAT)
+        return [onnx.helper.make_node(SAME_SHAPE_AS[kind], inputs, [integers]), cast]
+    replacement = onnx.helper.make_node(SAME_SHAPE_AS[kind], inputs, out)
+    replacement.attribute.extend(
+        item for item in node.attribute if kind == "FusedConv" or item.name.startswith("trans")
+    )
+    return [replacement]
 
 
 def _static(tensor_type: Any) -> Shape | None:

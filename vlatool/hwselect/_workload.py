@@ -13,7 +13,7 @@ from pathlib import Path
 
 from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, require
-from vlatool.hwselect._macs import COMPUTE, DYNAMIC_OPS, node_macs, precision_of
+from vlatool.hwselect._macs import COMPUTE, INTEGER_OPS, node_macs, precision_of
 from vlatool.hwselect._shapes import Tensors, open_graph
 
 
@@ -27,7 +27,7 @@ class GraphWorkload:
         weight_bytes: Bytes of all initializers as they are stored.
         activation_bytes: Bytes that the compute layers write.
         peak_bytes: The most bytes of tensors, weights apart, that are alive at one node.
-        dynamic: Whether activations are quantized at run time.
+        integer_ops: Whether int8 is computed by integer operators (MatMulInteger and its kin) and not in QDQ form.
         unknown: Compute layers that cannot be counted, because their shapes are not static.
     """
 
@@ -36,7 +36,7 @@ class GraphWorkload:
     weight_bytes: int = 0
     activation_bytes: int = 0
     peak_bytes: int = 0
-    dynamic: bool = False
+    integer_ops: bool = False
     unknown: tuple[str, ...] = ()
 
 
@@ -126,7 +126,7 @@ def _count(tensors: Tensors) -> GraphWorkload:
             continue
         macs[precision_of(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
-    dynamic = any(node.op_type in DYNAMIC_OPS for node in tensors.nodes)
+    integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
-        dict(macs), layers, tensors.weight_bytes, activation_bytes, tensors.peak_bytes(), dynamic, tuple(unknown)
+        dict(macs), layers, tensors.weight_bytes, activation_bytes, tensors.peak_bytes(), integer, tuple(unknown)
     )

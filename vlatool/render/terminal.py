@@ -42,9 +42,11 @@ class TerminalRenderer:
     Args:
         width: Columns that no line exceeds, at least 40.
         color: Whether to write ANSI colours.
+        brief: Leave out what the HTML page shows better: further measurements, details, environment and command.
     """
 
-    def __init__(self, width: int = 80, color: bool = False) -> None:
+    def __init__(self, width: int = 80, color: bool = False, brief: bool = False) -> None:
+        self.brief = brief
         self.width = max(40, width)
         self.color = color
         self._stream = io.StringIO()
@@ -66,10 +68,11 @@ class TerminalRenderer:
         lines = [
             *self._verdict(report),
             *self._variants(report),
-            *self._further(report),
-            *self._details(report),
+            *([] if self.brief else [*self._further(report), *self._details(report)]),
             *self._predicted(report),
-            *self._circumstances(report),
+            *([] if self.brief else self._environment(report)),
+            *self._warnings(report),
+            *([] if self.brief else self._command(report)),
         ]
         self._stream.seek(0)
         self._stream.truncate()
@@ -197,18 +200,19 @@ class TerminalRenderer:
             lines += self._notes(notes(report, "predicted", where=where))
         return lines
 
-    def _circumstances(self, report: Report) -> list[Text]:
-        lines: list[Text] = []
-        if found := facts(report.environment):
-            lines += self._heading("Environment")
-            lines += self._wrapped(" · ".join(f"{name} {text}" for name, text in found))
-        if report.warnings:
-            lines += self._heading("Warnings")
-            for text in report.warnings:
-                lines += self._wrapped(text, "! ", "  ", "yellow")
-        if report.command:
-            lines += [*self._heading("Command"), *self._wrapped(report.command, "", "  ")]
+    def _environment(self, report: Report) -> list[Text]:
+        found = facts(report.environment)
+        told = " · ".join(f"{name} {text}" for name, text in found)
+        return [*self._heading("Environment"), *self._wrapped(told)] if found else []
+
+    def _warnings(self, report: Report) -> list[Text]:
+        lines = self._heading("Warnings") if report.warnings else []
+        for text in report.warnings:
+            lines += self._wrapped(text, "! ", "  ", "yellow")
         return lines
+
+    def _command(self, report: Report) -> list[Text]:
+        return [*self._heading("Command"), *self._wrapped(report.command, "", "  ")] if report.command else []
 
     def _heading(self, text: str) -> list[Text]:
         return [Text(), *self._wrapped(text, style=HEADING)]
