@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -90,16 +91,33 @@ def fields_page(title: str, classes: list[Any]) -> str:
     """Return a table of the fields of dataclasses, with their docstrings."""
     parts = [f"# {title}\n"]
     for kind in classes:
-        rows = ["| key | type | default |", "|---|---|---|"]
+        text, meanings = _described(kind)
+        rows = ["| key | type | default | meaning |", "|---|---|---|---|"]
         for field in dataclasses.fields(kind):
             default = "required"
             if field.default is not dataclasses.MISSING:
                 default = f"`{field.default!r}`"
             elif field.default_factory is not dataclasses.MISSING:
                 default = f"`{field.default_factory()!r}`"
-            rows.append(f"| `{field.name}` | {str(field.type).replace('|', 'or')} | {default} |")
-        parts.append(f"## {kind.__name__}\n\n{inspect.cleandoc(kind.__doc__ or '')}\n\n" + "\n".join(rows) + "\n")
+            kind_of = str(field.type).replace("|", "or")
+            rows.append(f"| `{field.name}` | {kind_of} | {default} | {meanings.get(field.name, '')} |")
+        parts.append(f"## {kind.__name__}\n\n{text}\n\n" + "\n".join(rows) + "\n")
     return "\n".join(parts)
+
+
+def _described(kind: Any) -> tuple[str, dict[str, str]]:
+    """Split a docstring into its text and the meaning of each argument."""
+    text, _, arguments = inspect.cleandoc(kind.__doc__ or "").partition("\nArgs:\n")
+    meanings: dict[str, str] = {}
+    names: list[str] = []
+    for line in arguments.splitlines():
+        head = re.match(r"    (\w+(?:, \w+)*): (.*)", line)
+        if head:
+            names = head[1].split(", ")
+            meanings.update(dict.fromkeys(names, head[2]))
+        elif line.startswith("        "):
+            meanings.update({name: f"{meanings[name]} {line.strip()}" for name in names})
+    return text.strip(), {name: words.replace("|", "or") for name, words in meanings.items()}
 
 
 def errors_page() -> str:

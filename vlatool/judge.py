@@ -28,8 +28,15 @@ class Judged:
     warnings: tuple[str, ...] = ()
 
 
-def judge(row: Row, baseline: Row, limits: Limits, profile: Profile) -> Judged:
+def judge(row: Row, baseline: Row, limits: Limits, profile: Profile, on_board: bool = False) -> Judged:
     """Hold a candidate's row against the limits.
+
+    Args:
+        row: The candidate, or the baseline itself.
+        baseline: The float32 row.
+        limits: What was asked for.
+        profile: The board.
+        on_board: Whether this host is that board, so that its own latency decides.
 
     Returns:
         The row with its role (``within`` / ``outside``; the baseline keeps its own) and the reason in words.
@@ -42,7 +49,7 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile) -> Judged:
         reasons.append(f"{_drop_words(decisive)}, {_points(drop - limits.max_drop)} over the budget")
     if row is not baseline and decisive is None:
         reasons.append("its accuracy is unmeasured: the policy brings neither an environment nor evaluation data")
-    late, warning = _too_slow(row, limits, profile)
+    late, warning = _too_slow(row, limits, profile, on_board)
     reasons += late
     warnings += warning
     if decisive is not None and not reasons and (decisive.high or 0.0) > limits.max_drop and row.role != "baseline":
@@ -141,11 +148,15 @@ def _with_drop(row: Row, baseline: Row) -> Row:
     return replace(row, measurements=(*row.measurements, *found))
 
 
-def _too_slow(row: Row, limits: Limits, profile: Profile) -> tuple[list[str], list[str]]:
-    """Judge the rate by the prediction for the profile; a host's own latency says nothing about another board."""
+def _too_slow(row: Row, limits: Limits, profile: Profile, on_board: bool) -> tuple[list[str], list[str]]:
+    """Judge the rate: on the board by what was measured, elsewhere by the prediction for the board."""
     if limits.hz is None:
         return [], []
     budget_ms = 1000.0 / limits.hz
+    if on_board:
+        p90 = row.get("latency_p90") or row.get("latency_p50")
+        late = p90 is not None and p90.value > budget_ms
+        return ([f"p90 latency {p90.value:.3g} ms > {budget_ms:.3g} ms"] if p90 and late else []), []
     predicted = row.get("latency_p50", "predicted")
     if predicted is None or not predicted.known:
         return [], [f"{row.name}: no latency can be predicted for {profile.name}, so {limits.hz:g} Hz is unjudged"]

@@ -79,7 +79,26 @@ class ProgramStep:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The content of ``manifest.json``; see ``docs/reference/manifest.md`` for each key."""
+    """The content of ``manifest.json``.
+
+    Args:
+        name: Name of the policy.
+        version: Version of the policy, as its author counts.
+        spec: What the policy consumes and produces.
+        graphs: Graph name -> graph; empty in a source bundle.
+        program: How the graphs are run, in order.
+        files: Path inside the bundle -> SHA-256 and size, of every file but the reports.
+        parent: ``sha256:...`` of the bundle that this one was made from.
+        made_by: Version of vlatool, stage, options, versions of the packages that change the result.
+        source: Factory and hashes of the code and weights (a source bundle, and those exported from it).
+        environment: Factory and tasks of the closed-loop evaluation.
+        parts: Part of the policy -> globs of module names.
+        golden: File with golden inputs and outputs.
+        accuracy: Measured accuracy: name -> value, interval, samples.
+        description: One sentence.
+        license: SPDX identifier of the policy's licence.
+        schema: Version of this format.
+    """
 
     name: str
     version: str

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
+from vlatool.host import fingerprint, matches
 from vlatool.judge import Judged, choose, judge
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.predict import predictions
@@ -43,6 +45,7 @@ class Plan:
     recipe: Recipe
     profile: Profile
     cache: Path
+    fresh: bool = False
 
     @property
     def closed_loop(self) -> ClosedLoop | None:
@@ -100,8 +103,15 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
     )
 
 
-def make_plan(source: str, profile: Profile, recipe: Recipe, cache: Path) -> Plan:
+def make_plan(source: str, profile: Profile, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
     """Build and check every stage; nothing has run when this returns.
+
+    Args:
+        source: See ``source_stage``.
+        profile: The board.
+        recipe: Candidates, limits and effort.
+        cache: Where finished stages are kept.
+        fresh: Measure again, even what was measured before.
 
     Raises:
         VlatoolError: for the first thing that cannot work.
@@ -113,7 +123,7 @@ def make_plan(source: str, profile: Profile, recipe: Recipe, cache: Path) -> Pla
     for name in candidates:
         if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
             raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
-    return Plan(stage, policy, export, candidates, recipe, profile, cache)
+    return Plan(stage, policy, export, candidates, recipe, profile, cache, fresh)
 
 
 def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) -> Report:
@@ -128,10 +138,11 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         source = cached_transform(plan.source, None, plan.cache, context)
         baseline = _chain(plan.export, source, plan, context)
         bundles, failures = _candidates(plan, baseline, context)
-        rows = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
-        judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile) for row in rows.values()]
+        rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
+        on_board = matches(plan.profile.model_strings, fingerprint())
+        judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
         judged = choose(judged, plan.profile.engine)
-        report = _report(plan, baseline, judged, failures, context)
+        report = _report(plan, baseline, judged, failures, warnings, context)
         chosen = next(item.row for item in judged if item.row.role == "chosen")
         chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
         _write_bundle(plan, chosen, chosen_bundle, draft)
@@ -173,9 +184,11 @@ def _candidates(plan: Plan, baseline: Bundle, context: Context) -> tuple[dict[st
     return bundles, failures
 
 
-def _measure(plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context) -> dict[str, Row]:
-    """Return one row for each bundle with latency, memory, accuracy and predictions; the baseline is first."""
-    rows = _latency_rows(plan, source, bundles, context)
+def _measure(
+    plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context
+) -> tuple[dict[str, Row], tuple[str, ...]]:
+    """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
+    rows, warnings = _latency_rows(plan, source, bundles, context)
     loop = plan.closed_loop
     success: dict[str, Row] = {}
     for name, bundle in bundles.items():
@@ -191,16 +204,20 @@ def _measure(plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Co
             row = replace(row, raw={**row.raw, **paired.raw}, details={**row.details, **paired.details})
         found += predictions(plan.profile, bundle)
         rows[name] = replace(row, measurements=(*row.measurements, *found))
-    return rows
+    return rows, warnings
 
 
-def _latency_rows(plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context) -> dict[str, Row]:
+def _latency_rows(
+    plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context
+) -> tuple[dict[str, Row], tuple[str, ...]]:
     effort = plan.recipe.effort
     torch = [source] if source.manifest.source and source.path != bundles[BASELINE].path else []
     others = [bundle for name, bundle in bundles.items() if name != BASELINE]
     against = tuple(bundle.path for bundle in [*others, *torch])
     stage = Latency(against=against, iterations=effort.iterations, threads=effort.threads)
-    report = cached_measure(stage, bundles[BASELINE], plan.cache, context)
+    begun = now()
+    report = cached_measure(stage, bundles[BASELINE], plan.cache, context, fresh=plan.fresh)
+    kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)
     rows = dict(zip(bundles, report.rows, strict=False))
     named = {name: replace(row, name=name) for name, row in rows.items()}
     if torch:
@@ -208,17 +225,22 @@ def _latency_rows(plan: Plan, source: Bundle, bundles: dict[str, Bundle], contex
         if eager is not None:
             own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
             named[BASELINE] = replace(named[BASELINE], measurements=(*named[BASELINE].measurements, own))
-    return named
+    return named, (*report.warnings, *(kept if report.created < begun else ()))
 
 
-def _report(plan: Plan, baseline: Bundle, judged: list[Judged], failures: list[Row], context: Context) -> Report:
-    from vlatool.host import fingerprint
-
+def _report(
+    plan: Plan,
+    baseline: Bundle,
+    judged: list[Judged],
+    failures: list[Row],
+    notes: tuple[str, ...],
+    context: Context,
+) -> Report:
     rows = tuple(item.row for item in judged) + tuple(failures)
     chosen = next(item for item in judged if item.row.role == "chosen")
     wanted = plan.recipe.limits
     limits = {"max_success_drop_points": 100 * wanted.max_drop, "hz": wanted.hz, "profile": plan.profile.name}
-    warnings = tuple(dict.fromkeys(warning for item in judged for warning in item.warnings))
+    warnings = tuple(dict.fromkeys([*notes, *(warning for item in judged for warning in item.warnings)]))
     return Report(
         "optimize",
         f"{baseline.manifest.name} for {plan.profile.name}",
@@ -227,7 +249,7 @@ def _report(plan: Plan, baseline: Bundle, judged: list[Judged], failures: list[R
         rows=rows,
         limits={key: value for key, value in limits.items() if value is not None},
         command=context.command,
-        created=_now(),
+        created=now(),
         environment=fingerprint(),
         warnings=warnings,
     )
@@ -259,9 +281,8 @@ def _options(stage: Stage) -> str:
     return " ".join(f"{key}={value}" for key, value in stage.options().items())
 
 
-def _now() -> str:
-    from datetime import datetime, timezone
-
+def now() -> str:
+    """Return the time in UTC, ISO 8601, to the second."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 

@@ -59,7 +59,6 @@ def load(kind: str, name: str) -> type:
         for key, value in vars(source).items()
         if inspect.isclass(value) and value.__module__ == source.__name__ and not key.startswith("_")
     ]
-    marked = [value for value in classes if getattr(value, "__entry__", False)] or classes
-    if len(marked) != 1:
-        raise TypeError(f"{source.__name__} must define exactly one public class, it defines {len(marked)}")
-    return marked[0]
+    if len(classes) != 1:
+        raise TypeError(f"{source.__name__} must define exactly one public class, it defines {len(classes)}")
+    return classes[0]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from pydantic import Field
 
+from vlatool.benchmark._contest import Contestant, latency_measurements, run_interleaved, speedup, unique_names
 from vlatool.benchmark._probe import cold_start
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.data import observations_for
@@ -20,29 +18,9 @@ from vlatool.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import Policy
 from vlatool.stage import Context, Measure
-from vlatool.statistics import quantile_interval
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
-
-BLOCKS = 20
-"""Rounds in which every policy takes its turn; ratios are taken within a round, so that a slow phase hits all alike."""
-
-
-@dataclass
-class Contestant:
-    """One policy in the run: its bundle, how it is opened, and the milliseconds of each inference."""
-
-    name: str
-    bundle: Bundle
-    policy: Policy
-    observations: list[dict[str, Any]]
-    blocks: list[list[float]] = field(default_factory=list)
-
-    @property
-    def samples(self) -> list[float]:
-        """All milliseconds in the order in which they were taken."""
-        return [value for block in self.blocks for value in block]
 
 
 class Latency(Measure):
@@ -62,6 +40,11 @@ class Latency(Measure):
         """The manifests of the further bundles; they hold the hash of every file."""
         return tuple(path / MANIFEST for path in self.against)
 
+    def key(self, source_hash: str) -> str:
+        """A latency belongs to the machine that it was measured on."""
+        host = fingerprint()
+        return super().key(f"{source_hash} {host.get('cpu')} {host.get('cores')} {host.get('kernel')}")
+
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Every bundle can be opened."""
         for path in self.against:
@@ -72,8 +55,8 @@ class Latency(Measure):
         bundles = [source, *(Bundle.open(path) for path in self.against)]
         contestants = [self._open(bundle) for bundle in bundles]
         unique_names(contestants)
-        self._measure(contestants, context)
-        rows = []
+        run_interleaved(contestants, self.iterations, self.warmup, context)
+        rows: list[Row] = []
         for contestant in contestants:
             context.tell("cold start of each in a fresh process", len(rows) / len(contestants))
             rows.append(self._row(contestant, contestants[0]))
@@ -82,7 +65,9 @@ class Latency(Measure):
         where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
         summary = f"{rows[0].name}: {p50:.3g} ms median latency on {where}."
         title = f"Latency of {source.manifest.name}"
-        return Report("benchmark", title, summary=(summary,), rows=tuple(rows), environment=host)
+        return Report(
+            "benchmark", title, summary=(summary,), rows=tuple(rows), environment=host, warnings=busy_warning(host)
+        )
 
     def _open(self, bundle: Bundle) -> Contestant:
         manifest = bundle.manifest
@@ -96,17 +81,6 @@ class Latency(Measure):
         stage = str(manifest.made_by.get("stage", "policy")).rpartition(".")[2]
         name = {"torch_module": "torch eager", "onnx": "float32"}.get(stage, stage)
         return Contestant(name, bundle, policy, observations_for(bundle, 32))
-
-    def _measure(self, contestants: Sequence[Contestant], context: Context) -> None:
-        for contestant in contestants:
-            for index in range(self.warmup):
-                contestant.policy.infer(contestant.observations[index % len(contestant.observations)])
-        each = max(1, self.iterations // BLOCKS)
-        order = np.random.default_rng(0)
-        for block in range(BLOCKS):
-            context.tell("measuring latency", block / BLOCKS)
-            for index in order.permutation(len(contestants)):
-                contestants[int(index)].blocks.append(_timed(contestants[int(index)], each))
 
     def _row(self, contestant: Contestant, reference: Contestant) -> Row:
         samples = contestant.samples
@@ -131,45 +105,15 @@ class Latency(Measure):
         ]
 
 
-def _timed(contestant: Contestant, count: int) -> list[float]:
-    found = []
-    done = len(contestant.blocks) * count
-    for index in range(count):
-        observation = contestant.observations[(done + index) % len(contestant.observations)]
-        start = time.perf_counter_ns()
-        contestant.policy.infer(observation)
-        found.append((time.perf_counter_ns() - start) / 1e6)
-    return found
-
-
-def latency_measurements(samples: Sequence[float]) -> list[Measurement]:
-    """Return p50, p90, p99 and max in ms; a percentile whose upper bound the samples do not reach is left out."""
-    found = []
-    for name, quantile in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99)):
-        value, low, high = quantile_interval(samples, quantile)
-        if high is not None:
-            found.append(Measurement(f"latency_{name}", value, "ms", samples=len(samples), low=low, high=high))
-    return [*found, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
-
-
-def speedup(contestant: Contestant, reference: Contestant) -> Measurement:
-    """Return reference median / own median, with the order-statistic interval of the ratios within rounds."""
-    ratios = [
-        float(np.median(base) / np.median(own)) for base, own in zip(reference.blocks, contestant.blocks, strict=True)
-    ]
-    value = float(np.median(reference.samples) / np.median(contestant.samples))
-    _, low, high = quantile_interval(ratios, 0.5)
-    low, high = (min(low, value) if low else low), (max(high, value) if high else high)
-    note = f"ratio of medians to {reference.name}, interleaved"
-    return Measurement("speedup", value, "x", samples=len(contestant.samples), low=low, high=high, note=note)
-
-
-def unique_names(contestants: Sequence[Contestant]) -> None:
-    """Tell contestants of the same stage apart by their directories."""
-    names = [contestant.name for contestant in contestants]
-    for contestant in contestants:
-        if names.count(contestant.name) > 1:
-            contestant.name = f"{contestant.name} ({contestant.bundle.path.name})"
+def busy_warning(host: Mapping[str, Any]) -> tuple[str, ...]:
+    """Warn when other work was running: the load average says more than this process can have caused."""
+    load, cores = host.get("load_average"), host.get("cores")
+    if not load or not cores or load[0] <= max(1.5, 0.75 * cores):
+        return ()
+    return (
+        f"this host was busy (load {load[0]:.1f} on {cores} cores): the latencies are those of a contended machine; "
+        "ratios within the run still compare, absolute values do not; repeat on an idle machine",
+    )
 
 
 def set_torch_threads(threads: int) -> None:

@@ -26,6 +26,7 @@ def optimize(
     threads: Annotated[int | None, typer.Option(min=1, help="threads while timing (1)")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="processes for episodes; all cores if unset")] = None,
     cache: Annotated[Path | None, typer.Option(help="where finished stages are kept")] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="measure again, even what was measured before")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON on stdout")] = False,
@@ -48,7 +49,7 @@ def optimize(
     else:
         read = read_recipe(recipe)
         chosen = read.model_copy(update={"limits": limits, "effort": read.effort.model_copy(update=effort)})
-    plan = pipeline.make_plan(source, board, chosen, cache or cache_directory())
+    plan = pipeline.make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
     if dry_run:
         for line in plan.lines():
             typer.echo(line)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from datetime import datetime, timezone
 from pathlib import Path
 
 from vlatool.bundle import Bundle, writing
@@ -56,15 +58,15 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
     return run_transform(stage, source, path, context, force=True)
 
 
-def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context) -> Report:
-    """Return the stage's report from the cache, or measure and keep it."""
+def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
+    """Return the stage's report from the cache, or measure (always, when ``fresh``) and keep it."""
     path = cached_path(stage, source.hash, cache)
-    if path.is_dir():
+    if path.is_dir() and not fresh:
         try:
             return read_report(path)
         except DataError:
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
-    report = stage.run(source, context)
+    report = replace(stage.run(source, context), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     with writing(path, force=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
     return report
