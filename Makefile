@@ -2,11 +2,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PYTHON310 ?= python3.10
 OUT ?= out
 TORCH := torch==2.13.0
 SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
-.PHONY: help install demo test check docs format clean metaworld
+.PHONY: help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -39,6 +40,12 @@ check: $(VENV)/.dev  ## lint, format, types, layers, docs equal code
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python docs/generate.py --check
+
+robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnxruntime 1.23, numpy, nothing else
+	$(BIN)/vlatool quantize sample_models/vln-babyai -o $(OUT)/robot/bundle --force
+	@test -x $(OUT)/robot/venv/bin/python || $(PYTHON310) -m venv $(OUT)/robot/venv
+	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 numpy
+	PYTHONPATH=. $(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
 
 docs: $(VENV)/.dev  ## write docs/reference from the code
 	$(BIN)/python docs/generate.py

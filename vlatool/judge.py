@@ -12,6 +12,7 @@ from vlatool.report import Measurement, Row
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
+AGAINST_FLOAT32 = "against float32"
 MEASURED_ENGINE = "ort_cpu"
 DROPS = ("success_drop", "agreement_drop", "error_increase")
 """Which accuracy decides: the closed loop where there is one, else recorded observations."""
@@ -144,7 +145,7 @@ def _with_drop(row: Row, baseline: Row) -> Row:
             agreement = against.name == "agreement_baseline"
             value = 1.0 - against.value if agreement else against.value
             name = "agreement_drop" if agreement else "error_increase"
-            found.append(Measurement(name, value, "1", samples=against.samples, note="against float32"))
+            found.append(Measurement(name, value, "1", samples=against.samples, note=AGAINST_FLOAT32))
     return replace(row, measurements=(*row.measurements, *found))
 
 
@@ -177,6 +178,8 @@ def _drop_words(drop: Measurement) -> str:
         "error_increase": "action error",
     }
     name = subject[drop.name]
+    if drop.name == "error_increase" and drop.note == AGAINST_FLOAT32:
+        return f"the action differs from float32's by {100 * drop.value:.3g} % of its standard deviation"
     if drop.name == "error_increase":
         return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
     verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")

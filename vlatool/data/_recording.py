@@ -98,7 +98,9 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Array) -> Array:
     if tensor.kind == "text":
         if values.dtype.kind != "U":
             raise DataError(f"{where} is {values.dtype}; a text input needs unicode strings.")
-        return values
+        if values.size != len(values):
+            raise DataError(f"{where} has the shape {list(values.shape)}; a text input has one string a sample.")
+        return values.reshape(-1)
     if values.ndim == len(tensor.shape) + 1 and values.shape[1] == 1:
         values = values[:, 0]
     wanted = tensor.shape[1:]
