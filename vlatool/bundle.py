@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import glob
 import hashlib
 import json
 import os
@@ -165,10 +166,11 @@ def writing(final: Path, *, force: bool = False) -> Iterator[Path]:
 
 def sweep(final: Path) -> None:
     """Remove drafts of ``final`` whose writer is gone."""
-    for stale in final.parent.glob(f".{final.name}.tmp-*"):
+    name = glob.escape(final.name)
+    for stale in final.parent.glob(f".{name}.tmp-*"):
         if not _is_alive(stale):
             shutil.rmtree(stale, ignore_errors=True)
-    for stale in final.parent.glob(f".{final.name}.old-*"):
+    for stale in final.parent.glob(f".{name}.old-*"):
         if final.exists():
             shutil.rmtree(stale, ignore_errors=True)
 
@@ -227,10 +229,13 @@ def _output_errors(final: Path) -> Iterator[None]:
             errno.EDQUOT: ("the disk quota is used up", "free some space, or write elsewhere"),
             errno.EROFS: ("the file system is read-only", "write elsewhere"),
             errno.EACCES: ("permission denied", "write elsewhere, or change the permissions of the directory"),
+            errno.EEXIST: ("a part of the path is a file", "choose another output"),
             errno.ENOTDIR: ("a part of the path is a file", "choose another output"),
         }.get(error.errno or 0)
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        ours = str(error.filename or "").startswith(str(final.parent)) or final.is_relative_to(error.filename or "-")
+        named = Path(str(error.filename or "-"))
+        drafts = any(part.startswith(f".{final.name}.") for part in named.parts)
+        ours = drafts or named.is_relative_to(final) or final.is_relative_to(named)
         if reason is None or not (full or ours):
             raise
         raise OutputError(f"Cannot write {final}: {reason[0]}.", reason[1]) from error

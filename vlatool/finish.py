@@ -14,6 +14,7 @@ import numpy as np
 from vlatool.bundle import Bundle, seal
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import draw
 
 GOLDEN = "golden/golden.npz"
 GOLDEN_COUNT = 2
@@ -72,11 +73,7 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     random = np.random.default_rng(0)
     arrays: dict[str, list[Any]] = {}
     for observation in observations[:GOLDEN_COUNT]:
-        noise = {
-            name: random.standard_normal(wanted["shape"], np.float32)
-            for step in draft.manifest.program
-            for name, wanted in step.noise.items()
-        }
+        noise = {name: draw(wanted, random) for step in draft.manifest.program for name, wanted in step.noise.items()}
         policy.reset()
         outputs = policy.infer(observation, noise=noise).outputs
         for prefix, values in (("in", observation), ("noise", noise), ("out", outputs)):

@@ -12,6 +12,8 @@ from vlatool.report import Measurement, Row
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
+TOLERANCE = 1e-12
+TIE = 1.05
 AGAINST_FLOAT32 = "against float32"
 MEASURED_ENGINE = "ort_cpu"
 DROPS = ("success_drop", "agreement_drop", "error_increase")
@@ -20,11 +22,21 @@ DROPS = ("success_drop", "agreement_drop", "error_increase")
 
 @dataclass(frozen=True)
 class Judged:
-    """A row, whether it keeps to the limits, by how much it misses, and what to say about it."""
+    """A row, held against the limits.
+
+    Args:
+        row: The row with its role and the reason for it in words.
+        within: Whether it keeps to every limit.
+        drop: Accuracy lost against float32, a share; NaN when it is not known.
+        miss: By how much it misses the limits, as a multiple of them (0 when within, infinite when unknown).
+        sentences: What to tell a person, when it is the chosen one.
+        warnings: What a person should know before trusting it.
+    """
 
     row: Row
     within: bool
     drop: float
+    miss: float = 0.0
     sentences: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -42,32 +54,54 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile, on_board: b
     Returns:
         The row with its role (``within`` / ``outside``; the baseline keeps its own) and the reason in words.
     """
+    is_baseline = row is baseline
     row = _with_drop(row, baseline)
     decisive = next((found for name in DROPS if (found := row.get(name)) is not None), None)
+    rate = _judge_rate(row, limits, profile, on_board)
+    if is_baseline:
+        reason = "; ".join(rate.reasons) or "the reference"
+        return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
+    accuracy = _judge_accuracy(row, decisive, limits)
+    reasons = (*accuracy.reasons, *rate.reasons)
+    kept = f"{_drop_words(decisive)}, within {_points(limits.max_drop)}" if decisive else ""
+    row = replace(row, role="outside" if reasons else "within", reason="; ".join(reasons) or kept)
+    warnings = (*rate.warnings, *(() if reasons else accuracy.warnings))
     drop = decisive.value if decisive else math.nan
-    reasons, warnings = [], []
-    if row is not baseline and decisive is not None and drop > limits.max_drop + 1e-12:
-        reasons.append(f"{_drop_words(decisive)}, {_points(drop - limits.max_drop)} over the budget")
-    if row is not baseline and decisive is None:
-        reasons.append("its accuracy is unmeasured: the policy brings neither an environment nor evaluation data")
-    late, warning = _too_slow(row, limits, profile, on_board)
-    reasons += late
-    warnings += warning
-    if decisive is not None and not reasons and (decisive.high or 0.0) > limits.max_drop and row.role != "baseline":
-        warnings.append(
-            f"{row.name}: the drop could be as large as {_points(decisive.high or 0.0)} ({decisive.samples} paired "
-            "samples cannot exclude it); more episodes would narrow it: --episodes"
+    return Judged(row, not reasons, drop, accuracy.miss + rate.miss, (), warnings)
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """What one limit says: reasons against the row, by how much it misses, and reservations."""
+
+    reasons: tuple[str, ...] = ()
+    miss: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+
+def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verdict:
+    if drop is None or not drop.known:
+        reason = "its accuracy is unmeasured: the policy brings neither an environment nor evaluation data"
+        return _Verdict((reason,), math.inf)
+    over = drop.value - limits.max_drop
+    if over > TOLERANCE:
+        return _Verdict((f"{_drop_words(drop)}, {_points(over)} over the budget",), over / max(limits.max_drop, 0.001))
+    high = drop.high or 0.0
+    if high <= limits.max_drop:
+        return _Verdict()
+    return _Verdict(
+        warnings=(
+            f"{row.name}: the drop could be as large as {_points(high)} ({drop.samples} paired samples cannot exclude "
+            "it); more episodes would narrow it: --episodes",
         )
-    kept = _drop_words(decisive) + f", within {_points(limits.max_drop)}" if decisive and not reasons else ""
-    role = row.role if row.role == "baseline" else ("outside" if reasons else "within")
-    reason = "; ".join(reasons) or (kept if role != "baseline" else "the reference")
-    return Judged(
-        replace(row, role=role, reason=reason), not reasons, 0.0 if role == "baseline" else drop, (), tuple(warnings)
     )
 
 
 def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
     """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside.
+
+    Of rows within ``TIE`` of the fastest, which timing noise cannot tell apart, the most accurate is chosen, and of
+    equally accurate ones the first, so that a repeated run chooses the same.
 
     Args:
         judged: The baseline first.
@@ -80,7 +114,7 @@ def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
     quantized = [item for item in judged if item.row.role != "baseline"]
     inside = [item for item in quantized if item.within]
     if not inside:
-        best = min(quantized, key=lambda item: (item.drop if not math.isnan(item.drop) else math.inf, _p50(item.row)))
+        best = min(quantized, key=lambda item: (item.miss, _p50(item.row, origin)))
         reason = f"kept as the nearest, though outside the limits: {best.row.reason}"
         sentences = (
             f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept.",
@@ -88,26 +122,43 @@ def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
         )
     else:
         baseline = [item for item in judged if item.row.role == "baseline" and item.within]
-        best = min([*inside, *baseline], key=lambda item: _p50(item.row, origin))
+        best = _fastest([*inside, *baseline], origin)
         reason = f"the fastest inside the limits ({origin}); {best.row.reason}"
         sentences = _praise(best, judged) if origin == "measured" else _foretell(best, judged)
     chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
     return [chosen if item is best else item for item in judged]
 
 
+def _fastest(items: list[Judged], origin: str) -> Judged:
+    least = min(_p50(item.row, origin) for item in items)
+    tied = [item for item in items if _p50(item.row, origin) <= TIE * least] or items
+    return min(tied, key=lambda item: item.drop)
+
+
 def _praise(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     row, base = best.row, judged[0].row
     if best is judged[0]:
-        return (
-            f"{row.name} was kept: no quantized candidate is faster on this host.",
-            "For a graph this small the quantize and dequantize steps cost more than int8 arithmetic saves.",
-        )
+        return _float32_kept(judged)
     speed = f"{row.value('speedup'):.2f}x as fast as {base.name}"
     times = f"{row.value('latency_p50'):.3g} ms instead of {base.value('latency_p50'):.3g} ms, measured on this host"
     size = f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
     accuracy = row.get("success")
     success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
     return (f"{row.name} is {speed} ({times}); {size}.{success}", f"{row.reason[:1].upper()}{row.reason[1:]}.")
+
+
+def _float32_kept(judged: list[Judged]) -> tuple[str, ...]:
+    base = judged[0].row
+    faster = [item for item in judged[1:] if not item.within and _p50(item.row) < _p50(base)]
+    if faster:
+        return (
+            f"{base.name} was kept: the candidates inside the limits are slower than it on this host.",
+            *(f"{item.row.name} is faster, but outside: {item.row.reason}." for item in faster),
+        )
+    return (
+        f"{base.name} was kept: no quantized candidate is faster on this host.",
+        "In a graph this small the quantize and dequantize steps can cost more than int8 arithmetic saves.",
+    )
 
 
 def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
@@ -149,26 +200,28 @@ def _with_drop(row: Row, baseline: Row) -> Row:
     return replace(row, measurements=(*row.measurements, *found))
 
 
-def _too_slow(row: Row, limits: Limits, profile: Profile, on_board: bool) -> tuple[list[str], list[str]]:
+def _judge_rate(row: Row, limits: Limits, profile: Profile, on_board: bool) -> _Verdict:
     """Judge the rate: on the board by what was measured, elsewhere by the prediction for the board."""
     if limits.hz is None:
-        return [], []
+        return _Verdict()
     budget_ms = 1000.0 / limits.hz
     if on_board:
-        p90 = row.get("latency_p90") or row.get("latency_p50")
-        late = p90 is not None and p90.value > budget_ms
-        return ([f"p90 latency {p90.value:.3g} ms > {budget_ms:.3g} ms"] if p90 and late else []), []
+        found = row.get("latency_p90") or row.get("latency_p50")
+        p90 = found.value if found else math.inf
+        late = (f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms",)
+        return _Verdict(late, p90 / budget_ms - 1) if p90 > budget_ms else _Verdict()
     predicted = row.get("latency_p50", "predicted")
     if predicted is None or not predicted.known:
-        return [], [f"{row.name}: no latency can be predicted for {profile.name}, so {limits.hz:g} Hz is unjudged"]
+        unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {limits.hz:g} Hz is unjudged"
+        return _Verdict(warnings=(unjudged,))
     low, high = predicted.low or predicted.value, predicted.high or predicted.value
     told = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
     told += f", {limits.hz:g} Hz needs {budget_ms:.3g} ms"
     if low > budget_ms:
-        return [told], []
+        return _Verdict((told,), predicted.value / budget_ms - 1)
     if high > budget_ms:
-        return [], [f"{row.name}: {told}: too close to call, measure on the board"]
-    return [], []
+        return _Verdict(warnings=(f"{row.name}: {told}: too close to call, measure on the board",))
+    return _Verdict()
 
 
 def _drop_words(drop: Measurement) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -62,15 +62,26 @@ class ProgramStep:
     keep: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
+            if not isinstance(getattr(self, word), Mapping):
+                raise SpecError(f"'{word}' of '{self.graph}' must be a mapping; got {getattr(self, word)!r}.")
         if not isinstance(self.repeat, int) or self.repeat < 1:
             raise SpecError(f"The program repeats '{self.graph}' {self.repeat!r} times; allowed: from 1.")
         for value, numbers in self.schedule.items():
+            if not isinstance(numbers, list | tuple):
+                raise SpecError(f"The schedule of '{value}' must be a list of numbers; got {numbers!r}.")
             if len(numbers) != self.repeat:
                 got = f"{len(numbers)} numbers, but '{self.graph}' runs {self.repeat} times"
                 raise SpecError(f"The schedule of '{value}' has {got}.")
         for value, noise in self.noise.items():
+            if not isinstance(noise, Mapping):
+                raise SpecError(f"The noise '{value}' must be a mapping; got {noise!r}.")
             if noise.get("distribution", "normal") not in DISTRIBUTIONS or not noise.get("shape"):
                 raise SpecError(f"The noise '{value}' needs a shape and a distribution of {', '.join(DISTRIBUTIONS)}.")
+
+        for value, kept in self.keep.items():
+            if not isinstance(kept, Mapping) or not kept.get("shape"):
+                raise SpecError(f"The kept value '{value}' needs a shape.")
 
     def sources(self) -> set[str]:
         """Values that this entry brings into being before its graph runs."""
@@ -123,6 +134,8 @@ class Manifest:
         for graph in self.graphs.values():
             if graph.file not in self.files:
                 raise BundleError(f"The manifest names the graph {graph.file}, but records no hash for it.")
+        if self.graphs and not self.program:
+            raise BundleError("The manifest has graphs, but no program that runs them.")
         if self.program:
             check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
 
@@ -161,7 +174,7 @@ class Manifest:
         plain["spec"] = self.spec.to_dict()
         plain["graphs"] = {name: _nonempty(graph) for name, graph in self.graphs.items()}
         plain["program"] = [_nonempty(step) for step in self.program]
-        plain["files"] = {path: _nonempty(record) for path, record in sorted(self.files.items())}
+        plain["files"] = {path: asdict(record) for path, record in sorted(self.files.items())}
         return plain
 
 
@@ -228,6 +241,8 @@ def _check_schema(schema: Any) -> None:
 
 
 def _inside(path: str) -> None:
+    if not isinstance(path, str):
+        raise BundleError(f"The manifest names the file {path!r}; a file is text.")
     pure = PurePosixPath(path)
     if pure.is_absolute() or ".." in pure.parts or not path:
         raise BundleError(f"The manifest names the file '{path}', which is not inside the bundle.")

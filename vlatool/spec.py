@@ -60,6 +60,13 @@ class TensorSpec:
     def _check_words(self) -> None:
         if not self.name or not isinstance(self.name, str):
             raise SpecError(f"A tensor needs a name; got {self.name!r}.")
+        for field in ("statistics", "tokenizer"):
+            if not isinstance(getattr(self, field), str):
+                raise SpecError(f"'{self.name}' has {field} {getattr(self, field)!r}; it must be text.")
+        if not isinstance(self.labels, tuple) or not isinstance(self.unit, str | tuple):
+            raise SpecError(f"'{self.name}' has labels {self.labels!r} and unit {self.unit!r}; labels must be a list.")
+        if not isinstance(self.max_tokens, int):
+            raise SpecError(f"'{self.name}' has max_tokens {self.max_tokens!r}; it must be a whole number.")
         allowed = {"dtype": DTYPES, "kind": KINDS, "normalisation": NORMALISATIONS, "mode": MODES}
         for field, values in allowed.items():
             got = getattr(self, field)
@@ -155,7 +162,8 @@ class PolicySpec:
         number = isinstance(self.control_hz, int | float) and not isinstance(self.control_hz, bool)
         if not number or not 0 < self.control_hz < 1e5:
             raise SpecError(f"control_hz is {self.control_hz!r}; allowed: a rate in Hz above 0.")
-        if not isinstance(self.chunk, int) or self.chunk < 1 or not 0 <= self.execute <= self.chunk:
+        whole = isinstance(self.chunk, int) and isinstance(self.execute, int)
+        if not whole or self.chunk < 1 or not 0 <= self.execute <= self.chunk:
             raise SpecError(f"chunk is {self.chunk!r} and execute {self.execute!r}; allowed: 1 <= execute <= chunk.")
 
     @property

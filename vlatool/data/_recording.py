@@ -81,11 +81,11 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
         if tensor.name not in arrays:
             raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.")
         inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name])
-    lengths = {name: len(values) for name, values in inputs.items()}
     actions, episodes = arrays.get(spec.action.name, arrays.get("action")), arrays.get("episode")
-    for name, values in (("action", actions), ("episode", episodes)):
-        if values is not None:
-            lengths[name] = len(values)
+    lengths = {name: len(values) for name, values in inputs.items()}
+    for name, recorded in (("action", actions), ("episode", episodes)):
+        if recorded is not None:
+            lengths[name] = _length(path, name, recorded)
     if len(set(lengths.values())) != 1:
         raise DataError(f"{path} has different numbers of samples: {lengths}.", "each array needs one row a sample")
     if not next(iter(lengths.values())):
@@ -93,12 +93,18 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
     return Recording(path, inputs, None if actions is None else _checked_action(path, spec.action, actions), episodes)
 
 
+def _length(path: Path, name: str, values: Array) -> int:
+    if not values.ndim:
+        raise DataError(f"'{name}' in {path} is a single value; wanted one row a sample.")
+    return len(values)
+
+
 def _checked_input(path: Path, tensor: TensorSpec, values: Array) -> Array:
     where = f"'{tensor.name}' in {path}"
     if tensor.kind == "text":
         if values.dtype.kind != "U":
             raise DataError(f"{where} is {values.dtype}; a text input needs unicode strings.")
-        if values.size != len(values):
+        if values.size != _length(path, tensor.name, values):
             raise DataError(f"{where} has the shape {list(values.shape)}; a text input has one string a sample.")
         return values.reshape(-1)
     if values.ndim == len(tensor.shape) + 1 and values.shape[1] == 1:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,11 @@ class NpzReader:
             DataError: when the file is corrupt, is a single array, or holds Python objects.
         """
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with path.open("rb") as stream:
+                stored = np.load(stream, allow_pickle=False)
                 if not hasattr(stored, "files"):
                     raise DataError(f"{path} is one array, not an archive of named arrays.", "write it with np.savez")
                 return {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+        except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
             reason = "it holds pickled objects, which are refused" if "pickle" in str(error) else str(error)
             raise DataError(f"{path} cannot be read: {reason}.", "write it again with np.savez") from error

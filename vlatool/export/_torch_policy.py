@@ -95,4 +95,7 @@ class TorchSession:
             raise SourceError(
                 f"The module gives {len(outputs)} outputs; the program says {', '.join(self.step.gives)}."
             )
+        for name, value in zip(self.step.gives, outputs, strict=True):
+            if not isinstance(value, torch.Tensor):
+                raise SourceError(f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.")
         return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}

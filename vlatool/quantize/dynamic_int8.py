@@ -42,7 +42,7 @@ class DynamicInt8(Quantization):
                 per_channel=self.per_channel,
                 reduce_range=self.reduce_range,
                 weight_type=quantization.QuantType.QInt8,
-                nodes_to_exclude=excluded,
+                nodes_to_exclude=[*excluded, *(f"{name}_MatMul" for name in excluded)],
                 extra_options={"MatMulConstBOnly": True},
             )
             save(load(scratch / "model.onnx"), target)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer
 from vlatool.spec import PolicySpec, TensorSpec
@@ -63,7 +63,10 @@ def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
     floating = dtype.kind == "f"
 
     def encode(value: Any) -> Array:
-        array = value if isinstance(value, np.ndarray) else np.asarray(value)
+        try:
+            array = value if isinstance(value, np.ndarray) else np.asarray(value)
+        except ValueError as error:
+            raise DataError(f"The input '{tensor.name}' is no array: its rows have different lengths.") from error
         if array.dtype != dtype:
             array = _cast(array, dtype, tensor)
         shape = array.shape
@@ -73,7 +76,7 @@ def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
             raise DataError(
                 f"The input '{tensor.name}' holds {_not_finite(array)}.", "check the sensor or the recording"
             )
-        return array if normaliser is None else normaliser.forward(array)
+        return array if normaliser is None else normaliser.forward(array).astype(dtype, copy=False)
 
     return encode
 
@@ -118,8 +121,3 @@ def _batched(array: Array, tensor: TensorSpec) -> Array:
 def _not_finite(array: Array) -> str:
     nans = int(np.isnan(array).sum())
     return f"{nans} NaN of {array.size} values" if nans else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
-
-
-def missing_input(name: str, spec: PolicySpec) -> DataError:
-    """Return the error for a name that is no input of the policy."""
-    return DataError(f"The policy has no input '{name}'; {nearest(name, [tensor.name for tensor in spec.inputs])}.")

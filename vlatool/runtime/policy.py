@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,11 +150,11 @@ def load_golden(bundle: Bundle) -> tuple[dict[str, Any], dict[str, Array], Array
         return None
     path = bundle.file(bundle.manifest.golden)
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
             observation = {tensor.name: stored[f"in.{tensor.name}"][0] for tensor in bundle.manifest.spec.inputs}
             noise = {key[6:]: stored[key][0] for key in stored.files if key.startswith("noise.")}
             return observation, noise, stored[f"out.{bundle.manifest.spec.action.name}"][0]
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, OSError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise DataError(f"The golden file {path} cannot be read: {error}.") from error
 
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError
+from vlatool.errors import DataError, nearest
 from vlatool.manifest import ProgramStep
 
 Array = NDArray[Any]
@@ -53,6 +53,10 @@ class Program:
             values: Value name -> array.
             noise: Value name -> array, in the place of what the program would draw.
         """
+        for name in noise or ():
+            if all(name not in step.noise for step in self.steps):
+                known = [known for step in self.steps for known in step.noise]
+                raise DataError(f"The program draws no noise '{name}'; {nearest(name, known)}.")
         values.update(self._kept)
         for step, schedules in zip(self.steps, self._schedules, strict=True):
             for name, wanted in step.noise.items():
@@ -79,12 +83,18 @@ class Program:
             if noise[name].shape != shape:
                 raise DataError(f"The noise '{name}' has the shape {list(noise[name].shape)}; wanted {list(shape)}.")
             return np.asarray(noise[name], np.float32)
-        distribution = wanted.get("distribution", "normal")
-        if distribution == "zeros":
-            return np.zeros(shape, np.float32)
-        if distribution == "uniform":
-            return self._random.uniform(-1, 1, shape).astype(np.float32)
-        return self._random.standard_normal(shape, np.float32)
+        return draw(wanted, self._random)
+
+
+def draw(wanted: Mapping[str, Any], random: np.random.Generator) -> Array:
+    """Draw float32 noise as a program asks for it: ``normal`` N(0, 1), ``uniform`` on [-1, 1) or ``zeros``."""
+    shape = tuple(wanted["shape"])
+    distribution = wanted.get("distribution", "normal")
+    if distribution == "zeros":
+        return np.zeros(shape, np.float32)
+    if distribution == "uniform":
+        return random.uniform(-1, 1, shape).astype(np.float32)
+    return random.standard_normal(shape, np.float32)
 
 
 def _schedules(step: ProgramStep) -> dict[str, list[Array]]:

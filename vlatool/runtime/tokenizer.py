@@ -80,7 +80,8 @@ def _read(path: Path, name: str) -> dict[str, Any]:
 
 def _words(data: dict[str, Any], path: Path, name: str) -> tuple[int, Encode]:
     words, pad, unknown = data.get("words"), data.get("pad"), data.get("unknown")
-    if not isinstance(words, dict) or not isinstance(pad, int) or not isinstance(unknown, int):
+    ids = isinstance(words, dict) and all(isinstance(number, int) for number in words.values())
+    if not isinstance(words, dict) or not ids or not isinstance(pad, int) or not isinstance(unknown, int):
         raise SpecError(f"The vocabulary {path} needs 'words' (a mapping), 'pad' and 'unknown' (ids).")
 
     def encode(text: str) -> list[int]:
@@ -96,7 +97,11 @@ def _words(data: dict[str, Any], path: Path, name: str) -> tuple[int, Encode]:
 
 
 def _library(path: Path) -> tuple[int, Encode]:
-    tokenizer = require("tokenizers", "text").Tokenizer.from_file(str(path))
+    library = require("tokenizers", "text")
+    try:
+        tokenizer = library.Tokenizer.from_file(str(path))
+    except Exception as error:  # the seam: the library raises plain Exception
+        raise SpecError(f"{path} is no file of the tokenizers library: {error}.") from error
     tokenizer.no_truncation()
     padding = tokenizer.padding or {}
     tokenizer.no_padding()

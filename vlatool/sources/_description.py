@@ -67,6 +67,11 @@ def read_description(path: Path) -> Description:
     for key in data:
         if key not in KEYS:
             raise SourceError(f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.")
+    if data.get("schema", 1) != 1:
+        raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
+    for key in ("arguments", "environment", "parts"):
+        if not isinstance(data.get(key) or {}, Mapping):
+            raise SourceError(f"{file}: '{key}' must be a mapping; got {data[key]!r}.")
     for key in ("name", "spec"):
         if key not in data:
             raise SourceError(f"{file} has no '{key}'.", "see docs/guides/your-own-policy.md for a complete example")
@@ -103,7 +108,7 @@ def read_location(bundle: Path) -> Path:
     """
     try:
         folder = Path(json.loads((bundle / LOCATION).read_text(encoding="utf-8"))["folder"])
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise SourceError(
             f"{bundle} does not say where the policy's code is.", "start again from the source"
         ) from error

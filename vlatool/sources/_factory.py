@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
 import importlib.util
 import sys
@@ -85,7 +86,8 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
 
 
 def _import_path(path: Path) -> ModuleType:
-    name = f"vlatool_source_{abs(hash(str(path))):x}_{path.stem}"
+    digest = hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:16]
+    name = f"vlatool_source_{digest}_{path.stem}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -95,7 +97,7 @@ def _import_path(path: Path) -> ModuleType:
     sys.modules[name] = module
     try:
         with _importable(path):
-            spec.loader.exec_module(module)
+            exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
     except BaseException:
         sys.modules.pop(name, None)
         raise
@@ -108,6 +110,10 @@ def _importable(path: Path | None) -> Iterator[None]:
     if path is None:
         yield
         return
+    for neighbour in path.parent.glob("*.py"):
+        loaded = getattr(sys.modules.get(neighbour.stem), "__file__", None)
+        if loaded and Path(loaded).name == neighbour.name and Path(loaded).parent != path.parent:
+            del sys.modules[neighbour.stem]  # another policy's file of the same name
     sys.path.insert(0, str(path.parent))
     try:
         yield

@@ -13,6 +13,7 @@ from vlatool.data import observations_for
 from vlatool.errors import SourceError, nearest, require
 from vlatool.finish import finish
 from vlatool.manifest import Graph, Manifest, single_graph
+from vlatool.quantize._precision import precision_shares
 from vlatool.sources._description import Description, read_description
 from vlatool.sources.torch_module import copy_assets
 from vlatool.spec import PolicySpec, TensorSpec
@@ -46,7 +47,11 @@ class OnnxFile(Transform):
         described = read_description(self.policy) if self.policy else None
         data = [path for path in (described.calibration, described.evaluation) if path] if described else []
         beside = sorted(self.model.parent.glob(self.model.name + "*"))
-        return (*beside, *data, *([self.policy] if self.policy and self.policy.is_file() else []))
+        if described is None or self.policy is None:
+            return tuple(beside)
+        description = self.policy / "policy.yaml" if self.policy.is_dir() else self.policy
+        assets = [described.folder / name for name in sorted(described.assets())]
+        return (*beside, *data, description, *assets)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Load the file, store it, and run it once."""
@@ -70,7 +75,7 @@ class OnnxFile(Transform):
             license=described.license,
         )
         opset = max((entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")), default=0)
-        graphs = {"main": Graph("graphs/main.onnx", {"float32": 1.0}, opset)}
+        graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset)}
         made_by = {**self.made_by(), "options": {"model": self.model.name}}
         origin = Bundle(out, manifest)
         return finish(origin, out, made_by=made_by, graphs=graphs, observations=_observations(described, out, manifest))

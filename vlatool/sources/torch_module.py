@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from pydantic import Field
@@ -95,6 +95,8 @@ def copy_assets(described: Description, out: Path) -> None:
         SourceError: when a file that the spec names is missing.
     """
     for name in sorted(described.assets()):
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise SourceError(f"The spec names {name}, which is not inside {described.folder}.")
         if not (described.folder / name).is_file():
             raise SourceError(f"The spec names {name}, which is not in {described.folder}.")
         target = out / "assets" / name

@@ -1,0 +1,291 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+
+from vlatool.bundle import Bundle, hash_file
+from vlatool.data import recorded_observations
+from vlatool.errors import GraphError, RecipeError, SourceError
+from vlatool.export._torch_policy import load_modules, torch_policy
+from vlatool.export.onnx import ExportOnnx
+from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage import Context, build_stage
+
+PLAIN_YAML = """\
+name: plain
+source: policy.py:make
+spec:
+  inputs: [{name: x, shape: [1, 3]}]
+  outputs: [{name: y, shape: [1, 2]}]
+  control_hz: 10
+"""
+PLAIN_PY = """\
+import torch
+from torch import nn
+
+class Policy(nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.linear = nn.Linear(3, 2)
+
+    def forward(self, x):
+        BODY
+
+def make():
+    return Policy()
+"""
+FLOW_YAML = """\
+name: flow
+source: policy.py:make
+spec:
+  inputs: [{name: state, shape: [1, 3]}]
+  outputs: [{name: action, shape: [1, 4, 2]}]
+  control_hz: 10
+  chunk: 4
+program:
+  - {graph: encode, feeds: {state: state}, gives: {memory: memory}}
+  - graph: denoise
+    feeds: {memory: memory, noisy: noisy, time: time}
+    gives: {cleaner: action}
+    repeat: 3
+    carry: {action: noisy}
+    schedule: {time: [0.0, 0.25, 0.5]}
+    noise: {noisy: {shape: [1, 4, 2], distribution: normal}}
+"""
+FLOW_PY = """\
+import torch
+from torch import nn
+
+class Encode(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.linear = nn.Linear(3, 8)
+
+    def forward(self, state):
+        return torch.tanh(self.linear(state))
+
+class Denoise(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.linear = nn.Linear(8 + 2 + 1, 2)
+
+    def forward(self, memory, noisy, time):
+        context = torch.cat([memory, time[None]], 1)[:, None].expand(1, 4, 9)
+        return noisy - (1 - time) * self.linear(torch.cat([context, noisy], 2))
+
+def make():
+    torch.manual_seed(0)
+    return {"encode": Encode(), "denoise": Denoise()}
+"""
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Callable[..., Bundle]:
+    """A function that writes a policy and gives its source bundle."""
+
+    def make(code: str, description: str = PLAIN_YAML) -> Bundle:
+        folder, out = tmp_path / "policy", tmp_path / "source"
+        folder.mkdir()
+        out.mkdir()
+        (folder / "policy.py").write_text(code)
+        (folder / "policy.yaml").write_text(description)
+        return TorchModule(policy=folder).run(None, out, Context())
+
+    return make
+
+
+@pytest.fixture
+def plain(source) -> Callable[[str], Bundle]:
+    """A function that gives the source bundle of a policy whose ``forward`` is the given body."""
+    return lambda body: source(PLAIN_PY.replace("BODY", body.replace("\n", "\n        ")))
+
+
+def export(bundle: Bundle, out: Path, **options: object) -> Bundle:
+    out.mkdir()
+    return ExportOnnx(**options).run(bundle, out, Context())
+
+
+def test_the_exported_policy_gives_what_torch_gives(source_bundle, float_bundle):
+    torch_side, onnx_side = torch_policy(source_bundle), load(float_bundle.path, threads=1)
+    for observation in recorded_observations(source_bundle, 6):
+        wanted, got = torch_side.infer(observation), onnx_side.infer(observation)
+        np.testing.assert_allclose(got.chunk, wanted.chunk, rtol=1e-3, atol=1e-5)
+        assert got.labels == wanted.labels
+    assert torch_side.engine == "torch eager"
+
+
+def test_the_exported_bundle_is_complete(source_bundle, float_bundle):
+    assert Bundle.open(float_bundle.path) == float_bundle
+    graph = float_bundle.manifest.graphs["main"]
+    assert (graph.file, graph.opset, graph.precision) == ("graphs/main.onnx", 20, {"float32": 1.0})
+    assert float_bundle.manifest.golden in float_bundle.manifest.files
+    assert not (float_bundle.path / "graphs/main.onnx.data").exists()
+    model = onnx.load(float_bundle.path / "graphs/main.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    assert [value.name for value in model.graph.input] == ["image", "proprio", "instruction"]
+    assert [value.name for value in model.graph.output] == ["action"]
+
+
+def test_two_exports_give_equal_bytes(source_bundle, float_bundle, tmp_path: Path):
+    again = export(source_bundle, tmp_path / "again")
+    assert again.hash == float_bundle.hash
+    assert hash_file(again.path / "graphs/main.onnx") == hash_file(float_bundle.path / "graphs/main.onnx")
+
+
+def test_the_graph_holds_no_paths_of_this_machine(float_bundle, policy_template):
+    content = (float_bundle.path / "graphs/main.onnx").read_bytes()
+    for part in (b"site-packages", b"policy.py", b".venv", b"Traceback", str(policy_template).encode(), b"/tmp/"):
+        assert part not in content
+
+
+def test_a_program_of_two_graphs_with_repeat_carry_schedule_and_noise(source, tmp_path: Path):
+    bundle = source(FLOW_PY, FLOW_YAML)
+    made = export(bundle, tmp_path / "out")
+    assert set(made.manifest.graphs) == {"encode", "denoise"}
+    torch_side, onnx_side = torch_policy(bundle), load(made.path, threads=1)
+    noise = {"noisy": np.random.default_rng(0).normal(size=(1, 4, 2)).astype(np.float32)}
+    observation = {"state": np.array([0.1, -0.5, 2.0], np.float32)}
+    wanted = torch_side.infer(observation, noise=noise).chunk
+    np.testing.assert_allclose(onnx_side.infer(observation, noise=noise).chunk, wanted, rtol=1e-4, atol=1e-6)
+    seeded = [load(made.path, threads=1, seed=4).infer(observation).chunk for _ in range(2)]
+    np.testing.assert_array_equal(*seeded)
+    assert not np.allclose(seeded[0], wanted)
+
+
+def test_progress_is_told(plain, tmp_path: Path):
+    told: list[str] = []
+    (tmp_path / "out").mkdir()
+    context = Context(tell=lambda what, share: told.append(what))
+    ExportOnnx().run(plain("return self.linear(x)"), tmp_path / "out", context)
+    assert "exporting main" in told
+
+
+def test_another_opset(plain, tmp_path: Path):
+    made = export(plain("return self.linear(x)"), tmp_path / "out", opset=18)
+    assert made.manifest.graphs["main"].opset == 18
+    opsets = {entry.domain: entry.version for entry in onnx.load(made.path / "graphs/main.onnx").opset_import}
+    assert opsets[""] == 18
+
+
+def test_large_weights_go_beside_the_graph(source_bundle, tmp_path: Path, monkeypatch):
+    import vlatool.export.onnx
+
+    monkeypatch.setattr(vlatool.export.onnx, "EXTERNAL_DATA_BYTES", 8)
+    made = export(source_bundle, tmp_path / "out")
+    assert made.manifest.files["graphs/main.onnx.data"].bytes > 1000
+    assert load(made.path, threads=1).golden_error == pytest.approx(0, abs=1e-6)
+
+
+def test_weights_that_changed_since_the_source_was_made(policy_dir: Path, tmp_path: Path):
+    (tmp_path / "source").mkdir()
+    bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "source", Context())
+    with (policy_dir / "weights.safetensors").open("r+b") as stream:
+        stream.seek(-1, 2)
+        stream.write(b"\x01")
+    with pytest.raises(SourceError, match=r"weights.safetensors has changed since") as caught:
+        export(bundle, tmp_path / "out")
+    assert "start again" in caught.value.fix
+
+
+def test_code_that_is_gone(plain, tmp_path: Path):
+    bundle = plain("return self.linear(x)")
+    (tmp_path / "policy/policy.py").unlink()
+    with pytest.raises(SourceError, match=r"policy.py has changed"):
+        load_modules(bundle)
+
+
+def test_modules_are_in_evaluation_mode(source_bundle):
+    assert not any(module.training for module in load_modules(source_bundle)["main"].modules())
+
+
+def test_a_bundle_of_an_onnx_file_has_nothing_to_export(float_bundle, tmp_path: Path):
+    from dataclasses import replace
+
+    bundle = Bundle(float_bundle.path, replace(float_bundle.manifest, source={}))
+    with pytest.raises(SourceError, match="was not made from a torch policy"):
+        export(bundle, tmp_path / "out")
+
+
+def test_an_export_needs_a_source(tmp_path: Path):
+    with pytest.raises(RecipeError, match=r"export.onnx needs a bundle"):
+        ExportOnnx().run(None, tmp_path, Context())
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("raise RuntimeError('no camera')", r"fails on an observation that fits its spec: RuntimeError: no camera"),
+        (
+            "raise RuntimeError",
+            r"fails on an observation that fits its spec: RuntimeError: +\(given x \[1, 3\] float32\)",
+        ),
+        ("return self.linear(x[:, :2])", r"fails on an observation .*given x \[1, 3\] float32"),
+        ("return self.linear(x), x", "gives 2 outputs; the program says y"),
+        ("return ()", "gives 0 outputs"),
+    ],
+)
+def test_a_module_that_fails_or_gives_another_number_of_outputs(plain, tmp_path: Path, body, message):
+    with pytest.raises(SourceError, match=message):
+        export(plain(body), tmp_path / "out")
+
+
+@pytest.mark.parametrize("body", ["return {'y': self.linear(x)}", "return None", "return 3.0"])
+def test_a_module_that_gives_no_tensor_is_a_source_error_and_no_traceback(plain, tmp_path: Path, body):
+    with pytest.raises(SourceError, match="tensor"):
+        export(plain(body), tmp_path / "out")
+
+
+def test_control_flow_on_data_is_told_without_a_traceback(plain, tmp_path: Path):
+    body = "if x.sum() > 0:\n    return self.linear(x)\nreturn self.linear(x) * 2"
+    with pytest.raises(GraphError, match="torch cannot export the graph 'main': ") as caught:
+        export(plain(body), tmp_path / "out")
+    assert "control flow" in caught.value.fix
+    assert len(caught.value.message.splitlines()) == 1
+
+
+def test_random_numbers_in_forward_are_seen(plain, tmp_path: Path):
+    with pytest.raises(GraphError, match="ONNX Runtime and torch differ on calibration sample 0") as caught:
+        export(plain("return self.linear(x) + torch.rand(1, 2)"), tmp_path / "out")
+    assert "random numbers" in caught.value.fix
+
+
+def test_a_factory_that_gives_no_module(source, tmp_path: Path):
+    with pytest.raises(SourceError, match="gave a int for 'main'; wanted a torch module"):
+        export(source("def make():\n    return 3\n"), tmp_path / "out")
+
+
+def test_a_factory_that_lacks_a_graph_of_the_program(source, tmp_path: Path):
+    code = FLOW_PY.replace('"denoise": ', '"denoiser": ')
+    with pytest.raises(SourceError, match="runs 'denoise', which the factory does not give; did you mean 'denoiser'"):
+        export(source(code, FLOW_YAML), tmp_path / "out")
+
+
+def test_options_outside_the_range_are_refused():
+    with pytest.raises(RecipeError, match=r"opset = 12.*tolerance = 0"):
+        build_stage("export.onnx", {"opset": 12, "tolerance": 0})
+
+
+def test_the_error_of_a_tight_tolerance_names_the_number(source_bundle, tmp_path: Path):
+    with pytest.raises(GraphError, match=r"relative L2 error .*, allowed 1e-12"):
+        export(source_bundle, tmp_path / "out", tolerance=1e-12)
+
+
+def test_the_exporter_leaves_logging_and_outputs_alone(plain, tmp_path: Path, capfd):
+    import logging
+
+    before = logging.getLogger("torch.onnx").level
+    export(plain("return self.linear(x)"), tmp_path / "out")
+    assert logging.getLogger("torch.onnx").level == before
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_golden_action_is_that_of_the_exported_graph(float_bundle, source_bundle):
+    with np.load(float_bundle.path / "golden/golden.npz") as golden:
+        observation = recorded_observations(source_bundle, 24)[0]
+        got = torch_policy(source_bundle).infer(observation).outputs["action"]
+        assert relative_error(got, golden["out.action"][0]) < 1e-4

@@ -1,0 +1,107 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlatool.errors import SpecError
+from vlatool.runtime.statistics import load_normaliser
+from vlatool.spec import NORMALISATIONS, STATISTICS_OF, TensorSpec
+
+ROWS = {"mean": [1, 2], "std": [2, 4], "min": [-1, 0], "max": [3, 10], "q01": [0, 1], "q99": [4, 9]}
+
+
+def load(folder: Path, normalisation: str, table: object = None, where: str = "stats.json#state"):
+    text = table if isinstance(table, str) else json.dumps({"state": ROWS} if table is None else table)
+    (folder / "stats.json").write_text(text)
+    return load_normaliser(TensorSpec("state", (1, 2), normalisation=normalisation, statistics=where), folder)
+
+
+def test_no_normalisation_needs_no_file(tmp_path: Path):
+    assert load_normaliser(TensorSpec("state", (1, 2)), tmp_path) is None
+
+
+def test_mean_and_std(tmp_path: Path):
+    normaliser = load(tmp_path, "mean_std")
+    np.testing.assert_array_equal(normaliser.forward(np.array([[3.0, -2.0]], np.float32)), [[1.0, -1.0]])
+
+
+@pytest.mark.parametrize(("normalisation", "low", "high"), [("min_max", "min", "max"), ("quantiles", "q01", "q99")])
+def test_ranges_map_to_minus_one_and_one(tmp_path: Path, normalisation, low, high):
+    normaliser = load(tmp_path, normalisation)
+    ends = np.array([ROWS[low], ROWS[high]], np.float32)
+    np.testing.assert_allclose(normaliser.forward(ends), [[-1, -1], [1, 1]], atol=1e-6)
+    np.testing.assert_allclose(normaliser.inverse(np.array([-1, 1], np.float32)), [ROWS[low][0], ROWS[high][1]])
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS[1:])
+def test_inverse_undoes_forward_and_stays_float32(tmp_path: Path, normalisation):
+    normaliser = load(tmp_path, normalisation)
+    physical = np.random.default_rng(0).normal(size=(3, 4, 2)).astype(np.float32)
+    normalised = normaliser.forward(physical)
+    assert normalised.dtype == np.float32
+    np.testing.assert_allclose(normaliser.inverse(normalised), physical, rtol=1e-5, atol=1e-6)
+
+
+def test_a_missing_file_is_never_identity_in_silence(tmp_path: Path):
+    with pytest.raises(SpecError, match=r"'state' are missing: .*absent.json \(No such file") as caught:
+        load(tmp_path, "mean_std", where="absent.json#state")
+    assert "never skipped in silence" in caught.value.fix
+
+
+@pytest.mark.parametrize("text", ["", "{", "\x00"])
+def test_a_file_that_is_no_json(tmp_path: Path, text):
+    with pytest.raises(SpecError, match="not valid JSON"):
+        load(tmp_path, "mean_std", text)
+
+
+@pytest.mark.parametrize("table", [{}, [], {"stat": ROWS}])
+def test_a_missing_entry(tmp_path: Path, table):
+    with pytest.raises(SpecError, match="has no statistics 'state' for 'state'"):
+        load(tmp_path, "mean_std", table)
+
+
+def test_a_missing_entry_gets_the_nearest_name(tmp_path: Path):
+    with pytest.raises(SpecError, match="did you mean 'states'"):
+        load(tmp_path, "mean_std", {"states": ROWS})
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS[1:])
+def test_a_missing_key(tmp_path: Path, normalisation):
+    first, second = STATISTICS_OF[normalisation]
+    with pytest.raises(SpecError, match=f"lack '{second}', which {normalisation} needs"):
+        load(tmp_path, normalisation, {"state": {first: [0, 0]}})
+    with pytest.raises(SpecError, match=f"lack '{first}'"):
+        load(tmp_path, normalisation, {"state": "rows"})
+
+
+@pytest.mark.parametrize("row", [[1], [1, 2, 3], [[1, 2]], 4, []])
+def test_a_wrong_width(tmp_path: Path, row):
+    with pytest.raises(SpecError, match=r"has the shape .*; 'state' has 2 elements"):
+        load(tmp_path, "mean_std", {"state": {"mean": row, "std": [1, 1]}})
+
+
+@pytest.mark.parametrize("row", [["a", "b"], [[1], [2, 3]], {"x": 1}])
+def test_what_is_no_list_of_numbers(tmp_path: Path, row):
+    with pytest.raises(SpecError, match="is not a list of numbers"):
+        load(tmp_path, "mean_std", {"state": {"mean": row, "std": [1, 1]}})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
+def test_a_value_that_is_not_finite(tmp_path: Path, value):
+    with pytest.raises(SpecError, match=r"'std' of 'state'.*not finite"):
+        load(tmp_path, "mean_std", {"state": {"mean": [0, 0], "std": [1, value]}})
+
+
+@pytest.mark.parametrize(
+    ("normalisation", "change"),
+    [
+        ("mean_std", {"std": [1, 0]}),
+        ("mean_std", {"std": [1, -1]}),
+        ("min_max", {"max": [3, 0]}),
+        ("quantiles", {"q99": [4, 0]}),
+    ],
+)
+def test_no_spread_is_refused_with_the_element(tmp_path: Path, normalisation, change):
+    with pytest.raises(SpecError, match=r"'state' have no spread in the elements \[1\]"):
+        load(tmp_path, normalisation, {"state": {**ROWS, **change}})

@@ -1,0 +1,130 @@
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlatool.errors import SpecError
+from vlatool.runtime.tokenizer import Tokenizer
+
+WORDS = {"kind": "words", "pad": 0, "unknown": 1, "words": {"go": 2, "to": 3, "ball": 4}}
+LIBRARY = {
+    "version": "1.0",
+    "truncation": {"direction": "Right", "max_length": 2, "strategy": "LongestFirst", "stride": 0},
+    "padding": {
+        "strategy": {"Fixed": 9},
+        "direction": "Right",
+        "pad_to_multiple_of": None,
+        "pad_id": 7,
+        "pad_type_id": 0,
+        "pad_token": "[PAD]",
+    },
+    "added_tokens": [],
+    "normalizer": {"type": "Lowercase"},
+    "pre_tokenizer": {"type": "Whitespace"},
+    "post_processor": None,
+    "decoder": None,
+    "model": {
+        "type": "WordLevel",
+        "vocab": {"[UNK]": 0, "go": 1, "to": 2, "ball": 3, "[PAD]": 7},
+        "unk_token": "[UNK]",
+    },
+}
+
+
+def tokenizer(folder: Path, data: object, max_tokens: int = 4) -> Tokenizer:
+    path = folder / "tokenizer.json"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return Tokenizer(path, max_tokens, "instruction")
+
+
+def test_words_become_padded_ids(tmp_path: Path):
+    ids = tokenizer(tmp_path, WORDS)("Go  to BALL")
+    assert ids.dtype == np.int64
+    np.testing.assert_array_equal(ids, [[2, 3, 4, 0]])
+
+
+def test_empty_text_is_padding(tmp_path: Path):
+    np.testing.assert_array_equal(tokenizer(tmp_path, WORDS)(""), [[0, 0, 0, 0]])
+
+
+def test_unknown_words_warn_and_are_named(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, WORDS)
+    with pytest.warns(UserWarning, match="the instruction has words that the policy was not trained on: fetch, beer"):
+        np.testing.assert_array_equal(tokenize("go fetch beer"), [[2, 1, 1, 0]])
+
+
+def test_too_many_words_warn_and_are_cut(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, WORDS, max_tokens=2)
+    with pytest.warns(UserWarning, match="the instruction has 3 tokens; the last 1 are cut"):
+        np.testing.assert_array_equal(tokenize("go to ball"), [[2, 3]])
+
+
+def test_an_instruction_warns_once(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, WORDS)
+    with pytest.warns(UserWarning, match="fetch"):
+        first = tokenize("fetch")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(tokenize("fetch"), first)
+
+
+def test_the_last_instructions_are_remembered_and_no_more(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, {**WORDS, "words": {str(number): number for number in range(200)}})
+    for number in range(200):
+        np.testing.assert_array_equal(tokenize(str(number)), [[number, 0, 0, 0]])
+    assert len(tokenize._cache) == Tokenizer.remembered
+    assert tokenize("199") is tokenize("199")
+
+
+def test_a_file_of_the_tokenizers_library(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, LIBRARY)
+    np.testing.assert_array_equal(tokenize("go to ball"), [[1, 2, 3, 7]])
+    np.testing.assert_array_equal(tokenize("fly"), [[0, 7, 7, 7]])
+
+
+def test_the_cut_of_the_library_is_ours_so_that_it_warns(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, LIBRARY, max_tokens=2)
+    with pytest.warns(UserWarning, match="the last 1 are cut"):
+        np.testing.assert_array_equal(tokenize("go to ball"), [[1, 2]])
+
+
+def test_a_library_file_without_padding_pads_with_zero(tmp_path: Path):
+    np.testing.assert_array_equal(tokenizer(tmp_path, {**LIBRARY, "padding": None})("go"), [[1, 0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "data", [{"model": {}}, {"model": {"type": "WordLevel"}}, {**LIBRARY, "model": 3}], ids=["empty", "half", "number"]
+)
+def test_a_broken_library_file_is_a_spec_error_and_no_traceback(tmp_path: Path, data):
+    with pytest.raises(SpecError, match=r"tokenizer.json"):
+        tokenizer(tmp_path, data)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("{", "'instruction' is not valid JSON"),
+        ([], "must be a mapping"),
+        ({}, "neither 'model' .* nor kind 'words'"),
+        ({"kind": "letters"}, "is no tokenizer"),
+        ({"kind": "words"}, "needs 'words'"),
+        ({**WORDS, "pad": "0"}, "'pad' and 'unknown'"),
+        ({**WORDS, "unknown": None}, "'pad' and 'unknown'"),
+        ({**WORDS, "words": ["go"]}, "'words' \\(a mapping\\)"),
+    ],
+)
+def test_a_file_that_is_no_tokenizer(tmp_path: Path, data, message):
+    with pytest.raises(SpecError, match=message):
+        tokenizer(tmp_path, data)
+
+
+def test_ids_of_a_vocabulary_are_whole_numbers(tmp_path: Path):
+    with pytest.raises(SpecError, match="'words'"):
+        tokenizer(tmp_path, {**WORDS, "words": {"go": "two"}})
+
+
+def test_a_missing_file(tmp_path: Path):
+    with pytest.raises(SpecError, match=r"'instruction' cannot be read: .*absent.json \(No such file"):
+        Tokenizer(tmp_path / "absent.json", 4, "instruction")

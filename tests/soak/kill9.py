@@ -1,0 +1,220 @@
+"""Kill vlatool at random moments, again and again, and see that nothing is ever left half-written.
+
+``python tests/soak/kill9.py --kills 200 --command all`` runs a command once to the end (the reference), then starts it
+again and again from nothing, kills its whole process group at a moment drawn uniformly over the duration of the
+reference, and checks that
+
+- the final path is absent, or a bundle whose every file is verified and equal to the reference's;
+- the same command then runs to its end, on the cache that the killed one left;
+- its bundle is the reference's byte for byte (``reports/`` apart, which hold times);
+- no draft is left, neither beside the output nor in the cache.
+
+Prints a table of counts; the exit status is 1 when anything was violated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vlatool.bundle import Bundle
+from vlatool.errors import BundleError
+
+COMMANDS = ("export", "quantize", "optimize")
+RECIPE = """\
+schema: 1
+candidates:
+  dynamic_int8:
+    - quantize.dynamic_int8: {}
+"""
+OPTIMIZE = ["--profile", "raspberry-pi-5", "--episodes", "4", "--iterations", "20", "--workers", "2"]
+UNREACHABLE = ["--max-drop", "100%", "--hz", "1000000"]
+"""With a rate that nothing reaches, the nearest candidate is kept whatever the latencies were; the exit status is 1."""
+
+
+@dataclass
+class Work:
+    """One command in one folder: ``cache`` and ``place/out`` are its only outputs."""
+
+    arguments: list[str]
+    folder: Path
+    expected: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.place, self.cache = self.folder / "place", self.folder / "cache"
+        self.out, self.reference = self.place / "out", self.folder / "reference"
+
+    def start(self) -> subprocess.Popen[str]:
+        """Start the command in a process group of its own."""
+        environment = {**os.environ, "VLATOOL_CACHE": str(self.cache), "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, "-m", "vlatool", *self.arguments, "-o", str(self.out)]
+        self.place.mkdir(parents=True, exist_ok=True)
+        with (self.folder / "stderr").open("w") as errors:
+            return subprocess.Popen(
+                command, env=environment, stdout=subprocess.DEVNULL, stderr=errors, text=True, start_new_session=True
+            )
+
+    def run(self) -> str:
+        """Run to the end; return what was wrong with it, nothing when all is well."""
+        status = self.start().wait()
+        return "" if status == self.expected else f"exit {status}: {(self.folder / 'stderr').read_text()[-400:]}"
+
+    def clear(self) -> None:
+        """Remove output and cache."""
+        for folder in (self.place, self.cache):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def make_reference(self) -> float:
+        """Run once to the end, keep the bundle, and return the seconds it took."""
+        self.clear()
+        start = time.perf_counter()
+        if wrong := self.run():
+            raise SystemExit(f"the reference run of {self.arguments[0]} failed, {wrong}")
+        seconds = time.perf_counter() - start
+        shutil.copytree(self.out, self.reference)
+        return seconds
+
+    def kill_once(self, moment: float) -> list[str]:
+        """Start from nothing, kill after ``moment`` seconds, look, run again, look; return what was violated."""
+        self.clear()
+        process = self.start()
+        try:
+            process.wait(timeout=moment)
+            self.counts["ended before the kill"] += 1
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            self.counts["killed"] += 1
+        violations = self.look()
+        wrong = self.run() if not self.out.exists() else ""
+        return violations + ([f"the run after the kill: {wrong}"] if wrong else self.look_at_the_end())
+
+    def look(self) -> list[str]:
+        """After a kill: nothing, or the whole bundle."""
+        if self.cache.is_dir() and any(self.cache.glob("stages/[!.]*")):
+            self.counts["with finished stages in the cache"] += 1
+        if drafts(self.folder):
+            self.counts["with a draft left by the killed"] += 1
+        if not self.out.exists():
+            self.counts["output absent"] += 1
+            return []
+        self.counts["output whole"] += 1
+        try:
+            Bundle.open(self.out)
+        except BundleError as error:
+            return [f"half a bundle after the kill: {error}"]
+        return differences(self.reference, self.out)
+
+    def look_at_the_end(self) -> list[str]:
+        """After the second run: the reference's bytes, and no draft anywhere."""
+        left = [f"left over: {path}" for path in drafts(self.folder)]
+        return differences(self.reference, self.out) + left
+
+
+def drafts(folder: Path) -> list[Path]:
+    """Unfinished or outdated directories anywhere below a folder."""
+    return sorted(path for pattern in (".*.tmp-*", ".*.old-*") for path in folder.rglob(pattern))
+
+
+def differences(reference: Path, other: Path) -> list[str]:
+    """Files that only one of the bundles has, or that differ, ``reports/`` apart."""
+    wanted, found = contents(reference), contents(other)
+    return [
+        f"differs from the reference: {name}" for name in sorted(wanted | found) if wanted.get(name) != found.get(name)
+    ]
+
+
+def contents(bundle: Path) -> dict[str, bytes]:
+    """Relative path -> bytes of every file but the reports."""
+    files = {path.relative_to(bundle).as_posix(): path for path in bundle.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in files.items() if not name.startswith("reports/")}
+
+
+def make_policy(folder: Path) -> Path:
+    """Write the tiny policy of the tests."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    import conftest
+    import numpy as np
+
+    folder.mkdir()
+    (folder / "policy.yaml").write_text(conftest.POLICY_YAML)
+    (folder / "policy.py").write_text(conftest.POLICY_PY)
+    (folder / "environment.py").write_text(conftest.ENVIRONMENT_PY)
+    (folder / "vocabulary.json").write_text(json.dumps(conftest.VOCABULARY))
+    (folder / "statistics.json").write_text(json.dumps(conftest.STATISTICS))
+    np.savez(folder / "calibration.npz", **conftest.observations(24, seed=1))
+    np.savez(folder / "evaluation.npz", **conftest.observations(16, seed=2))
+    conftest.write_weights(folder / "weights.safetensors")
+    return folder
+
+
+def works(folder: Path, names: list[str]) -> dict[str, Work]:
+    """Prepare the commands; what comes before the one that is killed is made here, once."""
+    policy = make_policy(folder / "tiny")
+    export = Work(["export", str(policy)], folder / "export")
+    recipe = folder / "recipe.yaml"
+    recipe.write_text(RECIPE)
+    found = {"export": export}
+    if {*names} - {"export"}:
+        bundle = Work(["export", str(policy)], folder / "float")
+        bundle.make_reference()
+        model = shutil.copyfile(bundle.reference / "graphs/main.onnx", policy / "tiny.onnx")
+        found["quantize"] = Work(["quantize", str(bundle.reference)], folder / "quantize")
+        options = ["--recipe", str(recipe), *OPTIMIZE, *UNREACHABLE]
+        found["optimize"] = Work(["optimize", str(model), *options], folder / "optimize", expected=1)
+    return {name: found[name] for name in names}
+
+
+def soak(work: Work, kills: int, seed: int, tell: Callable[[str], None] = print) -> list[str]:
+    """Make the reference, kill ``kills`` times and return every violation."""
+    seconds = work.make_reference()
+    tell(f"{work.arguments[0]}: one run takes {seconds:.1f} s")
+    moments = random.Random(seed)
+    violations = []
+    for number in range(kills):
+        moment = moments.uniform(0, seconds)
+        for violation in work.kill_once(moment):
+            violations.append(violation)
+            tell(f"VIOLATED {work.arguments[0]}, kill {number} at {moment:.3f} s: {violation}")
+    work.counts["violations"] += len(violations)
+    return violations
+
+
+def main() -> int:
+    """Soak and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200, help="kills in all, shared out to the commands")
+    parser.add_argument("--command", choices=(*COMMANDS, "all"), default="all")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    names = list(COMMANDS) if given.command == "all" else [given.command]
+    bad = 0
+    with tempfile.TemporaryDirectory(prefix="vlatool-kill9-") as scratch:
+        prepared = works(Path(scratch), names)
+        for index, (name, work) in enumerate(prepared.items()):
+            share = given.kills // len(names) + (index < given.kills % len(names))
+            start = time.perf_counter()
+            bad += len(soak(work, share, given.seed))
+            print(f"{name}: {share} kills in {time.perf_counter() - start:.0f} s", flush=True)
+        kinds = list(dict.fromkeys(kind for work in prepared.values() for kind in work.counts))
+        print(f"{'':36}" + "".join(f"{name:>10}" for name in prepared))
+        for kind in kinds:
+            print(f"{kind:36}" + "".join(f"{work.counts[kind]:>10}" for work in prepared.values()))
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,123 @@
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from vlatool.bundle import Bundle
+from vlatool.errors import GraphError, RecipeError, SourceError
+from vlatool.runtime import load
+from vlatool.sources.onnx import OnnxFile
+from vlatool.stage import Context, build_stage
+
+
+def build(out: Path, model: Path, **options: object) -> Bundle:
+    out.mkdir()
+    return OnnxFile(model=model, **options).run(None, out, Context())
+
+
+def linear(path: Path, shape: object = (1, 3), dtype: int = TensorProto.FLOAT, op: str = "MatMul") -> Path:
+    """An ONNX file ``y = x @ w``."""
+    weight = numpy_helper.from_array(np.arange(6, dtype=np.float32).reshape(3, 2), "w")
+    node = helper.make_node(op, ["x", "w"], ["y"])
+    result = helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 2))
+    graph = helper.make_graph([node], "main", [helper.make_tensor_value_info("x", dtype, shape)], [result], [weight])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10), path)
+    return path
+
+
+def test_the_spec_comes_from_the_file(tmp_path: Path):
+    bundle = build(tmp_path / "out", linear(tmp_path / "walker.onnx"), control_hz=25)
+    assert bundle.manifest.name == "walker"
+    assert bundle.manifest.spec.control_hz == 25
+    assert bundle.manifest.spec.inputs[0].shape == (1, 3)
+    assert bundle.manifest.graphs["main"].opset == 20
+    assert bundle.manifest.made_by["options"] == {"model": "walker.onnx"}
+    policy = load(bundle.path, threads=1)
+    np.testing.assert_allclose(policy.infer({"x": [1.0, 0.0, 1.0]}).chunk, [[4, 6]])
+
+
+def test_a_free_batch_axis_is_one_and_other_free_axes_keep_their_names(tmp_path: Path):
+    path = linear(tmp_path / "a.onnx", ("batch", 3))
+    assert build(tmp_path / "out", path).manifest.spec.inputs[0].shape == (1, 3)
+    path = linear(tmp_path / "b.onnx", (None, 3))
+    assert build(tmp_path / "other", path).manifest.spec.inputs[0].shape == (1, 3)
+
+
+def test_initializers_that_are_listed_as_inputs_are_no_inputs(tmp_path: Path):
+    path = linear(tmp_path / "old.onnx")
+    model = onnx.load(path)
+    model.graph.input.append(helper.make_tensor_value_info("w", TensorProto.FLOAT, (3, 2)))
+    onnx.save(model, path)
+    assert [tensor.name for tensor in build(tmp_path / "out", path).manifest.spec.inputs] == ["x"]
+
+
+@pytest.mark.parametrize("form", ["folder", "file"])
+def test_a_description_gives_spec_assets_and_data(
+    tmp_path: Path, onnx_file, policy_dir, float_bundle, observation, form
+):
+    policy = policy_dir if form == "folder" else policy_dir / "policy.yaml"
+    bundle = build(tmp_path / "out", onnx_file, policy=policy)
+    assert bundle.manifest.spec == float_bundle.manifest.spec
+    assert {"assets/vocabulary.json", "data/calibration.npz", "data/evaluation.npz"} <= set(bundle.manifest.files)
+    wanted = load(float_bundle.path, threads=1).infer(observation).chunk
+    np.testing.assert_allclose(load(bundle.path, threads=1).infer(observation).chunk, wanted, rtol=1e-6)
+
+
+def test_a_description_that_names_what_the_file_lacks(tmp_path: Path, policy_dir):
+    with pytest.raises(SourceError, match="The ONNX file has no 'image', which the spec names; known: x"):
+        build(tmp_path / "out", linear(tmp_path / "a.onnx"), policy=policy_dir)
+
+
+def test_external_data_comes_along(tmp_path: Path, onnx_file, policy_dir, float_bundle, observation):
+    model = onnx.load(onnx_file)
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    onnx.save(model, outside / "big.onnx", save_as_external_data=True, location="big.onnx.data", size_threshold=0)
+    assert (outside / "big.onnx.data").stat().st_size > 0
+    stage = OnnxFile(model=outside / "big.onnx", policy=policy_dir)
+    assert outside / "big.onnx.data" in stage.inputs()
+    bundle = build(tmp_path / "out", outside / "big.onnx", policy=policy_dir)
+    wanted = load(float_bundle.path, threads=1).infer(observation).chunk
+    np.testing.assert_allclose(load(bundle.path, threads=1).infer(observation).chunk, wanted, rtol=1e-6)
+
+
+def test_external_data_that_is_missing(tmp_path: Path, onnx_file):
+    onnx.save(onnx.load(onnx_file), tmp_path / "big.onnx", save_as_external_data=True, location="d", size_threshold=0)
+    (tmp_path / "d").unlink()
+    with pytest.raises(SourceError, match=r"big.onnx is not a readable ONNX file"):
+        build(tmp_path / "out", tmp_path / "big.onnx")
+
+
+def test_a_missing_file(tmp_path: Path):
+    with pytest.raises(SourceError, match="There is no ONNX file"):
+        OnnxFile(model=tmp_path / "absent.onnx").check(None, None)
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense " * 50, b"\x08"], ids=["empty", "nonsense", "half"])
+def test_a_corrupt_file(tmp_path: Path, content):
+    (tmp_path / "a.onnx").write_bytes(content)
+    with pytest.raises(SourceError, match=r"a.onnx is not a"):
+        build(tmp_path / "out", tmp_path / "a.onnx")
+
+
+def test_a_dtype_that_no_spec_has(tmp_path: Path):
+    with pytest.raises(SourceError, match="'x' has the ONNX type 11; allowed: float32, uint8"):
+        build(tmp_path / "out", linear(tmp_path / "a.onnx", dtype=TensorProto.DOUBLE))
+
+
+@pytest.mark.parametrize("shape", [(), (1, 0)])
+def test_a_shape_that_no_observation_has(tmp_path: Path, shape):
+    with pytest.raises(SourceError, match="'x' has the shape"):
+        build(tmp_path / "out", linear(tmp_path / "a.onnx", shape=shape))
+
+
+def test_an_operator_that_the_engine_does_not_know(tmp_path: Path):
+    with pytest.raises(GraphError, match=r"ONNX Runtime .* refuses"):
+        build(tmp_path / "out", linear(tmp_path / "a.onnx", op="NoSuchOperator"))
+
+
+def test_a_rate_must_be_above_zero(tmp_path: Path):
+    with pytest.raises(RecipeError, match="control_hz"):
+        build_stage("sources.onnx", {"model": tmp_path / "a.onnx", "control_hz": 0})

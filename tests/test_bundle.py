@@ -1,0 +1,365 @@
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from vlatool.bundle import LOCATION, Bundle, _digest, _is_alive, hash_file, manifest_bytes, seal, writing
+from vlatool.errors import BundleError, OutputError
+from vlatool.manifest import Manifest
+from vlatool.spec import PolicySpec, TensorSpec
+
+MANIFEST = Manifest("tiny", "1.0.0", PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0))
+WRITER = """
+import sys
+from pathlib import Path
+from vlatool.bundle import writing
+with writing(Path(sys.argv[1]), force=True) as draft:
+    (draft / "graphs").mkdir()
+    (draft / "graphs/main.onnx").write_bytes(b"half of the weights")
+    print(draft, flush=True)
+    sys.stdin.readline()
+"""
+
+
+def fill(directory: Path) -> Path:
+    (directory / "graphs").mkdir(parents=True)
+    (directory / "graphs/main.onnx").write_bytes(b"weights" * 100)
+    (directory / "assets").mkdir()
+    (directory / "assets/words.json").write_text("{}")
+    return directory
+
+
+def stop_half_way(draft: Path) -> None:
+    fill(draft)
+    raise RuntimeError("half-way")
+
+
+def content(directory: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Bundle:
+    return seal(fill(tmp_path / "bundle"), MANIFEST)
+
+
+@pytest.fixture
+def writer(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
+    """A process that is in the middle of writing ``tmp_path/out``, and its draft."""
+    command = [sys.executable, "-c", WRITER, str(tmp_path / "out")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process, Path(process.stdout.readline().strip())
+        process.kill()
+
+
+def test_a_sealed_bundle_opens_equal(bundle):
+    opened = Bundle.open(bundle.path)
+    assert opened == bundle
+    assert set(opened.manifest.files) == {"graphs/main.onnx", "assets/words.json"}
+    assert opened.size_bytes == 702
+    assert opened.file("assets/words.json").read_text() == "{}"
+
+
+def test_sealing_is_deterministic(tmp_path: Path, bundle):
+    again = seal(fill(tmp_path / "again"), MANIFEST)
+    assert again.hash == bundle.hash
+    assert (again.path / "manifest.json").read_bytes() == (bundle.path / "manifest.json").read_bytes()
+
+
+def test_the_hash_is_that_of_the_manifest_file_and_follows_the_content(tmp_path: Path, bundle):
+    assert bundle.hash == "sha256:" + hash_file(bundle.path / "manifest.json")
+    fill(tmp_path / "other")
+    (tmp_path / "other/assets/words.json").write_text("[]")
+    assert seal(tmp_path / "other", MANIFEST).hash != bundle.hash
+
+
+def test_what_is_written_about_a_bundle_does_not_change_its_hash(bundle):
+    (bundle.path / "reports").mkdir()
+    (bundle.path / "reports/report.json").write_text("{}")
+    (bundle.path / LOCATION).write_text("{}")
+    assert seal(bundle.path, MANIFEST).hash == bundle.hash
+
+
+def test_a_manifest_keeps_letters_beyond_ascii(bundle):
+    spec = PolicySpec((TensorSpec("x", (1, 2), unit="°"),), (TensorSpec("y", (1, 2)),), 10.0)
+    named = Manifest("bras robotisé", "1", spec)
+    assert "bras robotisé".encode() in manifest_bytes(named)
+    assert Bundle.open(seal(bundle.path, named).path).manifest.name == "bras robotisé"
+
+
+def test_an_empty_file_is_a_file(bundle):
+    (bundle.path / "assets/empty.txt").touch()
+    sealed = seal(bundle.path, MANIFEST)
+    assert Bundle.open(bundle.path).manifest.files["assets/empty.txt"] == sealed.manifest.files["assets/empty.txt"]
+
+
+def test_the_digest_for_old_pythons_is_the_same(bundle):
+    path = bundle.path / "graphs/main.onnx"
+    with path.open("rb") as stream:
+        assert _digest(stream) == hash_file(path)
+
+
+def test_a_file_that_is_not_recorded_is_refused(bundle):
+    with pytest.raises(BundleError, match=r"has no file 'graphs/other.onnx'"):
+        bundle.file("graphs/other.onnx")
+
+
+def test_a_missing_file_is_seen(bundle):
+    (bundle.path / "graphs/main.onnx").unlink()
+    with pytest.raises(BundleError, match=r"lacks the file graphs/main.onnx"):
+        Bundle.open(bundle.path)
+
+
+def test_a_truncated_file_is_seen(bundle):
+    os.truncate(bundle.path / "graphs/main.onnx", 699)
+    with pytest.raises(BundleError, match=r"main.onnx has 699 bytes; the manifest says 700"):
+        Bundle.open(bundle.path)
+
+
+def test_a_flipped_bit_is_seen(bundle):
+    path = bundle.path / "graphs/main.onnx"
+    changed = bytearray(path.read_bytes())
+    changed[350] ^= 1
+    path.write_bytes(changed)
+    with pytest.raises(BundleError, match=r"main.onnx has changed: its SHA-256"):
+        Bundle.open(bundle.path)
+
+
+def test_a_link_in_the_place_of_a_file_is_seen(tmp_path: Path, bundle):
+    path = bundle.path / "assets/words.json"
+    shutil.move(path, tmp_path / "elsewhere.json")
+    path.symlink_to(tmp_path / "elsewhere.json")
+    with pytest.raises(BundleError, match="missing, or a link"):
+        Bundle.open(bundle.path)
+
+
+def test_a_directory_in_the_place_of_a_file_is_seen(bundle):
+    (bundle.path / "assets/words.json").unlink()
+    (bundle.path / "assets/words.json").mkdir()
+    with pytest.raises(BundleError, match=r"lacks the file assets/words.json"):
+        Bundle.open(bundle.path)
+
+
+def test_damage_is_not_looked_for_when_it_is_not_asked_for(bundle):
+    (bundle.path / "graphs/main.onnx").unlink()
+    assert Bundle.open(bundle.path, verify=False).manifest == bundle.manifest
+
+
+def test_a_path_that_does_not_exist(tmp_path: Path):
+    with pytest.raises(BundleError, match="There is no bundle at"):
+        Bundle.open(tmp_path / "nothing")
+
+
+def test_a_directory_that_is_no_bundle_says_what_is_in_it(tmp_path: Path):
+    with pytest.raises(BundleError, match=r"no manifest.json \(found: nothing\)"):
+        Bundle.open(tmp_path)
+    (tmp_path / "policy.yaml").touch()
+    with pytest.raises(BundleError, match=r"\(found: policy.yaml\)") as caught:
+        Bundle.open(tmp_path)
+    assert "vlatool export" in caught.value.fix
+
+
+def test_a_file_is_no_bundle(tmp_path: Path):
+    (tmp_path / "model.onnx").touch()
+    with pytest.raises(BundleError, match=r"is not a bundle.*a file"):
+        Bundle.open(tmp_path / "model.onnx")
+
+
+@pytest.mark.parametrize("text", [b"", b'{"schema": 1,', b"\xff\xfe"])
+def test_a_manifest_that_is_no_json(bundle, text):
+    (bundle.path / "manifest.json").write_bytes(text)
+    with pytest.raises(BundleError, match="not valid JSON"):
+        Bundle.open(bundle.path)
+
+
+def test_a_manifest_that_cannot_be_read(bundle, monkeypatch):
+    def refuse(*_args, **_options):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    with pytest.raises(BundleError, match="cannot be read: Permission denied"):
+        Bundle.open(bundle.path)
+
+
+def test_a_newer_bundle_asks_for_an_upgrade(bundle):
+    data = json.loads((bundle.path / "manifest.json").read_text())
+    (bundle.path / "manifest.json").write_text(json.dumps({**data, "schema": 9}))
+    with pytest.raises(BundleError, match="schema 9") as caught:
+        Bundle.open(bundle.path)
+    assert caught.value.fix == "upgrade vlatool"
+
+
+def test_the_directory_appears_when_the_block_ends_well(tmp_path: Path):
+    final = tmp_path / "deep/down/out"
+    with writing(final) as draft:
+        assert not final.exists()
+        fill(draft)
+    assert content(final) == content(fill(tmp_path / "wanted"))
+    assert os.listdir(final.parent) == ["out"]
+
+
+def test_nothing_is_left_when_the_block_raises(tmp_path: Path):
+    with pytest.raises(RuntimeError, match="half-way"), writing(tmp_path / "out") as draft:
+        stop_half_way(draft)
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_old_content_stays_when_the_block_raises(tmp_path: Path):
+    before = content(fill(tmp_path / "out"))
+    with pytest.raises(RuntimeError, match="half-way"), writing(tmp_path / "out", force=True) as draft:
+        stop_half_way(draft)
+    assert content(tmp_path / "out") == before
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_an_existing_output_is_refused(tmp_path: Path):
+    before = content(fill(tmp_path / "out"))
+    with pytest.raises(OutputError, match="exists already") as caught, writing(tmp_path / "out"):
+        pytest.fail("the block must not run")
+    assert "--force" in caught.value.fix
+    assert content(tmp_path / "out") == before
+
+
+def test_force_replaces_all_of_the_old_content(tmp_path: Path):
+    fill(tmp_path / "out")
+    with writing(tmp_path / "out", force=True) as draft:
+        (draft / "new").write_bytes(b"1")
+    assert content(tmp_path / "out") == {"new": b"1"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_force_replaces_a_file(tmp_path: Path):
+    (tmp_path / "out").write_text("a file")
+    with writing(tmp_path / "out", force=True) as draft:
+        (draft / "new").touch()
+    assert content(tmp_path / "out") == {"new": b""}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_relative_output_does_not_follow_a_change_of_directory(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with writing(Path("out")) as draft:
+        (tmp_path / "elsewhere").mkdir()
+        os.chdir(tmp_path / "elsewhere")
+        (draft / "new").touch()
+    assert (tmp_path / "out/new").is_file()
+
+
+@pytest.mark.parametrize("name", ["out", "run[1]", "*"])
+def test_the_draft_of_a_dead_process_is_swept(tmp_path: Path, name: str):
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    stale = tmp_path / f".{name}.tmp-{child.pid}-0badcafe"
+    fill(stale)
+    with writing(tmp_path / name) as draft:
+        (draft / "new").touch()
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_the_draft_of_another_output_is_left_alone(tmp_path: Path):
+    fill(tmp_path / ".other.tmp-999999999-0badcafe")
+    with writing(tmp_path / "out") as draft:
+        (draft / "new").touch()
+    assert sorted(os.listdir(tmp_path)) == [".other.tmp-999999999-0badcafe", "out"]
+
+
+def test_a_draft_that_another_sweep_takes_away_is_not_alive(tmp_path: Path):
+    assert not _is_alive(tmp_path / ".out.tmp-999999999-0badcafe")
+
+
+def test_the_draft_of_a_living_process_is_left_alone(tmp_path: Path, writer):
+    process, draft = writer
+    with writing(tmp_path / "out") as own:
+        (own / "new").touch()
+    assert (draft / "graphs/main.onnx").read_bytes() == b"half of the weights"
+    process.communicate("go on\n")
+    assert process.returncode == 0
+    assert content(tmp_path / "out") == {"main.onnx": b"half of the weights"}
+
+
+def test_the_draft_of_another_thread_is_left_alone(tmp_path: Path):
+    with writing(tmp_path / "out") as first:
+        (first / "first").touch()
+        with writing(tmp_path / "out") as second:
+            (second / "second").touch()
+            assert first.is_dir()
+
+
+def test_a_killed_writer_leaves_nothing_at_the_output_and_the_next_run_succeeds(tmp_path: Path, writer):
+    process, draft = writer
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert draft.is_dir()
+    assert not (tmp_path / "out").exists()
+    with writing(tmp_path / "out") as own:
+        (own / "new").touch()
+    assert content(tmp_path / "out") == {"new": b""}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_killed_writer_leaves_the_old_content(tmp_path: Path, writer):
+    process, _ = writer
+    before = content(fill(tmp_path / "out"))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert content(tmp_path / "out") == before
+
+
+def test_an_old_directory_that_a_killed_writer_set_aside_goes_once_there_is_a_new_one(tmp_path: Path):
+    fill(tmp_path / "out")
+    fill(tmp_path / ".out.old-0badcafe")
+    with writing(tmp_path / "out", force=True) as draft:
+        (draft / "new").touch()
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [(errno.ENOSPC, "the disk is full"), (errno.EDQUOT, "the disk quota is used up")],
+)
+def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path, number, message):
+    with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: {message}"), writing(tmp_path / "out"):
+        raise OSError(number, os.strerror(number))
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "message"),
+    [(errno.EROFS, "the file system is read-only"), (errno.EACCES, "permission denied")],
+)
+def test_a_place_that_may_not_be_written_to(tmp_path: Path, monkeypatch, number, message):
+    def refuse(path: Path, *_args, **_options):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(OutputError, match=message) as caught, writing(tmp_path / "out"):
+        pytest.fail("the block must not run")
+    assert caught.value.fix
+
+
+@pytest.mark.parametrize("place", ["file/out", "file/deep/out"])
+def test_a_path_under_a_file(tmp_path: Path, place: str):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="a part of the path is a file"), writing(tmp_path / place):
+        pytest.fail("the block must not run")
+
+
+def test_an_error_of_the_block_that_is_not_about_the_output_stays_itself(tmp_path: Path):
+    with pytest.raises(FileNotFoundError), writing(tmp_path / "out"):
+        (tmp_path / "absent").read_text()
+    with pytest.raises(PermissionError), writing(tmp_path / "out"):
+        raise PermissionError(errno.EACCES, "Permission denied", "/somewhere/else")
+
+
+def test_an_input_beside_the_output_that_may_not_be_read_is_not_blamed_on_the_output(tmp_path: Path):
+    source = str(tmp_path / "policy/weights.safetensors")
+    with pytest.raises(PermissionError), writing(tmp_path / "out"):
+        raise PermissionError(errno.EACCES, "Permission denied", source)

@@ -1,0 +1,242 @@
+"""Which candidate is chosen and what is said about it; every row is built by hand."""
+
+import math
+
+import pytest
+
+from vlatool.judge import Judged, choose, judge
+from vlatool.profile import load_profile
+from vlatool.recipe import Limits
+from vlatool.report import Measurement, Row
+
+BOARD = load_profile("raspberry-pi-5")
+FLOAT = Row("float32", "baseline", measurements=(Measurement("latency_p50", 10.0, "ms", samples=20),))
+
+
+def row(name: str, p50: float = 5.0, *found: Measurement) -> Row:
+    own = (
+        Measurement("latency_p50", p50, "ms", samples=20),
+        Measurement("speedup", 10 / p50, "x", samples=20),
+        Measurement("size", 1.0, "MB"),
+    )
+    return Row(name, measurements=(*own, *found))
+
+
+def drop(value: float, high: float | None = None) -> Measurement:
+    return Measurement("success_drop", value, "1", samples=200, high=high, note="paired: 3 lost, 1 won of 200 episodes")
+
+
+def predicted(value: float, low: float | None = None, high: float | None = None) -> Measurement:
+    return Measurement("latency_p50", value, "ms", "predicted", BOARD.name, low=low, high=high)
+
+
+def recorded(name: str, value: float) -> Measurement:
+    return Measurement(name, value, "1", samples=64)
+
+
+def held(candidate: Row, baseline: Row = FLOAT, **limits: float) -> Judged:
+    return judge(candidate, baseline, Limits(**limits), BOARD)
+
+
+def chosen(*candidates: Row, baseline: Row = FLOAT, **limits: float) -> Judged:
+    judged = [held(each, baseline, **limits) for each in (baseline, *candidates)]
+    found = [item for item in choose(judged) if item.row.role == "chosen"]
+    assert len(found) == 1
+    return found[0]
+
+
+# ---- accuracy
+
+
+@pytest.mark.parametrize(
+    ("value", "within", "says"),
+    [
+        (0.0, True, "success is unchanged (paired: 3 lost, 1 won of 200 episodes), within 1 point"),
+        (0.01, True, "success drops by 1 point"),
+        (-0.02, True, "success rises by 2 points"),
+        (
+            0.025,
+            False,
+            "success drops by 2.5 points (paired: 3 lost, 1 won of 200 episodes), 1.5 points over the budget",
+        ),
+    ],
+)
+def test_a_drop_is_held_against_the_budget(value, within, says):
+    found = held(row("int8", 5.0, drop(value)))
+    assert (found.within, found.row.role) == (within, "within" if within else "outside")
+    assert says in found.row.reason
+    assert found.drop == value
+
+
+def test_a_drop_that_the_samples_cannot_exclude_is_a_warning_with_its_remedy():
+    found = held(row("int8", 5.0, drop(0.0, high=0.03)))
+    assert found.within
+    assert "could be as large as 3 points (200 paired samples cannot exclude it)" in found.warnings[0]
+    assert "--episodes" in found.warnings[0]
+
+
+def test_without_accuracy_nothing_is_inside():
+    found = held(row("int8"))
+    assert not found.within
+    assert math.isnan(found.drop)
+    assert "its accuracy is unmeasured" in found.row.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "base", "wanted", "measured"),
+    [
+        ("agreement_expert", 0.90, 0.95, "agreement_drop", 0.05),
+        ("agreement_expert", 0.97, 0.95, "agreement_drop", -0.02),
+        ("error_expert", 0.30, 0.25, "error_increase", 0.05),
+        ("error_expert", 0.20, 0.25, "error_increase", -0.05),
+    ],
+)
+def test_on_recordings_the_drop_is_the_difference_in_which_more_is_worse(name, own, base, wanted, measured):
+    baseline = Row("float32", "baseline", measurements=(*FLOAT.measurements, recorded(name, base)))
+    found = held(row("int8", 5.0, recorded(name, own)), baseline)
+    added = found.row.get(wanted)
+    assert added is not None
+    assert added.value == pytest.approx(measured)
+    assert added.samples == 64
+    assert found.within == (measured <= 0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted", "measured"),
+    [("agreement_baseline", 0.98, "agreement_drop", 0.02), ("error_baseline", 0.02, "error_increase", 0.02)],
+)
+def test_without_expert_actions_float32_is_what_is_held_to(name, value, wanted, measured):
+    found = held(row("int8", 5.0, recorded(name, value)))
+    added = found.row.get(wanted)
+    assert added is not None
+    assert added.value == pytest.approx(measured)
+    assert "float32" in added.note
+    assert not found.within
+
+
+def test_the_closed_loop_decides_where_there_is_one():
+    baseline = Row("float32", "baseline", measurements=(*FLOAT.measurements, recorded("error_expert", 0.1)))
+    found = held(row("int8", 5.0, drop(0.0), recorded("error_expert", 9.0)), baseline)
+    assert found.within
+    assert "success" in found.row.reason
+
+
+def test_an_unknown_error_is_no_accuracy():
+    assert "unmeasured" in held(row("int8", 5.0, recorded("error_baseline", math.nan))).row.reason
+
+
+# ---- rate
+
+
+def test_a_rate_that_the_board_is_predicted_to_miss_is_outside():
+    found = held(row("int8", 5.0, drop(0.0), predicted(80.0, 60.0, 120.0)), hz=20)
+    assert not found.within
+    assert "predicted 80 ms (60-120) on raspberry-pi-5, 20 Hz needs 50 ms" in found.row.reason
+
+
+def test_a_prediction_that_straddles_the_budget_is_a_warning():
+    found = held(row("int8", 5.0, drop(0.0), predicted(45.0, 40.0, 70.0)), hz=20)
+    assert found.within
+    assert "too close to call, measure on the board" in found.warnings[0]
+
+
+def test_a_prediction_well_inside_says_nothing():
+    found = held(row("int8", 5.0, drop(0.0), predicted(10.0, 8.0, 20.0)), hz=20)
+    assert found.within
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize("found", [(), (predicted(math.nan),)])
+def test_without_a_prediction_the_rate_is_unjudged_and_that_is_said(found):
+    judged = held(row("int8", 5.0, drop(0.0), *found), hz=20)
+    assert judged.within
+    assert "no latency can be predicted for raspberry-pi-5, so 20 Hz is unjudged" in judged.warnings[0]
+
+
+def test_this_hosts_latency_says_nothing_about_another_board():
+    assert held(row("int8", 5000.0, drop(0.0), predicted(10.0, 8.0, 20.0)), hz=20).within
+
+
+@pytest.mark.parametrize(("p50", "within"), [(5.0, True), (80.0, False)])
+def test_on_the_board_itself_the_measurement_decides(p50, within):
+    candidate = row("int8", p50, drop(0.0), predicted(10.0, 8.0, 20.0))
+    assert judge(candidate, FLOAT, Limits(hz=20), BOARD, on_board=True).within == within
+
+
+# ---- choice
+
+
+def test_the_fastest_inside_is_chosen_and_praised_with_its_numbers():
+    found = chosen(row("slow", 8.0, drop(0.0)), row("fast", 4.0, drop(0.005)), row("bad", 1.0, drop(0.5)))
+    assert found.row.name == "fast"
+    assert found.within
+    assert "2.50x as fast as float32 (4 ms instead of 10 ms, measured on this host)" in found.sentences[0]
+    assert "Success drops by 0.5 points" in " ".join(found.sentences) or "the fastest inside" in found.row.reason
+
+
+def test_the_success_rate_is_told_with_its_episodes():
+    rate = Measurement("success", 0.96, "1", samples=200)
+    assert "96.0% of 200 closed-loop episodes succeed" in chosen(row("fast", 4.0, drop(0.0), rate)).sentences[0]
+
+
+def test_float32_is_kept_when_nothing_is_faster():
+    found = chosen(row("int8", 12.0, drop(0.0)))
+    assert found.row.name == "float32"
+    assert "no quantized candidate is faster" in found.sentences[0]
+
+
+def test_it_is_not_said_that_nothing_is_faster_when_a_candidate_outside_is():
+    found = chosen(row("slow", 12.0, drop(0.0)), row("bad", 1.0, drop(0.5)))
+    assert found.row.name == "float32"
+    assert "no quantized candidate is faster on this host" not in found.sentences[0]
+
+
+def test_float32_that_is_too_slow_for_the_board_is_not_kept():
+    slow = Row("float32", "baseline", measurements=(*FLOAT.measurements, predicted(90.0, 70.0, 99.0)))
+    found = chosen(row("int8", 12.0, drop(0.0), predicted(20.0, 15.0, 30.0)), baseline=slow, hz=20)
+    assert found.row.name == "int8"
+
+
+def test_without_any_inside_the_nearest_is_kept_and_each_says_by_how_much_it_missed():
+    found = chosen(row("far", 1.0, drop(0.5)), row("near", 9.0, drop(0.03)), row("blind", 1.0))
+    assert found.row.name == "near"
+    assert not found.within
+    assert "outside the limits" in found.row.reason
+    assert found.sentences[0] == "No candidate keeps to the limits; the nearest, near, was kept."
+    told = " ".join(found.sentences[1:])
+    assert "far: success drops by 50 points" in told
+    assert "49 points over the budget" in told
+    assert "near: success drops by 3 points" in told
+    assert "2 points over the budget" in told
+    assert "blind: its accuracy is unmeasured" in told
+
+
+def test_of_two_that_only_miss_the_rate_the_faster_on_the_board_is_the_nearest():
+    far = row("far", 5.0, drop(0.0), predicted(900.0, 800.0, 999.0))
+    near = row("near", 6.0, drop(0.005), predicted(60.0, 55.0, 70.0))
+    assert chosen(far, near, hz=20).row.name == "near"
+
+
+def test_the_order_of_the_rows_is_kept():
+    judged = [held(FLOAT), held(row("a", 4.0, drop(0.0))), held(row("b", 3.0, drop(0.0)))]
+    assert [(item.row.name, item.row.role) for item in choose(judged)] == [
+        ("float32", "baseline"),
+        ("a", "within"),
+        ("b", "chosen"),
+    ]
+
+
+def test_for_another_engine_predictions_rank_where_every_row_has_one():
+    base = Row("float32", "baseline", measurements=(*FLOAT.measurements, predicted(30.0)))
+    slow_here, slow_there = row("here", 9.0, drop(0.0), predicted(5.0)), row("there", 2.0, drop(0.0), predicted(20.0))
+    judged = [held(each, base) for each in (base, slow_here, slow_there)]
+    found = next(item for item in choose(judged, "tensorrt") if item.row.role == "chosen")
+    assert found.row.name == "here"
+    assert "predicted to need 5 ms" in found.sentences[0]
+    assert "not measured there" in found.sentences[0]
+    assert next(item for item in choose(judged, "ort_cpu") if item.row.role == "chosen").row.name == "there"
+
+
+def test_for_another_engine_one_missing_prediction_leaves_the_choice_to_the_measurements():
+    judged = [held(each) for each in (FLOAT, row("a", 4.0, drop(0.0), predicted(1.0)), row("b", 3.0, drop(0.0)))]
+    assert next(item for item in choose(judged, "tensorrt") if item.row.role == "chosen").row.name == "b"
