@@ -32,7 +32,7 @@ MANIFESTS = [
         DIFFUSION_GRAPHS,
         program_from(DIFFUSION),
         {graph.file: FileRecord("11", 5) for graph in DIFFUSION_GRAPHS.values()},
-        accuracy={"success": 0.9},
+        accuracy={"success": {"value": 0.9}},
         parts={"head": ["head*"]},
         environment={"make": "e.py:make", "tasks": ["reach"]},
         description="two graphs",

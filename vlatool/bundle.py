@@ -146,7 +146,7 @@ def writing(final: Path, *, force: bool = False) -> Iterator[Path]:
     """
     final = Path(os.path.abspath(final))
     with _output_errors(final):
-        if final.exists() and not force:
+        if os.path.exists(final) and not force:
             raise OutputError(f"{final} exists already.", "choose another output, or pass --force to replace it")
         final.parent.mkdir(parents=True, exist_ok=True)
         sweep(final)
@@ -229,10 +229,12 @@ def _output_errors(final: Path) -> Iterator[None]:
             errno.EDQUOT: ("the disk quota is used up", "free some space, or write elsewhere"),
             errno.EROFS: ("the file system is read-only", "write elsewhere"),
             errno.EACCES: ("permission denied", "write elsewhere, or change the permissions of the directory"),
+            errno.EFBIG: ("a file would be larger than the limit on file sizes", "raise the limit (ulimit -f)"),
+            errno.ENAMETOOLONG: ("the name is too long", "choose a shorter one"),
             errno.EEXIST: ("a part of the path is a file", "choose another output"),
             errno.ENOTDIR: ("a part of the path is a file", "choose another output"),
         }.get(error.errno or 0)
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         named = Path(str(error.filename or "-"))
         drafts = any(part.startswith(f".{final.name}.") for part in named.parts)
         ours = drafts or named.is_relative_to(final) or final.is_relative_to(named)

@@ -24,8 +24,11 @@ CARRIED = ("assets", "data")
 def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
     """Copy the folders that a derived bundle keeps."""
     for folder in folders:
-        if (source.path / folder).is_dir():
-            shutil.copytree(source.path / folder, out / folder)
+        for file in sorted((source.path / folder).rglob("*")):
+            if file.is_file():
+                target = out / file.relative_to(source.path)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(file, target)
 
 
 def finish(

@@ -135,7 +135,10 @@ class Manifest:
             if graph.file not in self.files:
                 raise BundleError(f"The manifest names the graph {graph.file}, but records no hash for it.")
         if self.graphs and not self.program:
-            raise BundleError("The manifest has graphs, but no program that runs them.")
+            raise BundleError(f"The manifest has graphs, but no program that runs them to '{self.spec.action.name}'.")
+        for name, found in self.accuracy.items():
+            if not isinstance(found, Mapping) or not isinstance(found.get("value"), int | float):
+                raise BundleError(f"The manifest's accuracy '{name}' must have a number as 'value'; got {found!r}.")
         if self.program:
             check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
 
@@ -150,6 +153,9 @@ class Manifest:
         if not isinstance(data, Mapping):
             raise BundleError(f"The manifest must be a mapping; got {type(data).__name__}.")
         _check_schema(data.get("schema"))
+        for key in ("graphs", "files", "made_by", "source", "environment", "parts", "accuracy"):
+            if not isinstance(data.get(key, {}), Mapping):
+                raise BundleError(f"The manifest has '{key}': {data[key]!r}; it must be a mapping.")
         known = {item.name for item in fields(cls)}
         values = {key: data[key] for key in data if key in known}
         for key in ("name", "version", "spec"):
@@ -242,7 +248,7 @@ def _check_schema(schema: Any) -> None:
 
 def _inside(path: str) -> None:
     if not isinstance(path, str):
-        raise BundleError(f"The manifest names the file {path!r}; a file is text.")
+        raise BundleError(f"The manifest names the file {path!r} in graphs or files; a file is text.")
     pure = PurePosixPath(path)
     if pure.is_absolute() or ".." in pure.parts or not path:
         raise BundleError(f"The manifest names the file '{path}', which is not inside the bundle.")

@@ -48,6 +48,8 @@ class Measurement:
     def __post_init__(self) -> None:
         if self.origin not in ORIGINS:
             raise ValueError(f"origin is {self.origin!r}; allowed: {', '.join(ORIGINS)}")
+        if not isinstance(self.value, int | float):
+            raise ValueError(f"the value of {self.name} is {self.value!r}; allowed: a number")
 
     @property
     def known(self) -> bool:
@@ -78,6 +80,8 @@ class Row:
     def __post_init__(self) -> None:
         if self.role not in ROLES:
             raise ValueError(f"role is {self.role!r}; allowed: {', '.join(ROLES)}")
+        if not isinstance(self.raw, Mapping) or not isinstance(self.details, Mapping):
+            raise ValueError(f"raw and details of {self.name} must be mappings")
 
     def get(self, name: str, origin: str = "measured") -> Measurement | None:
         """Return the measurement of that name and origin, or None."""

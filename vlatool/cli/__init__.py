@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,6 +20,8 @@ from vlatool.errors import VlatoolError
 
 INTERRUPTED = 130
 OUR_BUG = 70
+CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+"""The base of usage errors: of the click that typer brings, or of the one that it imports, by its version."""
 
 app = typer.Typer(
     name="vlatool",
@@ -67,18 +69,27 @@ def main(arguments: list[str] | None = None) -> None:
     0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
     """
     try:
-        app(arguments)
+        code = app(arguments, standalone_mode=False) or 0
+        if code == INTERRUPTED:  # typer catches Ctrl-C itself
+            raise KeyboardInterrupt
+        sys.exit(code)
+    except CLICK_EXCEPTION as error:
+        error.show()
+        sys.exit(error.exit_code)
     except VlatoolError as error:
         typer.echo(f"error: {error.message}", err=True)
         if error.fix:
             typer.echo(f"  fix: {error.fix}", err=True)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         typer.echo("interrupted; finished stages are kept", err=True)
         sys.exit(INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
+    except OSError as error:
+        typer.echo(f"error: {error.filename or 'a file'}: {error.strerror or error}.", err=True)
+        sys.exit(3)
     except MemoryError:
         typer.echo("error: out of memory.\n  fix: use a machine with more memory, or a smaller policy", err=True)
         sys.exit(3)

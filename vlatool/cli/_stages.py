@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import types
 import typing
@@ -16,6 +17,7 @@ from typer.core import TyperGroup
 
 from vlatool import registry
 from vlatool.cli import _run
+from vlatool.errors import UsageError, nearest
 from vlatool.stage import Measure, Stage, validated
 
 DEFAULTS = {"export": "onnx", "quantize": "static-int8", "benchmark": "latency", "evaluate": "recorded"}
@@ -43,7 +45,9 @@ class StageGroup(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the default method when the first word is not a method."""
         known = self.list_commands(ctx)
-        if args and args[0] not in ("--help",) and args[0].replace("_", "-") not in known:
+        if args and args[0] != "--help" and args[0].replace("_", "-") not in known:
+            if difflib.get_close_matches(args[0], known, n=1) and not Path(args[0]).exists():
+                raise UsageError(f"There is no {self.name} method '{args[0]}'; {nearest(args[0], known)}.")
             args = [DEFAULTS[self.name or ""], *args]
         return super().parse_args(ctx, args)
 

@@ -10,7 +10,7 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import progress, show
-from vlatool.errors import UsageError
+from vlatool.errors import DataError, UsageError
 
 
 def compare(
@@ -29,6 +29,9 @@ def compare(
 
     if len(paths) < 2:
         raise UsageError("compare needs two or more bundles, or two or more reports.")
+    for path in paths:
+        if not path.exists():
+            raise DataError(f"There is no report at {path}, and no bundle.")
     bundles = [(path / MANIFEST).is_file() for path in paths]
     if all(bundles):
         with progress() as context:

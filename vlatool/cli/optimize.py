@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Annotated
@@ -41,6 +42,8 @@ def optimize(
     from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
 
     board = load_profile(profile)
+    if hz is not None and not math.isfinite(hz):
+        raise UsageError(f"--hz is {hz}; allowed: a rate in Hz above 0.")
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
     limits = Limits(max_drop=share(max_drop), hz=hz)

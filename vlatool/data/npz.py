@@ -29,6 +29,14 @@ class NpzReader:
                 if not hasattr(stored, "files"):
                     raise DataError(f"{path} is one array, not an archive of named arrays.", "write it with np.savez")
                 return {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            NotImplementedError,
+            zlib.error,
+            zipfile.BadZipFile,
+            zipfile.LargeZipFile,
+        ) as error:
             reason = "it holds pickled objects, which are refused" if "pickle" in str(error) else str(error)
             raise DataError(f"{path} cannot be read: {reason}.", "write it again with np.savez") from error

@@ -21,7 +21,7 @@ def run_transform(
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
     """
-    if not force and out.exists():
+    if not force and os.path.exists(out):
         raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
     stage.check(source, None)
     with writing(out, force=force) as draft:

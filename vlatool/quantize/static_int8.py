@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.errors import DataError
+from vlatool.errors import DataError, RecipeError, nearest
 from vlatool.quantize._graphs import QUANTIZED_OPS, Quantization, load, quantization_library, quiet_quantizer, save
 from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.runtime.policy import Policy
@@ -52,8 +52,11 @@ class StaticInt8(Quantization):
         return (self.calibration,) if self.calibration else ()
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """There is calibration data."""
+        """The operators are ones that can be quantized, and there is calibration data."""
         super().check(source, profile)
+        for name in self.ops:
+            if name not in QUANTIZED_OPS:
+                raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
         if source is not None and not recorded_observations(source, 1, self.calibration):
             raise DataError(
                 f"{source.path} carries no calibration data, which {self.name()} needs.",

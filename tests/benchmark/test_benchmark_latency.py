@@ -1,0 +1,185 @@
+"""What is measured is named, counted and comparable; no test asserts a time."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements, speedup, unique_names
+from vlatool.benchmark._probe import cold_start, main, peak_rss_mb
+from vlatool.benchmark.latency import Latency, busy_warning
+from vlatool.bundle import Bundle
+from vlatool.errors import BundleError, GraphError, UsageError
+from vlatool.stage import Context
+
+PROBED = {"import_ms", "load_ms", "first_ms", "peak_rss_mb"}
+
+
+def names(row):
+    return {measurement.name for measurement in row.measurements}
+
+
+@pytest.fixture(scope="module")
+def report(float_bundle, int8_bundle):
+    stage = Latency(against=(int8_bundle.path,), iterations=20, warmup=1, cold=False)
+    stage.check(float_bundle, None)
+    return stage.run(float_bundle, Context())
+
+
+def test_one_row_for_each_policy_the_first_is_the_baseline(report):
+    assert [(row.name, row.role) for row in report.rows] == [("float32", "baseline"), ("static_int8", "subject")]
+    assert (report.kind, report.verdict) == ("benchmark", "info")
+    assert "float32" in report.summary[0]
+    assert "1 thread" in report.summary[0]
+    assert report.environment["cpu"]
+
+
+def test_every_sample_is_kept_and_counted(report):
+    for row in report.rows:
+        assert len(row.raw["latency_ms"]) == 20
+        assert min(row.raw["latency_ms"]) > 0
+        assert row.get("latency_p50").samples == row.get("latency_max").samples == 20
+        assert row.value("latency_max") == max(row.raw["latency_ms"])
+        assert row.get("latency_p50").unit == "ms"
+
+
+def test_percentiles_that_twenty_samples_cannot_bound_are_left_out(report):
+    for row in report.rows:
+        assert "latency_p50" in names(row)
+        assert not {"latency_p90", "latency_p99"} & names(row)
+
+
+def test_the_size_is_that_of_the_graphs(report, float_bundle):
+    graph = float_bundle.path / "graphs/main.onnx"
+    assert report.rows[0].value("size") == graph.stat().st_size / 1e6
+
+
+def test_the_baseline_is_as_fast_as_itself(report):
+    assert report.rows[0].value("speedup") == 1.0
+    faster = report.rows[1].get("speedup")
+    assert faster.low <= faster.value <= faster.high
+    assert "interleaved" in faster.note
+
+
+def test_without_cold_starts_none_is_reported(report):
+    assert not {"peak_rss", "cold_start"} & names(report.rows[0])
+
+
+def test_a_cold_start_reports_memory_and_time(float_bundle):
+    row = Latency(iterations=20, warmup=1).run(float_bundle, Context()).rows[0]
+    assert row.get("peak_rss").unit == "MB"
+    assert row.value("peak_rss") > 10
+    assert row.value("cold_start") > 0
+    assert row.get("cold_start").samples == 1
+
+
+def test_a_source_bundle_is_measured_in_eager_torch(float_bundle, source_bundle):
+    found = Latency(against=(source_bundle.path,), iterations=20, warmup=1, cold=False).run(float_bundle, Context())
+    row = found.rows[1]
+    assert row.name == "torch eager"
+    assert "size" not in names(row)
+    assert row.get("latency_p50").samples == 20
+
+
+def test_a_bundle_with_nothing_to_run_is_refused(float_bundle):
+    empty = replace(float_bundle.manifest, graphs={}, source={})
+    with pytest.raises(BundleError, match="has nothing to run"):
+        Latency().run(Bundle(float_bundle.path, empty), Context())
+
+
+def test_an_unknown_engine_gets_the_nearest_name(float_bundle):
+    with pytest.raises(UsageError, match="did you mean 'ort_cpu'"):
+        Latency(engine="ort_gpu").run(float_bundle, Context())
+
+
+def test_the_further_bundles_belong_to_the_key_and_are_opened_first(float_bundle, int8_bundle, tmp_path):
+    stage = Latency(against=(int8_bundle.path,))
+    assert stage.inputs() == (int8_bundle.path / "manifest.json",)
+    assert stage.key("a") != Latency().key("a")
+    assert stage.key("a") == stage.key("a") != stage.key("b")
+    with pytest.raises(BundleError, match="There is no bundle"):
+        Latency(against=(tmp_path / "none",)).check(float_bundle, None)
+
+
+def contestant(name, bundle, *blocks):
+    return Contestant(name, bundle, policy=None, observations=[], blocks=list(blocks))
+
+
+def test_contestants_of_one_stage_are_told_apart_by_their_folders(float_bundle, int8_bundle):
+    found = [contestant("static_int8", float_bundle), contestant("static_int8", int8_bundle), contestant("x", None)]
+    found[1].bundle = Bundle(int8_bundle.path.parent / "other", int8_bundle.manifest)
+    unique_names(found)
+    assert [each.name for each in found] == ["static_int8 (bundle)", "static_int8 (other)", "x"]
+
+
+def test_the_speed_up_is_the_ratio_of_the_medians(float_bundle):
+    base = contestant("a", float_bundle, *[[2.0, 4.0, 6.0]] * BLOCKS)
+    own = contestant("b", float_bundle, *[[1.0, 2.0, 3.0]] * BLOCKS)
+    found = speedup(own, base)
+    assert (found.value, found.low, found.high, found.samples) == (2.0, 2.0, 2.0, 3 * BLOCKS)
+
+
+@pytest.mark.parametrize(
+    ("count", "wanted"),
+    [
+        (5, set()),
+        (6, {"p50"}),
+        (35, {"p50"}),
+        (36, {"p50", "p90"}),
+        (367, {"p50", "p90"}),
+        (368, {"p50", "p90", "p99"}),
+    ],
+)
+def test_a_percentile_needs_enough_samples_for_its_upper_bound(count, wanted):
+    found = latency_measurements([float(value) for value in range(1, count + 1)])
+    assert {each.name for each in found} == {f"latency_{name}" for name in wanted} | {"latency_max"}
+    assert found[-1].value == count
+    for each in found[:-1]:
+        assert each.low is None or each.low <= each.value <= each.high
+
+
+def test_a_busy_host_is_a_warning():
+    assert busy_warning({"load_average": [0.5, 9, 9], "cores": 2}) == ()
+    assert busy_warning({"load_average": None, "cores": 2}) == ()
+    assert "load 6.0 on 2 cores" in busy_warning({"load_average": [6.0, 0, 0], "cores": 2})[0]
+
+
+# ---- the probe
+
+
+def test_the_probe_runs_in_a_fresh_process(int8_bundle):
+    found = cold_start(int8_bundle.path, "ort_cpu", 1)
+    assert set(found) == PROBED
+    assert all(value > 0 for value in found.values())
+
+
+def test_the_probe_prints_one_line_of_json(int8_bundle):
+    command = [sys.executable, "-m", "vlatool.benchmark._probe", str(int8_bundle.path), "ort_cpu", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert set(json.loads(done.stdout)) == PROBED
+
+
+def test_the_probe_says_why_a_bundle_does_not_run(tmp_path):
+    with pytest.raises(GraphError, match=r"cannot be run in a fresh process: .*There is no bundle"):
+        cold_start(tmp_path / "none", "ort_cpu", 1)
+
+
+def test_the_probe_in_this_process(float_bundle):
+    assert set(main([str(float_bundle.path), "ort_cpu", "1"])) == PROBED
+
+
+def test_a_bundle_without_golden_values_is_probed_without_an_inference(float_bundle, copied):
+    from vlatool.bundle import seal
+
+    bare = copied(float_bundle)
+    seal(bare.path, replace(bare.manifest, golden=""))
+    assert set(main([str(bare.path), "ort_cpu", "1"])) == PROBED
+
+
+def test_the_peak_of_memory_is_the_processs_own(tmp_path):
+    (tmp_path / "status").write_text("Name:\tx\nVmHWM:\t   2000 kB\n")
+    assert peak_rss_mb(tmp_path / "status") == 2.048
+    (tmp_path / "status").write_text("Name:\tx\n")
+    assert peak_rss_mb(tmp_path / "status") > 1

@@ -1,0 +1,224 @@
+"""Episodes of the tiny world: success depends on the seed alone, so every number is known beforehand."""
+
+from __future__ import annotations
+
+import pytest
+
+from vlatool.errors import DataError, MissingExtra, SourceError, UsageError
+from vlatool.evaluate import _episodes
+from vlatool.evaluate._episodes import Job, Outcome, run_jobs
+from vlatool.evaluate._paired import compare_success, success_row
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.report import Row
+from vlatool.stage import Context
+
+WORLD = """\
+import numpy as np
+
+OPEN = []
+
+class World:
+    def __init__(self, task):
+        OPEN.append(task)
+        assert len(OPEN) == 1, f"{len(OPEN)} environments are open at once"
+
+    def reset(self, *, seed=None):
+        return {"image": np.zeros((8, 8, 3), np.uint8), "proprio": np.zeros(3), "instruction": "go"}, {}
+
+    def step(self, action):
+        return self.reset()[0], 0.0, False, False, {}
+
+    def close(self):
+        OPEN.pop()
+
+def make(task):
+    return World(task)
+"""
+FOREVER = "return self.reset()[0], 0.0, False, False, {}"
+
+
+@pytest.fixture(autouse=True)
+def fresh_worker(monkeypatch):
+    """With one worker, the policy stays open in this process; forget it after each test."""
+    monkeypatch.setattr(_episodes, "_worker", None)
+
+
+@pytest.fixture
+def world(tmp_path):
+    """A function that writes a world whose step is another, and returns ``path:make``."""
+
+    def write(step: str = FOREVER) -> str:
+        (tmp_path / "world.py").write_text(WORLD.replace(FOREVER, step))
+        return f"{tmp_path / 'world.py'}:make"
+
+    return write
+
+
+def evaluated(bundle, policy, workers=1, **options):
+    stage = ClosedLoop(policy=policy, **{"episodes": 20, "first_seed": 0, **options})
+    stage.check(bundle, None)
+    return stage.run(bundle, Context(workers=workers))
+
+
+@pytest.fixture(scope="module")
+def paired(float_bundle, int8_bundle, policy_template):
+    """One run with a baseline."""
+    return evaluated(int8_bundle, policy_template, baseline=float_bundle.path)
+
+
+def test_success_is_counted_over_the_seeds_with_its_interval(int8_bundle, policy_template):
+    (row,) = evaluated(int8_bundle, policy_template).rows
+    rate = row.get("success")
+    assert (rate.value, rate.samples) == (0.8, 20)
+    assert rate.low < 0.8 < rate.high
+    assert row.raw["seed"] == [float(seed) for seed in range(10)] * 2
+    assert row.raw["success"] == [float(seed % 5 != 0) for seed in range(10)] * 2
+    assert row.raw["steps"] == [5.0] * 20
+    table = row.details["success by task"]
+    assert [(line["task"], line["success"], line["episodes"], line["mean steps"]) for line in table] == [
+        ("reach", 0.8, 10, 5.0),
+        ("push", 0.8, 10, 5.0),
+    ]
+
+
+def test_a_baseline_plays_the_same_seeds_and_is_paired(paired):
+    base, row = paired.rows
+    assert (base.name, base.role, row.name) == ("baseline", "baseline", "tiny")
+    assert base.raw["seed"] == row.raw["seed"]
+    assert row.value("success_drop") == 0.0
+    assert row.get("success_drop").low < 0 < row.get("success_drop").high
+    assert row.value("mcnemar_p") == 1.0
+    assert row.details["paired with the baseline"][0]["episodes"] == 20
+    assert base.get("success_drop") is None
+    assert paired.kind == "evaluate"
+    assert "80.0% of 20 episodes succeed" in paired.summary[0]
+
+
+def test_two_workers_give_what_one_gives(paired, float_bundle, int8_bundle, policy_template):
+    again = evaluated(int8_bundle, policy_template, workers=2, baseline=float_bundle.path)
+    assert again.rows == paired.rows
+    assert again.summary == paired.summary
+
+
+def test_the_wrong_instruction_is_a_control_and_the_title_says_so(int8_bundle, policy_template):
+    report = evaluated(int8_bundle, policy_template, instruction="wrong", tasks=("reach",))
+    (row,) = report.rows
+    assert row.raw["success"] == [float(seed % 3 == 0) for seed in range(20)]
+    assert "told the wrong instruction" in report.title
+    assert "told the wrong instruction" in report.summary[0]
+
+
+def test_episodes_are_spread_evenly_over_the_tasks(int8_bundle, policy_template):
+    assert evaluated(int8_bundle, policy_template, episodes=3).rows[0].get("success").samples == 4
+
+
+def test_progress_tells_episodes_and_success(int8_bundle, policy_template):
+    told = []
+    context = Context(lambda what, share: told.append((what, share)))
+    ClosedLoop(policy=policy_template, episodes=20, first_seed=0).run(int8_bundle, context)
+    assert told == [("10 episodes, 80.0% succeed", 0.5), ("20 episodes, 80.0% succeed", 1.0)]
+
+
+def test_a_bundle_that_names_its_environment_needs_no_description(int8_bundle, policy_template):
+    environment = f"{policy_template / 'environment.py'}:make"
+    stage = ClosedLoop(environment=environment, episodes=2, first_seed=1)
+    assert stage.run(int8_bundle, Context()).rows[0].value("success") == 1.0
+    assert stage.inputs() == (policy_template / "environment.py",)
+
+
+def test_the_baseline_and_the_environments_file_belong_to_the_key(float_bundle, policy_template):
+    stage = ClosedLoop(policy=policy_template, baseline=float_bundle.path)
+    assert stage.inputs() == (float_bundle.path / "manifest.json", policy_template / "environment.py")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_environment_that_raises_is_named_with_its_task_and_seed(int8_bundle, world, workers):
+    stage = ClosedLoop(environment=world("1 / 0"), tasks=("reach",), episodes=2, first_seed=7)
+    with pytest.raises(DataError, match=r"task 'reach' failed at seed 7: ZeroDivisionError: division by zero"):
+        stage.run(int8_bundle, Context(workers=workers))
+
+
+def test_an_environment_that_never_ends_is_left(int8_bundle, world, monkeypatch):
+    monkeypatch.setattr(_episodes, "STEP_LIMIT", 50)
+    stage = ClosedLoop(environment=world(), tasks=("reach",), episodes=1, first_seed=3)
+    with pytest.raises(DataError, match=r"task 'reach' did not end within 50 steps at seed 3"):
+        stage.run(int8_bundle, Context())
+
+
+def test_an_observation_that_does_not_fit_is_the_policys_error(int8_bundle, world):
+    stage = ClosedLoop(environment=world("return {}, 0.0, False, False, {}"), tasks=("reach",), episodes=1)
+    with pytest.raises(DataError, match="The observation has no 'image'"):
+        stage.run(int8_bundle, Context())
+
+
+def test_a_worker_that_dies_is_said(int8_bundle, world):
+    stage = ClosedLoop(environment=world("import os; os._exit(1)"), tasks=("reach",), episodes=1)
+    with pytest.raises(DataError, match="A worker process died") as caught:
+        stage.run(int8_bundle, Context(workers=2))
+    assert "--workers 1" in caught.value.fix
+
+
+def test_one_environment_is_open_at_a_time(float_bundle, int8_bundle, world):
+    """Some renderers allow no more; both bundles of a pair play in this process."""
+    ends = "return self.reset()[0], 0.0, True, False, {'success': True}"
+    stage = ClosedLoop(environment=world(ends), tasks=("reach", "push"), episodes=4, baseline=float_bundle.path)
+    assert stage.run(int8_bundle, Context()).rows[1].value("success") == 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "says"),
+    [
+        ({"tasks": ("raech",)}, UsageError, "There is no task 'raech'; did you mean 'reach'"),
+        ({"environment": "none.py:make"}, SourceError, "There is no file"),
+        ({"environment": "environment.py:mak"}, SourceError, "did you mean 'make'"),
+        ({"environment": "environment.py"}, SourceError, "names no factory"),
+        ({"environment": "no_such_package.module:make"}, MissingExtra, "no_such_package"),
+    ],
+)
+def test_what_is_named_wrongly_is_said(int8_bundle, policy_template, options, error, says):
+    with pytest.raises(error, match=says):
+        evaluated(int8_bundle, policy_template, **options)
+
+
+def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
+    from dataclasses import replace
+
+    from vlatool.bundle import Bundle
+
+    bare = Bundle(int8_bundle.path, replace(int8_bundle.manifest, environment={}))
+    for stage in (ClosedLoop(), ClosedLoop(environment="a.py:make"), ClosedLoop(tasks=("reach",))):
+        with pytest.raises(DataError, match="No environment or no tasks") as caught:
+            stage.check(bare, None)
+        assert "--policy DIR" in caught.value.fix
+
+
+def test_jobs_come_back_in_their_order(int8_bundle, policy_template):
+    jobs = [Job("environment.py:make", str(policy_template), task, (2, 1)) for task in ("push", "reach")]
+    outcomes = run_jobs(int8_bundle, jobs, "ort_cpu", Context(workers=2))
+    assert [(each.task, each.seed) for each in outcomes] == [("push", 2), ("push", 1), ("reach", 2), ("reach", 1)]
+
+
+def outcomes(*successes: bool, first: int = 0):
+    return [Outcome("a", first + number, success, 3) for number, success in enumerate(successes)]
+
+
+def test_lost_and_won_episodes_are_counted_pair_by_pair():
+    base = success_row("baseline", "baseline", outcomes(True, True, True, True, False))
+    row = compare_success(base, success_row("int8", "subject", outcomes(True, False, False, True, True)))
+    assert row.value("success_drop") == pytest.approx(0.2)
+    assert "2 lost, 1 won of 5 episodes" in row.get("success_drop").note
+    assert row.value("mcnemar_p") == 1.0
+    assert row.details["paired with the baseline"][0] == {
+        "episodes": 5,
+        "lost": 2,
+        "won": 1,
+        "drop": 0.2,
+        "McNemar exact p": 1.0,
+    }
+
+
+def test_other_seeds_are_not_paired():
+    one = success_row("a", "baseline", outcomes(True))
+    other: Row = success_row("b", "subject", outcomes(True, first=9))
+    with pytest.raises(DataError, match="did not play the same episodes"):
+        compare_success(one, other)

@@ -1,0 +1,140 @@
+"""Errors on recordings, against the same sums done by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from vlatool.bundle import Bundle, seal
+from vlatool.errors import DataError
+from vlatool.evaluate.recorded import Recorded, compare
+from vlatool.runtime import load
+from vlatool.spec import TensorSpec
+from vlatool.stage import Context
+
+ARM = TensorSpec("action", (1, 2, 2), labels=("dx", "gripper"), unit=("m", "1"))
+TURN = TensorSpec("action", (1, 3), kind="discrete", labels=("left", "right", "forward"))
+
+
+def by_name(found):
+    return {measurement.name: measurement for measurement in found}
+
+
+def chunks(bundle):
+    """What the runtime gives on the bundle's evaluation data, and what the expert did."""
+    policy = load(bundle.path, threads=1, seed=0)
+    with np.load(bundle.path / "data/evaluation.npz") as data:
+        recorded = {name: data[name] for name in data.files}
+    given = []
+    for index in range(len(recorded["image"])):
+        observation = {name: recorded[name][index] for name in ("image", "proprio")}
+        given.append(policy.infer({**observation, "instruction": str(recorded["instruction"][index])}).chunk)
+    return np.stack(given).astype(np.float64), recorded["action"].astype(np.float64)
+
+
+def test_errors_are_mean_absolute_ones_in_the_unit_of_each_element(float_bundle):
+    (row,) = Recorded().run(float_bundle, Context()).rows
+    got, expert = chunks(float_bundle)
+    errors = np.abs(got - expert).mean(axis=(0, 1))
+    for index, label in enumerate(("dx", "dy")):
+        found = row.get(f"error_expert.{label}")
+        assert found.value == pytest.approx(errors[index], rel=1e-5)
+        assert (found.unit, found.samples) == ("m", 16)
+    relative = np.mean(errors / expert.std(axis=(0, 1)))
+    assert row.value("error_expert") == pytest.approx(relative, rel=1e-5)
+    assert row.get("error_expert").unit == "1"
+
+
+def test_a_baseline_gets_its_row_and_the_bundle_its_distance_to_it(float_bundle, int8_bundle):
+    stage = Recorded(baseline=float_bundle.path)
+    assert stage.inputs() == (float_bundle.path / "manifest.json",)
+    base, row = stage.run(int8_bundle, Context()).rows
+    assert (base.name, base.role) == ("baseline", "baseline")
+    expected = np.abs(chunks(int8_bundle)[0] - chunks(float_bundle)[0]).mean(axis=(0, 1))
+    assert row.value("error_baseline.dx") == pytest.approx(expected[0], rel=1e-4)
+    assert row.value("error_baseline.dy") == pytest.approx(expected[1], rel=1e-4)
+    assert base.value("error_expert.dx") != row.value("error_expert.dx")
+
+
+def test_against_itself_a_bundle_has_no_error(float_bundle):
+    _, row = Recorded(baseline=float_bundle.path).run(float_bundle, Context()).rows
+    assert row.value("error_baseline") == 0.0
+
+
+def test_fewer_samples_are_spread_over_the_recording(float_bundle):
+    report = Recorded(samples=4).run(float_bundle, Context())
+    assert report.rows[0].get("error_expert").samples == 4
+    assert "on 4 recorded observations" in report.title
+
+
+def test_other_data_may_be_named(float_bundle, policy_template):
+    stage = Recorded(data=policy_template / "calibration.npz")
+    assert stage.inputs() == (policy_template / "calibration.npz",)
+    assert stage.run(float_bundle, Context()).rows[0].get("error_expert").samples == 24
+
+
+def test_data_without_expert_actions_or_episodes_is_still_run(float_bundle, policy_template, tmp_path):
+    with np.load(policy_template / "evaluation.npz") as data:
+        np.savez(tmp_path / "bare.npz", **{name: data[name] for name in ("image", "proprio", "instruction")})
+    _, row = Recorded(data=tmp_path / "bare.npz", baseline=float_bundle.path).run(float_bundle, Context()).rows
+    assert {each.name for each in row.measurements} == {"error_baseline", "error_baseline.dx", "error_baseline.dy"}
+
+
+def test_without_data_the_remedy_is_named(float_bundle, copied):
+    bare = copied(float_bundle)
+    (bare.path / "data/evaluation.npz").unlink()
+    bare = seal(bare.path, bare.manifest)
+    with pytest.raises(DataError, match="carries no evaluation data") as caught:
+        Recorded().check(Bundle.open(bare.path), None)
+    assert caught.value.fix == "pass --data FILE.npz"
+    Recorded().check(None, None)
+
+
+def test_continuous_actions_by_hand():
+    wanted = np.array([[[1.0, 1.0], [3.0, -1.0]], [[1.0, 1.0], [3.0, -1.0]]])
+    got = wanted + np.array([0.5, 0.0])
+    found = by_name(compare(ARM, got, wanted, "expert"))
+    assert found["error_expert.dx"].value == 0.5
+    assert found["error_expert.gripper"].value == 0.0
+    assert found["error_expert"].value == pytest.approx((0.5 / 1.0 + 0.0 / 1.0) / 2)
+    assert found["gripper_flips_expert"].value == 0.0
+
+
+def test_gripper_flips_are_the_share_of_steps_with_the_other_sign():
+    wanted = np.array([[[0.0, 1.0], [0.0, -1.0]], [[0.0, 0.2], [0.0, -0.2]]])
+    got = np.array([[[0.0, -1.0], [0.0, -0.1]], [[0.0, 9.0], [0.0, -9.0]]])
+    flips = by_name(compare(ARM, got, wanted, "baseline"))["gripper_flips_baseline"]
+    assert (flips.value, flips.samples) == (0.25, 4)
+    assert 0 < flips.low < 0.25 < flips.high
+
+
+def test_an_element_that_never_moves_does_not_divide_by_zero():
+    wanted = np.zeros((3, 1, 2))
+    found = by_name(compare(ARM, wanted + 1.0, wanted, "expert"))
+    assert math.isnan(found["error_expert"].value)
+    assert found["error_expert.dx"].value == 1.0
+
+
+def test_chunks_of_unequal_length_are_compared_as_far_as_both_go():
+    wanted = np.ones((2, 5, 2)) * np.arange(5)[None, :, None]
+    found = by_name(compare(ARM, wanted[:, :3] + 0.25, wanted, "expert"))
+    assert found["error_expert.dx"].value == 0.25
+
+
+def test_without_labels_elements_are_numbered():
+    plain = TensorSpec("action", (1, 1, 2), unit="rad")
+    found = by_name(compare(plain, np.zeros((2, 1, 2)), np.ones((2, 1, 2)), "expert"))
+    assert found["error_expert.1"].unit == "rad"
+
+
+def test_discrete_actions_agree_or_not():
+    wanted = np.array([[0], [1], [2], [2]])
+    (found,) = compare(TURN, np.array([[0], [1], [2], [0]]), wanted, "expert")
+    assert (found.name, found.value, found.samples) == ("agreement_expert", 0.75, 4)
+    assert found.low < 0.75 < found.high
+
+
+def test_nothing_to_compare_with_gives_nothing():
+    assert compare(TURN, np.zeros((2, 1)), None, "expert") == []
