@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from environment import BLANK, COLOURS, FIRST_OBJECT, FRAMES, NO_ACTION, TYPES, UNSEEN, VIEW
@@ -77,7 +78,9 @@ class Demonstrations:
         )
 
 
-def draw_symmetries(size: int, rng: np.random.Generator) -> tuple[NDArray, NDArray, NDArray]:
+def draw_symmetries(
+    size: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Per sample a permutation of the colours (B, 6), one of the types (B, 3) and whether to mirror (B,)."""
     colours = rng.random((size, len(COLOURS))).argsort(axis=1)
     kinds = rng.random((size, len(TYPES))).argsort(axis=1)
@@ -96,7 +99,7 @@ class Recorder:
     """Asks BabyAIBot for its action in every state that an episode visits, and records both actions."""
 
     def __init__(self) -> None:
-        self._bots: dict[int, object] = {}
+        self._bots: dict[int, Any] = {}
         self._steps: dict[int, list[tuple[NDArray[np.uint8], list[int]]]] = {}
 
     def expert_action(self, episode: Episode) -> int:

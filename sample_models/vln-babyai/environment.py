@@ -107,8 +107,9 @@ class GoToLocal(gymnasium.Env[Observation, int]):
             raise ValueError(f"instruction must be 'right' or 'wrong', got {instruction!r}")
         import minigrid  # noqa: F401  (registers the levels with gymnasium)
 
-        self.level: Any = gymnasium.make(f"BabyAI-{task}-v0", disable_env_checker=True).unwrapped
-        self.level.gen_obs = dict  # minigrid would draw its own observation at every step, unused here
+        level: Any = gymnasium.make(f"BabyAI-{task}-v0", disable_env_checker=True).unwrapped
+        level.gen_obs = dict  # minigrid would encode its own observation at every step, unused here
+        self.level = level
         self.instruction_mode = instruction
         self.observation_space = gymnasium.spaces.Dict(
             {
@@ -119,7 +120,9 @@ class GoToLocal(gymnasium.Env[Observation, int]):
         )
         self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
         """Generate the level of `seed` and return its first observation."""
         super().reset(seed=seed)
         seed = int(self.np_random.integers(2**31)) if seed is None else seed

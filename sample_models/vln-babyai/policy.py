@@ -152,7 +152,7 @@ class Policy(nn.Module):
         return self.action_head(self.action_norm(fused[:, 0]))
 
 
-def make(weights: Path | None = WEIGHTS) -> nn.Module:
+def make(weights: Path | None = WEIGHTS) -> Policy:
     """Build the policy in evaluation mode; `weights=None` leaves it randomly initialised."""
     policy = Policy()
     if weights is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from demonstrations import Demonstrations, collect
@@ -24,7 +25,7 @@ def write_samples(policy: Chooser, out: Path) -> None:
     np.savez_compressed(out / "evaluation.npz", **draw_samples(policy, EVALUATION_SAMPLES, EVALUATION_SEED))
 
 
-def draw_samples(policy: Chooser, count: int, first_seed: int) -> dict[str, NDArray]:
+def draw_samples(policy: Chooser, count: int, first_seed: int) -> dict[str, NDArray[Any]]:
     """States the policy visits, spread evenly over the ladder and over early and late steps, with expert actions."""
     names = [name for name in LADDER for _ in range(EPISODES_PER_TASK)]
     starts = [(name, first_seed + index) for index, name in enumerate(names)]
@@ -43,7 +44,7 @@ def spread_rows(visited: Demonstrations, count: int) -> NDArray[np.int64]:
     return np.concatenate(chosen)
 
 
-def as_inputs(visited: Demonstrations, rows: NDArray[np.int64]) -> dict[str, NDArray]:
+def as_inputs(visited: Demonstrations, rows: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     """The policy's raw inputs at `rows`, the expert's action and the seed of the episode."""
     batch = visited.batch(rows)
     goals = visited.facts[rows, 3:6]

@@ -20,7 +20,15 @@ from demonstrations import Batch, Demonstrations, collect
 from environment import CODES, VIEW, tile_images
 from numpy.typing import NDArray
 from policy import CHANNELS, FRAMES, Policy, make
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rollout import LADDER, Episode, play, word_ids
 from safetensors.torch import save_file
 from samples import write_samples
@@ -60,7 +68,7 @@ class TilePolicy:
         patches = one_hot @ table.bfloat16() + convolution.bias
         return patches.transpose(1, 2).reshape(-1, CHANNELS, VIEW, VIEW)
 
-    def logits(self, codes: NDArray[np.uint8], actions: NDArray, instruction: NDArray) -> Tensor:
+    def logits(self, codes: NDArray[np.uint8], actions: NDArray[np.int64], instruction: NDArray[np.int64]) -> Tensor:
         """Logits (B, 3) in float32, computed in bfloat16."""
         with torch.autocast("cpu", torch.bfloat16):
             patches = self.image_patches(torch.from_numpy(codes).long())
@@ -150,9 +158,9 @@ class Trainer:
         return float(np.mean([episode.success for episode in play(TilePolicy(self.average).choose, starts)]))
 
 
-def train_round(trainer: Trainer, bar: Progress, task: int) -> dict[str, float]:
+def train_round(trainer: Trainer, bar: Progress, task: TaskID) -> dict[str, float]:
     """Train until the next DAgger round, collect it, and measure; returns one row of the training curve."""
-    seen = []
+    seen: list[tuple[float, float]] = []
     while len(seen) < ROUND_STEPS and trainer.progress < 1:
         seen.append(trainer.learn())
         bar.update(task, completed=trainer.step, loss=seen[-1][0])

@@ -59,7 +59,8 @@ def main() -> None:
     import onnxruntime
 
     print(
-        f"python {sys.version.split()[0]}, onnxruntime {onnxruntime.__version__}: import {1e3 * (imported - start):.0f} ms"
+        f"python {sys.version.split()[0]}, onnxruntime {onnxruntime.__version__}:"
+        f" import {1e3 * (imported - start):.0f} ms"
         f" + load {1e3 * (loaded - imported):.0f} ms + first action {1e3 * (done - before):.1f} ms = {total_ms:.0f} ms,"
         f" peak RSS {peak_mb():.0f} MB, chunk {action.chunk.shape}"
     )

@@ -63,7 +63,8 @@ class Recorded(Measure):
             measurements += compare(action, got, reference, "baseline")
         rows.append(Row(source.manifest.name, measurements=tuple(measurements)))
         title = f"{source.manifest.name} on {len(indices)} recorded observations"
-        return Report("evaluate", title, summary=(title + ".",), rows=tuple(rows), environment=fingerprint())
+        text = f"{title}: {_summary(rows[-1])}."
+        return Report("evaluate", title, summary=(text,), rows=tuple(rows), environment=fingerprint())
 
     def _data(self, source: Bundle) -> Path:
         own = source.path / EVALUATION if EVALUATION in source.manifest.files else None
@@ -71,6 +72,17 @@ class Recorded(Measure):
         if chosen is None:
             raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
         return chosen
+
+
+def _summary(row: Row) -> str:
+    told = []
+    for whose, words in (("expert", "the expert"), ("baseline", "the baseline")):
+        agreement, error = row.get(f"agreement_{whose}"), row.get(f"error_{whose}")
+        if agreement is not None:
+            told.append(f"{agreement.value:.1%} of the actions are those of {words}")
+        elif error is not None:
+            told.append(f"actions differ from {words}'s by {error.value:.1%} of their standard deviation")
+    return "; ".join(told) or "nothing to compare with"
 
 
 def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], engine: str, context: Context) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vlatool import registry
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError, GraphError
-from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
 from vlatool.spec import PolicySpec, TensorSpec
@@ -129,13 +129,13 @@ class _Decoder:
 
     def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
         tensor = self.tensor
-        if raw.dtype.kind == "f" and not np.isfinite(raw).all():
+        if raw.dtype.kind == "f" and not all_finite(raw):
             raise GraphError(
                 f"The output '{tensor.name}' is not finite.", "do not execute it; check the last observation"
             )
         if tensor.kind == "discrete":
             chunk = raw.argmax(-1).reshape(-1)
-            return chunk, tuple(tensor.labels[index] for index in chunk)
+            return chunk, tuple([tensor.labels[index] for index in chunk.tolist()])
         physical = raw if self.normaliser is None else self.normaliser.inverse(raw)
         return physical.reshape(-1, physical.shape[-1]), tensor.labels
 
