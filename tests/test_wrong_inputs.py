@@ -217,8 +217,13 @@ def namespace() -> list[str]:
 
 
 def small_files(at: Workshop, line: Line) -> tuple[int, str]:
-    """With a limit on the size of a file, which the kernel enforces."""
-    return finished(at, at.child("import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))", line))
+    """With a limit on the size of a file, which the kernel enforces; lifted at the exit, where coverage is written."""
+    code = """
+import atexit, resource
+kept = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, kept[1]))
+atexit.register(resource.setrlimit, resource.RLIMIT_FSIZE, kept)"""
+    return finished(at, at.child(code, line))
 
 
 def mounted(mount: str) -> Callable[[Workshop, Line], tuple[int, str]]:
@@ -242,9 +247,9 @@ def full_disk(at: Workshop, line: Line) -> tuple[int, str]:
 
 def full_cache(at: Workshop, line: Line) -> tuple[int, str]:
     """The cache is on the full disk."""
-    at.environment["VLATOOL_CACHE"] = str(at.place / "cache")
     if not namespace():
         return small_files(at, line)
+    at.environment["VLATOOL_CACHE"] = str(at.place / "cache")
     script = 'mount -t tmpfs -o size=16k none "$1" || exit 99; shift; exec "$@"'
     return finished(at, at.child("", line, *namespace(), "sh", "-c", script, "sh", str(at.place)))
 

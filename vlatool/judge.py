@@ -123,7 +123,10 @@ def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
     else:
         baseline = [item for item in judged if item.row.role == "baseline" and item.within]
         best = _fastest([*inside, *baseline], origin)
-        reason = f"the fastest inside the limits ({origin}); {best.row.reason}"
+        first = min(_p50(item.row, origin) for item in [*inside, *baseline])
+        tied = f"within {TIE - 1:.0%} of the fastest inside the limits and the most accurate of those"
+        place = "the fastest inside the limits" if _p50(best.row, origin) == first else tied
+        reason = f"{place} ({origin}); {best.row.reason}"
         sentences = _praise(best, judged) if origin == "measured" else _foretell(best, judged)
     chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
     return [chosen if item is best else item for item in judged]

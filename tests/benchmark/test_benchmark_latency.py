@@ -72,7 +72,7 @@ def test_a_cold_start_reports_memory_and_time(float_bundle):
     assert row.get("peak_rss").unit == "MB"
     assert row.value("peak_rss") > 10
     assert row.value("cold_start") > 0
-    assert row.get("cold_start").samples == 1
+    assert row.get("cold_start").samples >= 1
 
 
 def test_a_source_bundle_is_measured_in_eager_torch(float_bundle, source_bundle):

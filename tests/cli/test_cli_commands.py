@@ -110,7 +110,7 @@ def test_a_closed_pipe_is_no_error():
     process.stdout.close()
     told = process.stderr.read()
     process.stderr.close()
-    process.wait()
+    assert process.wait() == 0
     assert "Traceback" not in told
     assert "internal error" not in told
     assert "BrokenPipe" not in told
