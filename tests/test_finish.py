@@ -27,10 +27,10 @@ def test_folders_are_carried_over_and_others_are_not(tmp_path: Path, float_bundl
 
 
 def test_a_bundle_can_be_sealed_elsewhere_under_another_manifest(tmp_path: Path, float_bundle):
-    manifest = replace(float_bundle.manifest, accuracy={"success": 0.9})
+    manifest = replace(float_bundle.manifest, accuracy={"success": {"value": 0.9}})
     reseal(float_bundle, tmp_path, manifest, ("graphs", "assets", "golden"))
     opened = Bundle.open(tmp_path)
-    assert opened.manifest.accuracy == {"success": 0.9}
+    assert opened.manifest.accuracy == {"success": {"value": 0.9}}
     assert not any(name.startswith("data/") for name in opened.manifest.files)
     assert load(tmp_path, threads=1).golden_error == 0.0
 

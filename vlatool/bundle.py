@@ -21,6 +21,8 @@ from vlatool.manifest import FileRecord, Manifest
 
 MANIFEST = "manifest.json"
 LOCATION = "location.json"
+OURS = (MANIFEST, "report.json", "policy.yaml")
+"""Files that tell a directory which vlatool wrote from any other; only those are replaced by --force."""
 UNRECORDED = ("reports", "recipe.yaml", MANIFEST, "SIGNATURE", LOCATION)
 """Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
 

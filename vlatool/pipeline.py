@@ -86,8 +86,8 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
     """
     path = Path(source)
     if path.suffix == ".onnx":
-        beside = path.parent / FILE
-        return OnnxFile(model=path, policy=beside if beside.is_file() else None), None
+        beside = path.parent / FILE if (path.parent / FILE).is_file() else None
+        return OnnxFile(model=path, policy=beside), beside
     if path.is_dir() or path.suffix in (".yaml", ".yml"):
         read_description(path)
         return TorchModule(policy=path), path
@@ -301,6 +301,5 @@ def exported(source: str, cache: Path, context: Context) -> Bundle:
 
 def brings_calibration(source: str) -> bool:
     """Say whether SOURCE brings calibration data, which static quantization needs."""
-    stage, policy = source_stage(source)
-    described = policy or getattr(stage, "policy", None)
-    return described is not None and read_description(described).calibration is not None
+    _, policy = source_stage(source)
+    return policy is not None and read_description(policy).calibration is not None

@@ -96,12 +96,21 @@ class Transform(Stage):
         """Write the new bundle into the empty directory ``out`` and return it."""
         raise NotImplementedError(self.name())
 
+    def _told_options(self) -> dict[str, Any]:
+        """Return the options with files named by name and content: where they were is nobody's business."""
+        told = self.options()
+        for name in told:
+            value = getattr(self, name)
+            if isinstance(value, Path):
+                told[name] = f"{value.name} sha256:{_content(value)[:16]}"
+        return told
+
     def made_by(self, seed: int | None = None) -> dict[str, Any]:
         """Return the ``made_by`` entry of the manifest."""
         from importlib import metadata
 
         versions = {package: metadata.version(package) for package in self.packages}
-        made: dict[str, Any] = {"vlatool": __version__, "stage": self.name(), "options": self.options()}
+        made: dict[str, Any] = {"vlatool": __version__, "stage": self.name(), "options": self._told_options()}
         return {**made, "versions": versions, **({} if seed is None else {"seed": seed})}
 
 

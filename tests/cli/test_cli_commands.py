@@ -250,7 +250,7 @@ def test_benchmark_means_latency_and_writes_three_reports(vlatool, int8_bundle, 
     report = read_report(out)
     assert [row.name for row in report.rows] == ["float32", "static_int8"]
     assert report.rows[0].get("latency_p50", "predicted").where == "raspberry-pi-5"
-    assert report.command.startswith("vlatool ")
+    assert report.command.startswith("vlatool")
     assert report.created
 
 

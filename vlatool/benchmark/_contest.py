@@ -40,7 +40,7 @@ def run_interleaved(contestants: Sequence[Contestant], iterations: int, warmup: 
     for contestant in contestants:
         for index in range(warmup):
             contestant.policy.infer(contestant.observations[index % len(contestant.observations)])
-    each = max(1, iterations // BLOCKS)
+    each = -(-iterations // BLOCKS)
     order = np.random.default_rng(0)
     for block in range(BLOCKS):
         context.tell("measuring latency", block / BLOCKS)

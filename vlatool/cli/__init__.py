@@ -73,6 +73,8 @@ def main(arguments: list[str] | None = None) -> None:
         if code == INTERRUPTED:  # typer catches Ctrl-C itself
             raise KeyboardInterrupt
         sys.exit(code)
+    except SystemExit as left:  # a closed pipe: typer puts a wrapper around stdout and leaves with 1
+        sys.exit(0 if type(sys.stdout).__name__ == "PacifyFlushWrapper" else left.code)
     except CLICK_EXCEPTION as error:
         error.show()
         sys.exit(error.exit_code)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import typer
 
-from vlatool.bundle import writing
-from vlatool.errors import GateFailed, Inconclusive
+from vlatool.bundle import OURS, writing
+from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.report import Report
 from vlatool.stage import Context, Tell
 
@@ -65,6 +65,20 @@ def _plain_lines() -> Tell:
             typer.echo(f"... {what}", err=True)
 
     return tell
+
+
+def refuse_existing(out: Path | None, force: bool) -> None:
+    """Say before the work, not after it, that the output exists.
+
+    Raises:
+        OutputError: when it does and --force was not given, or when it is a directory that vlatool did not write.
+    """
+    if out is None or not os.path.exists(out):
+        return
+    if not force:
+        raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
+    if out.is_dir() and any(out.iterdir()) and not any((out / name).exists() for name in OURS):
+        raise OutputError(f"{out} was not written by vlatool, so --force does not replace it.", "remove it yourself")
 
 
 def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False) -> None:

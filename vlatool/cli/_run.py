@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.cli._console import default_workers, progress, show
+from vlatool.cli._console import default_workers, progress, refuse_existing, show
 from vlatool.launch import cache_directory, run_transform
 from vlatool.stage import Measure, Transform
 
@@ -58,13 +58,17 @@ def is_bundle(source: str) -> bool:
 
 def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
-    from vlatool.pipeline import exported, sourced
+    from vlatool.pipeline import exported, source_stage, sourced
 
+    bundle: Bundle | None
+    refuse_existing(out, force)
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)
         elif stage.kind() == "export":
             bundle = sourced(source, cache_directory(), context)
+            if bundle.manifest.graphs:  # an ONNX file: its source stage is all the export that there is
+                stage, bundle = source_stage(source)[0], None
         else:
             bundle = exported(source, cache_directory(), context)
         made = run_transform(stage, bundle, out, context, force=force)
@@ -84,6 +88,7 @@ def measure(
     """Measure a bundle, or a policy that is exported first."""
     from vlatool.pipeline import exported
 
+    refuse_existing(out, force)
     board = None
     if profile:
         from vlatool.profile import load_profile

@@ -98,9 +98,3 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
 def _unset(value: Any, field: FieldInfo) -> bool:
     """An empty list means that a repeatable flag was not given."""
     return isinstance(value, list) and not value and not field.is_required()
-
-
-def path_argument(name: str, help_text: str) -> inspect.Parameter:
-    """Return a positional path."""
-    argument = typer.Argument(..., help=help_text, show_default=False)
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=argument, annotation=Path)

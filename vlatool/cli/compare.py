@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.cli._console import progress, show
+from vlatool.cli._console import progress, refuse_existing, show
 from vlatool.errors import DataError, UsageError
 
 
@@ -29,6 +29,7 @@ def compare(
 
     if len(paths) < 2:
         raise UsageError("compare needs two or more bundles, or two or more reports.")
+    refuse_existing(output, force)
     for path in paths:
         if not path.exists():
             raise DataError(f"There is no report at {path}, and no bundle.")

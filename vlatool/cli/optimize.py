@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vlatool.cli._console import default_workers, leave, progress, terminal_text
+from vlatool.cli._console import default_workers, leave, progress, refuse_existing, terminal_text
 from vlatool.errors import UsageError
 
 
@@ -19,7 +19,7 @@ def optimize(
     profile: Annotated[
         str, typer.Option(help="board to optimise for (see: vlatool profiles list)", show_default=False)
     ],
-    max_drop: Annotated[str, typer.Option(help="largest drop against float32: 1%, or 0.01")] = "1%",
+    max_drop: Annotated[str | None, typer.Option(help="largest drop against float32, such as 1% (default)")] = None,
     hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
     recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
@@ -46,17 +46,21 @@ def optimize(
         raise UsageError(f"--hz is {hz}; allowed: a rate in Hz above 0.")
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
-    limits = Limits(max_drop=share(max_drop), hz=hz)
+    asked: dict[str, float] = {} if max_drop is None else {"max_drop": share(max_drop)}
+    asked |= {} if hz is None else {"hz": hz}
     if recipe is None:
-        chosen = default_recipe(limits, Effort(**effort), pipeline.brings_calibration(source), board.engine)
+        calibrated = pipeline.brings_calibration(source)
+        chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine)
     else:
         read = read_recipe(recipe)
-        chosen = read.model_copy(update={"limits": limits, "effort": read.effort.model_copy(update=effort)})
+        update = {"limits": read.limits.model_copy(update=asked), "effort": read.effort.model_copy(update=effort)}
+        chosen = read.model_copy(update=update)
     plan = pipeline.make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
     if dry_run:
         for line in plan.lines():
             typer.echo(line)
         return
+    refuse_existing(output, force)
     with progress(workers or default_workers()) as context:
         report = pipeline.optimize(plan, output, context, force=force)
     typer.echo(report.to_json() if as_json else terminal_text(report, brief=True), nl=False)

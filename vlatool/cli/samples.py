@@ -9,6 +9,7 @@ import typer
 
 from vlatool import registry
 from vlatool.bundle import writing
+from vlatool.cli._console import refuse_existing
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -31,6 +32,7 @@ def make(
     from vlatool.samples._write import write_sample
 
     registry.module("samples", name)
+    refuse_existing(output, force)
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)
     typer.echo(f"{output}: {name}, seed {seed}")

@@ -86,12 +86,12 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
     for name, recorded in (("action", actions), ("episode", episodes)):
         if recorded is not None:
             lengths[name] = _length(path, name, recorded)
-    if episodes is not None and episodes.dtype.kind not in "iu":
-        raise DataError(f"'episode' in {path} is {episodes.dtype}; wanted whole numbers.")
     if len(set(lengths.values())) != 1:
         raise DataError(f"{path} has different numbers of samples: {lengths}.", "each array needs one row a sample")
     if not next(iter(lengths.values())):
         raise DataError(f"{path} holds no samples.")
+    if episodes is not None and episodes.dtype.kind not in "iu":
+        raise DataError(f"'episode' in {path} is {episodes.dtype}; wanted whole numbers.")
     return Recording(path, inputs, None if actions is None else _checked_action(path, spec.action, actions), episodes)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import multiprocessing
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,8 +48,11 @@ def run_jobs(bundle: Bundle, jobs: list[Job], engine: str, context: Context) -> 
     """
     arguments = (str(bundle.path), engine)
     if context.workers == 1:
-        _open(*arguments)
-        return _collect((_play(job) for job in jobs), len(jobs), context)
+        worker = _Worker(*arguments)
+        try:
+            return _collect((worker.play(job) for job in jobs), len(jobs), context)
+        finally:
+            worker.close()
     spawn = multiprocessing.get_context("spawn")
     pool = concurrent.futures.ProcessPoolExecutor(context.workers, spawn, _open, arguments)
     try:
@@ -82,12 +86,23 @@ class _Worker:
         """Return the environment of a job; one is open at a time, since some renderers allow no more."""
         key = (job.environment, job.folder, job.task, job.instruction)
         if key != self._key:
-            if self._environment is not None:
-                self._environment.close()
+            self.close()
             arguments = {"task": job.task, **({} if job.instruction == "right" else {"instruction": job.instruction})}
             self._environment = call_factory(job.environment, Path(job.folder), arguments)
             self._key = key
         return self._environment
+
+    def play(self, job: Job) -> list[Outcome]:
+        """Play the episodes of a job."""
+        environment = self.environment(job)
+        return [_episode(environment, self.queue, job.task, seed) for seed in job.seeds]
+
+    def close(self) -> None:
+        """Close the open environment; one that fails to close has done its work all the same."""
+        environment, self._environment, self._key = self._environment, None, ()
+        if environment is not None:
+            with contextlib.suppress(Exception):
+                environment.close()
 
 
 _worker: _Worker | None = None
@@ -101,8 +116,7 @@ def _open(path: str, engine: str) -> None:
 def _play(job: Job) -> list[Outcome]:
     if _worker is None:
         raise RuntimeError("the worker was not opened")
-    environment = _worker.environment(job)
-    return [_episode(environment, _worker.queue, job.task, seed) for seed in job.seeds]
+    return _worker.play(job)
 
 
 def _episode(environment: Any, queue: ChunkQueue, task: str, seed: int) -> Outcome:

@@ -81,7 +81,7 @@ class ClosedLoop(Measure):
                 "pass --policy DIR (with a policy.yaml that names them), or --environment FILE.py:make --tasks NAME",
             )
         for task in self.tasks:
-            if known and task not in known:
+            if known and task not in known and not self.environment:
                 raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.")
         each = -(-self.episodes // len(tasks))
         seeds = range(self.first_seed, self.first_seed + each)
