@@ -8,6 +8,7 @@ a physics step, and a policy that executes four actions per inference looks at o
 
 import atexit
 import os
+import string
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -30,6 +31,7 @@ INSTRUCTIONS: dict[str, tuple[str, ...]] = {
     "faucet-close": ("close the faucet", "turn the faucet off"),
 }
 TASKS = tuple(INSTRUCTIONS)
+
 
 class LazyObservation(Mapping[str, Any]):
     """Read-only observation whose image is rendered on first access."""
@@ -70,10 +72,9 @@ class MetaWorldEnv(gymnasium.Env[Mapping[str, Any], np.ndarray]):
         self.observation_space = spaces.Dict(
             image=spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8),
             proprio=spaces.Box(-np.inf, np.inf, (4,), np.float32),
-            instruction=spaces.Text(64),
+            instruction=spaces.Text(64, charset=string.ascii_lowercase + " "),
         )
-        reach = METRES_PER_UNIT
-        limit = np.array([reach, reach, reach, 1.0], np.float32)
+        limit = np.array([METRES_PER_UNIT] * 3 + [1.0], np.float32)
         self.action_space = spaces.Box(-limit, limit, dtype=np.float32)
         self._wrong = instruction == "wrong"
         self._camera: _Camera | None = None

@@ -3,7 +3,7 @@
 import argparse
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -65,12 +65,17 @@ def run_work(work: Work) -> list[tuple[bool, int]]:
 
 
 def evaluate(
-    folder: Path, episodes: int, instruction: str = "right", workers: int = 1, first_seed: int = HELD_OUT_SEED
+    folder: Path,
+    episodes: int,
+    instruction: str = "right",
+    workers: int = 1,
+    first_seed: int = HELD_OUT_SEED,
+    names: Sequence[str] = tasks.TASKS,
 ) -> dict[str, list[tuple[bool, int]]]:
     """Per task the (success, steps) of `episodes` held-out episodes."""
-    work = [Work(task, instruction, first_seed, episodes, folder) for task in tasks.TASKS]
+    work = [Work(task, instruction, first_seed, episodes, folder) for task in names]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        return dict(zip(tasks.TASKS, pool.map(run_work, work), strict=True))
+        return dict(zip(names, pool.map(run_work, work), strict=True))
 
 
 def show(results: dict[str, list[tuple[bool, int]]], title: str, console: Console) -> None:
@@ -92,6 +97,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(__file__).parent, help="weights, vocabulary, statistics")
     parser.add_argument("--episodes", type=int, default=64, help="per task, right instruction")
     parser.add_argument("--wrong-episodes", type=int, default=32, help="per task, wrong instruction")
+    parser.add_argument("--tasks", nargs="+", choices=tasks.TASKS, default=tasks.TASKS)
     parser.add_argument("--seed", type=int, default=HELD_OUT_SEED, help="first episode seed")
     parser.add_argument("--threads", type=int, default=1, help="worker processes, one thread each")
     parser.add_argument("--json", type=Path, help="also write every episode's outcome here")
@@ -100,7 +106,7 @@ def main() -> None:
     outcomes = {}
     for instruction, episodes in (("right", options.episodes), ("wrong", options.wrong_episodes)):
         if episodes:
-            results = evaluate(options.folder, episodes, instruction, options.threads, options.seed)
+            results = evaluate(options.folder, episodes, instruction, options.threads, options.seed, options.tasks)
             show(results, f"{instruction} instruction", console)
             outcomes[instruction] = results
     if options.json:

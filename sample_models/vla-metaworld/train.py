@@ -30,6 +30,7 @@ EVALUATION_EPISODES = 8
 CALIBRATION_SAMPLES = 128
 EVALUATION_SAMPLES = 256
 SEED_STRIDE = 10_000
+Json = dict[str, Any]
 
 
 class Display:
@@ -64,7 +65,7 @@ def gather(
         return collect(first_seed, episodes, threads, lambda: move(None, ""), folder)
 
 
-def write_json(path: Path, value: dict[str, Any]) -> None:
+def write_json(path: Path, value: Json) -> None:
     """Writes a JSON file with a final newline."""
     path.write_text(json.dumps(value, indent=2) + "\n")
 
@@ -94,7 +95,7 @@ def write_samples(path: Path, frames: Frames, with_episode: bool) -> None:
     np.savez_compressed(path, **arrays)
 
 
-def learn(learner: Learner, display: Display, frames: Frames, words: dict, statistics: dict, options: Any) -> None:
+def learn(learner: Learner, display: Display, frames: Frames, words: Json, statistics: Json, options: Any) -> None:
     """Trains with DAgger rounds at fixed shares of the budget."""
     for number, until in enumerate((*DAGGER_AT, 1.0), start=1):
         batches = Batches(frames, words, statistics, options.seed)
