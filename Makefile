@@ -24,7 +24,7 @@ $(VENV)/.dev: $(BIN)/vlatool
 	@touch $@
 
 demo: $(BIN)/vlatool  ## optimise the sample policy vln-babyai for a Raspberry Pi 5, with a report
-	$(BIN)/vlatool optimize sample_models/vln-babyai --profile raspberry-pi-5 --max-drop 1% -o $(OUT)/vln-babyai --force
+	$(BIN)/vlatool optimize sample_models/vln-babyai --profile raspberry-pi-5 --max-drop 1% --episodes 1500 -o $(OUT)/vln-babyai --force
 
 metaworld: $(BIN)/vlatool  ## install what the sample policy vla-metaworld needs
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,metaworld]'

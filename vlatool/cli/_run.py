@@ -6,14 +6,19 @@ import inspect
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, progress, refuse_existing, show
+from vlatool.errors import MissingExtra
 from vlatool.launch import cache_directory, run_transform
+from vlatool.report import Report
 from vlatool.stage import Measure, Transform
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
 
 
 def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any) -> inspect.Parameter:
@@ -99,9 +104,17 @@ def measure(
         stage.check(bundle, board)
         report = stage.run(bundle, context)
     if board is not None:
-        from vlatool.predict import predictions
-
-        first = report.rows[-1] if stage.kind() == "evaluate" else report.rows[0]
-        told = replace(first, measurements=(*first.measurements, *predictions(board, bundle)))
-        report = replace(report, rows=tuple(told if row is first else row for row in report.rows))
+        report = with_predictions(report, board, bundle)
     show(report, as_json=as_json, out=out, force=force)
+
+
+def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
+    """Add what is predicted for a board; a robot without onnx measures all the same, and is told what is missing."""
+    from vlatool.predict import predictions
+
+    row = report.rows[-1] if report.kind == "evaluate" else report.rows[0]
+    try:
+        told = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
+    except MissingExtra as error:
+        return replace(report, warnings=(*report.warnings, f"nothing is predicted for {board.name}: {error.message}"))
+    return replace(report, rows=tuple(told if each is row else each for each in report.rows))
