@@ -336,7 +336,7 @@ COMMANDS = [
         lambda at: ["evaluate", at.float, "--engine", "ort_gpu"]),
     Row("an unknown engine to measure", "'ort_gpu'; did you mean 'ort_cpu'", 2,
         lambda at: ["benchmark", at.float, "--engine", "ort_gpu", "--no-cold"]),
-    Row("an unknown sample", "did you mean 'vit_s'", 2, lambda at: ["samples", "make", "vit-x", *at.to]),
+    Row("an unknown sample", "did you mean 'vit-s'", 2, lambda at: ["samples", "make", "vit-x", *at.to]),
     Row("an unknown task", "There is no task 'raech'; did you mean 'reach'", 2,
         lambda at: ["evaluate", "closed-loop", at.float, "--policy", at.template, "--tasks", "raech"]),
     Row("no samples", "samples = 0: input should be greater than or equal to 1", 3,
@@ -412,7 +412,7 @@ BUNDLES = [
         lambda at: lambda: load(at.bundle("golden/golden.npz", b"PK", sealed=True)), called),
 ]  # fmt: skip
 SOURCES = [
-    Row("no source", "is no policy source", 3, lambda at: ["export", at.root / "none", *at.to]),
+    Row("no source", "is no bundle and no policy source", 3, lambda at: ["export", at.root / "none", *at.to]),
     Row("no ONNX file", "There is no ONNX file", 3, lambda at: ["quantize", at.root / "none.onnx", *at.to]),
     Row("an ONNX file that is none", "is not a readable ONNX file", 3,
         lambda at: ["quantize", at.file("a.onnx", b"\x0a\xff" * 9), *at.to]),

@@ -98,8 +98,8 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
             raise SourceError(f"There is no file {where} (from '{source}').")
         return TorchModule(policy=folder, factory=f"{Path(where).name}:{function}"), folder
     raise SourceError(
-        f"'{source}' is no policy source.",
-        "give a directory with a policy.yaml, path/to/policy.py:make, or a .onnx file",
+        f"'{source}' is no bundle and no policy source.",
+        "give a bundle, a directory with a policy.yaml, path/to/policy.py:make, or a .onnx file",
     )
 
 

@@ -7,6 +7,7 @@ a physics step, and a policy that executes four actions per inference looks at o
 """
 
 import atexit
+import contextlib
 import os
 import string
 import weakref
@@ -131,15 +132,31 @@ class MetaWorldEnv(gymnasium.Env[Mapping[str, Any], np.ndarray]):
         return self._camera.capture(self.simulation.data)
 
 
+@contextlib.contextmanager
+def _headless_rendering() -> Iterator[None]:
+    """Says which system packages are missing where MuJoCo only says that something could not be imported."""
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:
+        raise RuntimeError(
+            f"headless rendering ({os.environ['MUJOCO_GL']}) does not start: {error}. It needs the Debian packages "
+            "libegl1, libgl1 and libosmesa6: apt-get install libegl1 libgl1 libosmesa6, or set MUJOCO_GL=osmesa"
+        ) from error
+
+
 class _Camera:
     """A fixed free camera with every costly rendering effect and all goal markers switched off."""
 
     def __init__(self, model: Any) -> None:
-        import mujoco
+        with _headless_rendering():
+            import mujoco
 
         model.vis.quality.offsamples = 0
         model.vis.quality.shadowsize = 256
-        self._renderer = mujoco.Renderer(model, IMAGE_SIZE, IMAGE_SIZE)
+        with _headless_rendering():
+            self._renderer = mujoco.Renderer(model, IMAGE_SIZE, IMAGE_SIZE)
         # Registered after mujoco's own exit handler, hence run before it: a later close prints EGL errors.
         atexit.register(_close_if_alive, weakref.ref(self._renderer))
         self._view = mujoco.MjvCamera()
@@ -172,7 +189,8 @@ def _close_if_alive(renderer: "weakref.ref[Any]") -> None:
 
 def _make_simulation(task: str) -> Any:
     """Builds the Meta-World environment with a freshly drawn, seeded scene at every reset."""
-    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+    with _headless_rendering():
+        from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
     simulation = ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
     simulation._freeze_rand_vec = False

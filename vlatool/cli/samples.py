@@ -10,6 +10,7 @@ import typer
 from vlatool import registry
 from vlatool.bundle import writing
 from vlatool.cli._console import refuse_existing
+from vlatool.errors import UsageError, nearest
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -31,7 +32,9 @@ def make(
     """Write a policy with seeded random weights, for latency and memory work."""
     from vlatool.samples._write import write_sample
 
-    registry.module("samples", name)
+    known = [entry.replace("_", "-") for entry in registry.names("samples")]
+    if name.replace("_", "-") not in known:
+        raise UsageError(f"There is no sample '{name}'; {nearest(name, known)}.")
     refuse_existing(output, force)
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)

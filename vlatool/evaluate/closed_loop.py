@@ -14,6 +14,7 @@ from vlatool.evaluate._paired import compare_success, success_row
 from vlatool.host import fingerprint
 from vlatool.report import Report, Row
 from vlatool.sources._description import read_description
+from vlatool.sources._factory import factory_file
 from vlatool.stage import Context, Measure
 
 if TYPE_CHECKING:
@@ -79,6 +80,11 @@ class ClosedLoop(Measure):
             raise DataError(
                 "No environment or no tasks are named for the closed loop.",
                 "pass --policy DIR (with a policy.yaml that names them), or --environment FILE.py:make --tasks NAME",
+            )
+        if described is None and not self.environment and not (factory_file(where, folder) or folder).exists():
+            raise DataError(
+                f"The bundle names the environment {where}, which is not here.",
+                "pass --policy DIR, the directory of the policy that the bundle was made from",
             )
         for task in self.tasks:
             if known and task not in known and not self.environment:
