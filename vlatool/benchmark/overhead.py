@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -21,10 +22,18 @@ if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 
-class Overhead(Measure):
-    """Measure what ``infer`` adds to the engine's bare ``run()`` on the same inputs: pairs, in alternating order."""
+ROUND = 40
+"""Consecutive calls of one kind; the first round of each kind warms up and is dropped."""
 
-    iterations: int = Field(2000, ge=50, description="pairs of calls")
+
+class Overhead(Measure):
+    """Measure what ``infer`` adds to the engine's bare ``run()`` on the same inputs.
+
+    Rounds of consecutive calls of one kind, as a controller makes them, alternate with rounds of the other; the
+    overhead is the median over pairs of rounds of the difference of their medians.
+    """
+
+    iterations: int = Field(2000, ge=100, description="calls of each kind")
     threads: int = Field(1, ge=1, description="intra-op threads")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -43,23 +52,20 @@ class Overhead(Measure):
         feeds = [{name: encoded[value] for name, value in step.feeds.items()} for encoded in values]
         bare: list[float] = []
         whole: list[float] = []
-        for index in range(self.iterations + 20):
-            if index % 200 == 0:
-                context.tell("measuring pairs", index / self.iterations)
-            which = index % len(observations)
-            for kind in (0, 1) if index % 2 else (1, 0):
-                start = time.perf_counter_ns()
+        rounds = -(-self.iterations // ROUND)
+        for number in range(rounds + 1):
+            context.tell("measuring rounds", number / (rounds + 1))
+            for kind in (0, 1) if number % 2 else (1, 0):
                 if kind:
-                    policy.infer(observations[which])
+                    whole.append(_median_us(policy.infer, observations))
                 else:
-                    session.run(None, feeds[which])
-                (whole if kind else bare).append((time.perf_counter_ns() - start) / 1e3)
-        differences = np.array(whole[20:]) - np.array(bare[20:])
-        return self._report(source, differences, float(np.median(bare[20:])))
+                    bare.append(_median_us(lambda fed: session.run(None, fed), feeds))
+        differences = np.array(whole[1:]) - np.array(bare[1:])
+        return self._report(source, differences, float(np.median(bare[1:])))
 
     def _report(self, source: Bundle, differences: np.ndarray, bare_us: float) -> Report:
         value, low, high = quantile_interval(differences, 0.5)
-        note = "infer() minus bare run(), paired"
+        note = f"infer() minus bare run(), medians of alternating rounds of {ROUND} calls"
         measurements = (
             Measurement("overhead_p50", value, "us", samples=len(differences), low=low, high=high, note=note),
             Measurement("bare_run_p50", bare_us, "us", samples=len(differences), note="engine alone"),
@@ -68,3 +74,13 @@ class Overhead(Measure):
         row = Row(source.manifest.name, measurements=measurements, raw={"overhead_us": differences.tolist()})
         return Report("benchmark", f"Overhead of the runtime on {source.manifest.name}", summary=(text,), rows=(row,),
                       environment=fingerprint())  # fmt: skip
+
+
+def _median_us(call: Callable[[Any], Any], arguments: Sequence[Any]) -> float:
+    taken = []
+    for index in range(ROUND):
+        argument = arguments[index % len(arguments)]
+        start = time.perf_counter_ns()
+        call(argument)
+        taken.append((time.perf_counter_ns() - start) / 1e3)
+    return float(np.median(taken))

@@ -15,6 +15,7 @@ from vlatool.errors import DataError, RecipeError, nearest
 from vlatool.quantize._graphs import QUANTIZED_OPS, Quantization, load, quantization_library, quiet_quantizer, save
 from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import Program
 from vlatool.stage import Context, source_of
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def record_feeds(bundle: Bundle, observations: list[dict[str, Any]]) -> dict[str
     """Run the policy on observations and return what each of its graphs was fed: graph name -> list of feeds."""
     policy = Policy.open(bundle, threads=1, seed=0)
     recorders = {name: _RecordingSession(session) for name, session in policy.program.sessions.items()}
-    policy.program.sessions = recorders
+    policy.program = Program(policy.program.steps, recorders, seed=0)
     for observation in observations:
         policy.infer(observation)
     return {name: recorder.feeds for name, recorder in recorders.items()}

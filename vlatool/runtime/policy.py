@@ -6,9 +6,8 @@ import time
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,7 @@ from vlatool.spec import PolicySpec, TensorSpec
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Action:
+class Action(NamedTuple):
     """What the policy wants the robot to do.
 
     Args:
@@ -126,10 +124,11 @@ class _Decoder:
     def __init__(self, spec: PolicySpec, assets: Path) -> None:
         self.tensor: TensorSpec = spec.action
         self.normaliser: Normaliser | None = load_normaliser(spec.action, assets)
+        self._floating = np.dtype(spec.action.dtype).kind == "f"
 
     def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
         tensor = self.tensor
-        if raw.dtype.kind == "f" and not all_finite(raw):
+        if self._floating and not all_finite(raw):
             raise GraphError(
                 f"The output '{tensor.name}' is not finite.", "do not execute it; check the last observation"
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +12,9 @@ from vlatool.errors import DataError, nearest
 from vlatool.manifest import ProgramStep
 
 Array = NDArray[Any]
+
+
+Run = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 class Session(Protocol):
@@ -35,7 +38,17 @@ class Program:
         self.sessions = sessions
         self._seed = seed
         self._schedules = [_schedules(step) for step in self.steps]
+        self._plain = self._plain_step()
         self.reset()
+
+    def _plain_step(self) -> tuple[Run, list[tuple[str, str]], list[tuple[str, str]]] | None:
+        """The parts of a program that is one graph, run once, with nothing beside inputs and outputs."""
+        if len(self.steps) != 1:
+            return None
+        step = self.steps[0]
+        if step.repeat != 1 or step.sources() or step.carry:
+            return None
+        return self.sessions[step.graph].run, list(step.feeds.items()), list(step.gives.items())
 
     def reset(self) -> None:
         """Zero the kept values and restart the noise from the seed."""
@@ -57,6 +70,12 @@ class Program:
             if all(name not in step.noise for step in self.steps):
                 known = [known for step in self.steps for known in step.noise]
                 raise DataError(f"The program draws no noise '{name}'; {nearest(name, known)}.")
+        if self._plain is not None:
+            run, feeds, gives = self._plain
+            given = run({name: values[value] for name, value in feeds})
+            for name, value in gives:
+                values[value] = given[name]
+            return values
         values.update(self._kept)
         for step, schedules in zip(self.steps, self._schedules, strict=True):
             for name, wanted in step.noise.items():
