@@ -255,7 +255,7 @@ def test_benchmark_means_latency_and_writes_three_reports(vlatool, int8_bundle, 
 
 
 def test_json_alone_is_on_stdout(vlatool, float_bundle, tmp_path):
-    for line in (["benchmark", *FAST], ["benchmark", "overhead", "--iterations", "50"], ["evaluate"]):
+    for line in (["benchmark", *FAST], ["benchmark", "overhead", "--iterations", "100"], ["evaluate"]):
         code, out, _ = vlatool(*line, float_bundle.path, "--json", "-o", tmp_path / line[-1])
         assert code == 0
         assert Report.from_json(out) == read_report(tmp_path / line[-1])
