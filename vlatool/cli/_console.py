@@ -95,10 +95,19 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
     if out is not None:
         with writing(out, force=force) as draft:
             write_reports(report, draft)
-    typer.echo(report.to_json() if as_json else terminal_text(report), nl=False)
+    emit(report.to_json() if as_json else terminal_text(report))
     if out is not None and not as_json:
-        typer.echo(f"report: {out / 'report.html'}")
+        emit(f"report: {out / 'report.html'}\n")
     leave(report)
+
+
+def emit(text: str) -> None:
+    """Print on stdout; a reader that has gone (``| head``) does not change the exit code, which is the verdict's."""
+    try:
+        typer.echo(text, nl=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def terminal_text(report: Report, *, brief: bool = False) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vlatool.cli._console import default_workers, leave, progress, refuse_existing, terminal_text
+from vlatool.cli._console import default_workers, emit, leave, progress, refuse_existing, terminal_text
 from vlatool.errors import UsageError
 
 
@@ -63,9 +63,9 @@ def optimize(
     refuse_existing(output, force)
     with progress(workers or default_workers()) as context:
         report = pipeline.optimize(plan, output, context, force=force)
-    typer.echo(report.to_json() if as_json else terminal_text(report, brief=True), nl=False)
+    emit(report.to_json() if as_json else terminal_text(report, brief=True))
     if not as_json:
-        typer.echo(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}")
+        emit(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
     leave(report)
 
 
