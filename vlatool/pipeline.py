@@ -239,7 +239,8 @@ def _report(
     rows = tuple(item.row for item in judged) + tuple(failures)
     chosen = next(item for item in judged if item.row.role == "chosen")
     wanted = plan.recipe.limits
-    limits = {"max_success_drop_points": 100 * wanted.max_drop, "hz": wanted.hz, "profile": plan.profile.name}
+    name = "max_success_drop_points" if plan.closed_loop else "max_drop_points"
+    limits = {name: 100 * wanted.max_drop, "hz": wanted.hz, "profile": plan.profile.name}
     warnings = tuple(dict.fromkeys([*notes, *(warning for item in judged for warning in item.warnings)]))
     return Report(
         "optimize",

@@ -209,7 +209,8 @@ def limit(name: str, wanted: Any) -> tuple[str, str]:
     """Return a limit's name as words and its value with the unit that ends the name."""
     words, _, last = name.rpartition("_")
     if words and last in LIMIT_UNITS:
-        return plain(words.replace("_", " ")), f"{cell(wanted)} {LIMIT_UNITS[last]}"
+        unit = "point" if last == "points" and wanted == 1 else LIMIT_UNITS[last]
+        return plain(words.replace("_", " ")), f"{cell(wanted)} {unit}"
     return plain(name.replace("_", " ")), cell(wanted)
 
 
