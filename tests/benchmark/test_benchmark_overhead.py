@@ -18,7 +18,10 @@ def test_the_overhead_is_the_median_over_pairs_of_rounds(float_bundle):
     assert row.value("bare_run_p50") > 0
     assert report.kind == "benchmark"
     assert "infer() adds" in report.summary[0]
-    assert told == [("measuring rounds", share) for share in [number / 11 for number in range(11)]]
+    assert told == [*(("measuring rounds", number / 11) for number in range(11)), ("measuring calls in turn", None)]
+    in_turn = row.get("overhead_in_turn_p50")
+    assert (in_turn.unit, in_turn.samples) == ("us", 400)
+    assert in_turn.low <= in_turn.value <= in_turn.high
 
 
 def test_a_graph_that_runs_twice_has_no_single_bare_call(float_bundle):

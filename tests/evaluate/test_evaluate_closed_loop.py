@@ -123,12 +123,13 @@ def test_a_bundle_that_names_its_environment_needs_no_description(int8_bundle, p
     environment = f"{policy_template / 'environment.py'}:make"
     stage = ClosedLoop(environment=environment, episodes=2, first_seed=1)
     assert stage.run(int8_bundle, Context()).rows[0].value("success") == 1.0
-    assert stage.inputs() == (policy_template / "environment.py",)
+    assert stage.inputs() == (policy_template / "environment.py", policy_template / "policy.py")
 
 
 def test_the_baseline_and_the_environments_file_belong_to_the_key(float_bundle, policy_template):
     stage = ClosedLoop(policy=policy_template, baseline=float_bundle.path)
-    assert stage.inputs() == (float_bundle.path / "manifest.json", policy_template / "environment.py")
+    code = (policy_template / "environment.py", policy_template / "policy.py")
+    assert stage.inputs() == (float_bundle.path / "manifest.json", *code)
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -30,7 +30,8 @@ class Overhead(Measure):
     """Measure what ``infer`` adds to the engine's bare ``run()`` on the same inputs.
 
     Rounds of consecutive calls of one kind, as a controller makes them, alternate with rounds of the other; the
-    overhead is the median over pairs of rounds of the difference of their medians.
+    overhead is the median over pairs of rounds of the difference of their medians. A second figure is the harder case:
+    single calls of both kinds in turn, so that each finds the processor's caches as the other left them.
     """
 
     iterations: int = Field(2000, ge=100, description="calls of each kind")
@@ -50,6 +51,10 @@ class Overhead(Measure):
         session = getattr(policy.program.sessions[step.graph], "_session")  # noqa: B009
         values = [policy.encode(observation) for observation in observations]
         feeds = [{name: encoded[value] for name, value in step.feeds.items()} for encoded in values]
+
+        def run(fed: dict[str, Any]) -> Any:
+            return session.run(None, fed)
+
         bare: list[float] = []
         whole: list[float] = []
         rounds = -(-self.iterations // ROUND)
@@ -59,18 +64,25 @@ class Overhead(Measure):
                 if kind:
                     whole.append(_median_us(policy.infer, observations))
                 else:
-                    bare.append(_median_us(lambda fed: session.run(None, fed), feeds))
+                    bare.append(_median_us(run, feeds))
+        context.tell("measuring calls in turn", None)
+        in_turn = _in_turn_us(policy.infer, observations, run, feeds, rounds * ROUND)
         differences = np.array(whole[1:]) - np.array(bare[1:])
-        return self._report(source, differences, float(np.median(bare[1:])))
+        return self._report(source, differences, in_turn, float(np.median(bare[1:])))
 
-    def _report(self, source: Bundle, differences: np.ndarray, bare_us: float) -> Report:
+    def _report(self, source: Bundle, differences: np.ndarray, in_turn: list[float], bare_us: float) -> Report:
         value, low, high = quantile_interval(differences, 0.5)
         note = f"infer() minus bare run(), medians of alternating rounds of {ROUND} calls"
+        turn, turn_low, turn_high = quantile_interval(in_turn, 0.5)
+        beside = "infer() minus bare run(), single calls in turn"
+        count = len(in_turn)
         measurements = (
             Measurement("overhead_p50", value, "us", samples=len(differences), low=low, high=high, note=note),
+            Measurement("overhead_in_turn_p50", turn, "us", samples=count, low=turn_low, high=turn_high, note=beside),
             Measurement("bare_run_p50", bare_us, "us", samples=len(differences), note="engine alone"),
         )
-        text = f"infer() adds {value:.1f} us (median) to a bare run() of {bare_us:.0f} us."
+        text = f"infer() adds {value:.1f} us (median) to a bare run() of {bare_us:.0f} us"
+        text += f"; {turn:.1f} us when calls of both kinds take turns."
         row = Row(source.manifest.name, measurements=measurements, raw={"overhead_us": differences.tolist()})
         return Report("benchmark", f"Overhead of the runtime on {source.manifest.name}", summary=(text,), rows=(row,),
                       environment=fingerprint())  # fmt: skip
@@ -84,3 +96,25 @@ def _median_us(call: Callable[[Any], Any], arguments: Sequence[Any]) -> float:
         call(argument)
         taken.append((time.perf_counter_ns() - start) / 1e3)
     return float(np.median(taken))
+
+
+def _in_turn_us(
+    infer: Callable[[Any], Any],
+    observations: Sequence[Any],
+    run: Callable[[Any], Any],
+    feeds: Sequence[Any],
+    pairs: int,
+) -> list[float]:
+    """Return infer minus run of each pair, in microseconds; who goes first alternates."""
+    calls = ((run, feeds), (infer, observations))
+    differences = []
+    for pair in range(pairs):
+        taken = [0.0, 0.0]
+        for kind in (0, 1) if pair % 2 else (1, 0):
+            call, arguments = calls[kind]
+            argument = arguments[pair % len(arguments)]
+            start = time.perf_counter_ns()
+            call(argument)
+            taken[kind] = (time.perf_counter_ns() - start) / 1e3
+        differences.append(taken[1] - taken[0])
+    return differences

@@ -41,12 +41,13 @@ class ClosedLoop(Measure):
     engine: str = Field("ort_cpu", description="engine of the runtime")
 
     def inputs(self) -> tuple[Path, ...]:
-        """The baseline's manifest and the environment's file."""
+        """The baseline's manifest, and the environment's file with its neighbours, which it may import."""
         described = read_description(self.policy) if self.policy else None
         where = self.environment or str((described.environment if described else {}).get("make", ""))
         folder = described.folder if described else Path()
         file = folder / where.rpartition(":")[0]
-        return (*([self.baseline / MANIFEST] if self.baseline else []), *([file] if file.is_file() else []))
+        code = sorted(file.parent.glob("*.py")) if file.is_file() else []
+        return (*([self.baseline / MANIFEST] if self.baseline else []), *code)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Environment and tasks are named."""

@@ -50,7 +50,7 @@ class OrtCpuSession:
             GraphError: when ONNX Runtime fails on these inputs.
         """
         try:
-            return dict(zip(self.outputs, self._run(None, feeds), strict=True))
+            return dict(zip(self.outputs, self._run(self.outputs, feeds), strict=True))
         except Exception as error:
             raise GraphError(f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}") from error
 
