@@ -59,7 +59,7 @@ def test_feeds_are_read_at_the_call_and_may_be_strided(session: OrtCpuSession) -
     ],
 )
 def test_a_feed_that_does_not_fit_is_named(session: OrtCpuSession, name: str, value: object) -> None:
-    with pytest.raises(GraphError, match=rf"ONNX Runtime failed in sum.onnx: .*(\b{name}|double)"):
+    with pytest.raises(GraphError, match=rf"ONNX Runtime failed in sum.*(\b{name}|double)"):
         session.run({**_feeds(1), name: value})
     np.testing.assert_array_equal(session.run(_feeds(1))["y"], [[2, 2, 2]])
 
@@ -90,5 +90,5 @@ def test_other_graphs_run_without_buffers(tmp_path: Path, text: str) -> None:
 def test_a_file_that_is_no_graph_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.onnx"
     path.write_bytes(b"not a model")
-    with pytest.raises(GraphError, match="ONNX Runtime .* refuses"):
+    with pytest.raises(GraphError, match=r"ONNX Runtime .* refuses"):
         OrtCpuSession(path)

@@ -15,7 +15,7 @@ from vlatool.errors import GraphError, require
 PROVIDER = "CPUExecutionProvider"
 SMALL = 256 * 1024
 """Bytes of all inputs and outputs up to which a run goes through buffers that are bound once."""
-NUMPY_OF = {
+NUMPY_OF: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype(np.float32),
     "tensor(float16)": np.dtype(np.float16),
     "tensor(double)": np.dtype(np.float64),
