@@ -7,7 +7,7 @@ OUT ?= out
 TORCH := torch==2.13.0
 SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
-.PHONY: help install demo test check robot docs format clean metaworld
+.PHONY: peers help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -46,6 +46,11 @@ robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnx
 	@test -x $(OUT)/robot/venv/bin/python || $(PYTHON310) -m venv $(OUT)/robot/venv
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 numpy
 	PYTHONPATH=. $(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
+
+peers:  ## measure other tools and our bundles on six workloads, interleaved (about an hour)
+	@test -x $(OUT)/peers/venv/bin/python || $(PYTHON) -m venv $(OUT)/peers/venv
+	$(OUT)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check -r tests/peers/requirements.txt
+	PYTHONPATH=. $(OUT)/peers/venv/bin/python tests/peers/table.py
 
 docs: $(VENV)/.dev  ## write docs/reference from the code
 	$(BIN)/python docs/generate.py

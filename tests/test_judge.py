@@ -1,6 +1,7 @@
 """Which candidate is chosen and what is said about it; every row is built by hand."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -34,7 +35,7 @@ def recorded(name: str, value: float) -> Measurement:
     return Measurement(name, value, "1", samples=64)
 
 
-def held(candidate: Row, baseline: Row = FLOAT, **limits: float) -> Judged:
+def held(candidate: Row, baseline: Row = FLOAT, **limits: Any) -> Judged:
     return judge(candidate, baseline, Limits(**limits), BOARD)
 
 
@@ -240,3 +241,73 @@ def test_for_another_engine_predictions_rank_where_every_row_has_one():
 def test_for_another_engine_one_missing_prediction_leaves_the_choice_to_the_measurements():
     judged = [held(each) for each in (FLOAT, row("a", 4.0, drop(0.0), predicted(1.0)), row("b", 3.0, drop(0.0)))]
     assert next(item for item in choose(judged, "tensorrt") if item.row.role == "chosen").row.name == "b"
+
+
+# ---- budgets in other measures, latency, memory
+
+
+def metric(name: str, value: float, unit: str = "1") -> Measurement:
+    return Measurement(name, value, unit, samples=12)
+
+
+@pytest.mark.parametrize(("value", "within"), [(0.04, True), (0.0401, False)])
+def test_a_named_measurement_decides_in_the_place_of_success(value: float, within: bool) -> None:
+    found = held(row("a", 5, metric("relative_error", value), drop(0.5)), metric="relative_error", max_metric=0.04)
+    assert found.within is within
+    assert f"relative_error is {value:g}" in found.row.reason
+
+
+def test_an_action_element_is_named_by_its_label() -> None:
+    found = held(row("a", 5, metric("error_baseline.dx", 0.003, "m")), metric="dx", max_metric=0.002)
+    assert not found.within
+    assert found.row.reason == "error_baseline.dx is 0.003 m, allowed 0.002 m"
+    assert found.miss == pytest.approx(0.5)
+
+
+def test_a_unit_means_its_worst_element() -> None:
+    errors = (
+        metric("error_baseline.dx", 0.001, "m"),
+        metric("error_baseline.dy", 0.004, "m"),
+        metric("error_baseline.yaw", 9.0, "rad"),
+    )
+    assert held(row("a", 5, *errors), metric="unit:m", max_metric=0.004).within
+    assert not held(row("a", 5, *errors), metric="unit:m", max_metric=0.003).within
+
+
+def test_a_measurement_that_is_not_there_is_unmeasured() -> None:
+    found = held(row("a", 5, drop(0.0)), metric="unit:furlong", max_metric=1.0)
+    assert not found.within
+    assert math.isinf(found.miss)
+
+
+def test_the_shorter_of_rate_and_latency_counts() -> None:
+    assert Limits(hz=20, max_latency_ms=10).latency_ms == 10
+    assert Limits(hz=200, max_latency_ms=10).latency_ms == 5
+    assert Limits().latency_ms is None
+
+
+def test_without_a_profile_the_latency_of_this_host_decides() -> None:
+    slow = judge(row("a", 5, drop(0.0)), FLOAT, Limits(max_latency_ms=4), None)
+    assert not slow.within
+    assert "p90 latency 5 ms > 4 ms" in slow.row.reason
+
+
+@pytest.mark.parametrize(("limit", "within"), [(100, True), (99, False)])
+def test_memory_is_what_a_fresh_process_took_here(limit: float, within: bool) -> None:
+    found = judge(row("a", 5, drop(0.0), metric("peak_rss", 100, "MB")), FLOAT, Limits(max_memory_mb=limit), None)
+    assert found.within is within
+
+
+def test_memory_of_another_board_is_predicted_or_unjudged() -> None:
+    memory = Measurement("memory", 700, "MB", "predicted", BOARD.name)
+    assert not held(row("a", 5, drop(0.0), memory), max_memory_mb=600).within
+    unknown = held(row("a", 5, drop(0.0)), max_memory_mb=600)
+    assert unknown.within
+    assert any("unjudged" in warning for warning in unknown.warnings)
+
+
+def test_float32_is_no_answer_when_memory_was_asked_for() -> None:
+    slower = row("small", 20, drop(0.0))
+    judged = [held(each, FLOAT) for each in (FLOAT, slower)]
+    assert next(item.row.name for item in choose(judged) if item.row.role == "chosen") == "float32"
+    assert next(item.row.name for item in choose(judged, small=True) if item.row.role == "chosen") == "small"

@@ -84,13 +84,15 @@ class Workshop:
         folder = self.policy(*swap)
         return Path(shutil.copyfile(self.float / "graphs/main.onnx", folder / "tiny.onnx"))
 
-    def bundle(self, file: str = "", content: bytes | Callable[[bytes], bytes] = b"", *, sealed: bool = False) -> Path:
-        """A copy of the int8 bundle with one file rewritten; ``sealed`` again, the hashes are right."""
-        path = Path(shutil.copytree(self.int8, self.root / "damaged"))
+    def bundle(
+        self, file: str = "", content: bytes | Callable[[bytes], bytes] = b"", *, sealed: bool = False, of: str = "int8"
+    ) -> Path:
+        """A copy of the int8 bundle (or another) with one file rewritten; ``sealed`` again, the hashes are right."""
+        path = Path(shutil.copytree(self.bundles[of].path, self.root / "damaged"))
         if file:
             (path / file).write_bytes(content((path / file).read_bytes()) if callable(content) else content)
         if sealed:
-            seal(path, self.bundles["int8"].manifest)
+            seal(path, self.bundles[of].manifest)
         return path
 
     def manifest(self, change: Callable[[dict[str, Any]], Any]) -> Path:
@@ -406,8 +408,12 @@ BUNDLES = [
         lambda at: ["evaluate", at.bundle("graphs/main.onnx", lambda data: data[:-9] + b"\0" + data[-8:])]),
     Row("a graph cut short, sealed again", "ONNX Runtime", 3,
         lambda at: ["evaluate", at.bundle("graphs/main.onnx", lambda data: data[:-100], sealed=True)]),
-    Row("a graph that is no ONNX, sealed again", "refuses", 3,
-        lambda at: ["quantize", at.bundle("graphs/main.onnx", b"no graph", sealed=True), *at.to]),
+    Row("a graph that is no ONNX, sealed again", "The graph 'main' cannot be quantized: DecodeError", 3,
+        lambda at: ["quantize", at.bundle("graphs/main.onnx", b"no graph", sealed=True, of="float"), *at.to]),
+    Row("a bundle that is int8 already", "is int8 already; quantize.static_int8 starts from float32", 3,
+        lambda at: ["quantize", at.int8, *at.to]),
+    Row("bfloat16 of an int8 bundle", "is int8 already; quantize.bfloat16 starts from float32", 3,
+        lambda at: ["quantize", "bfloat16", at.int8, *at.to]),
     Row("golden values that are none", "golden", 3,
         lambda at: lambda: load(at.bundle("golden/golden.npz", b"PK", sealed=True)), called),
 ]  # fmt: skip

@@ -22,7 +22,7 @@ Status = Literal["ok", "warn", "missing"]
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "ort": ("onnxruntime",),
     "build": ("torch", "onnx", "onnxscript", "onnx-ir", "safetensors"),
-    "openvino": ("openvino", "nncf"),
+    "openvino": ("openvino",),
     "sim": ("gymnasium", "minigrid"),
     "metaworld": ("metaworld", "mujoco"),
     "data": ("h5py", "pyarrow", "av"),

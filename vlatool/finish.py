@@ -18,7 +18,13 @@ from vlatool.runtime.program import draw
 
 GOLDEN = "golden/golden.npz"
 GOLDEN_COUNT = 2
+SEED = 0
+"""Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")
+HANDED_OUT = "optimize"
+"""In a build record, the entry of the step in which ``optimize`` hands a candidate out."""
+DECIDED = ("accuracy", "engine")
+"""Fields of a manifest that ``optimize`` sets when it hands a candidate out."""
 
 
 def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
@@ -38,6 +44,7 @@ def finish(
     made_by: Mapping[str, Any],
     graphs: Mapping[str, Graph],
     observations: list[dict[str, Any]],
+    changes: Mapping[str, Any] | None = None,
 ) -> Bundle:
     """Write golden file and manifest of a bundle whose graphs and carried folders are in ``out`` already.
 
@@ -46,16 +53,44 @@ def finish(
         made_by: Stage, options and versions.
         graphs: Graph name -> graph.
         observations: Raw observations; the first two become golden.
+        changes: Other fields of the manifest that the stage changes, such as program and engine.
 
     Raises:
         GraphError: when the engine refuses a graph or gives an action that is not finite.
     """
-    changes: dict[str, Any] = {"parent": source.hash, "made_by": dict(made_by), "graphs": dict(graphs), "accuracy": {}}
+    changed: dict[str, Any] = {"parent": source.hash, "made_by": dict(made_by), "graphs": dict(graphs), "accuracy": {}}
+    changed.update(changes or {})
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
-    draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changes))
+    draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
     write_golden(draft, observations, out)
-    return seal(out, replace(draft.manifest, golden=GOLDEN))
+    return seal(out, replace(draft.manifest, golden=GOLDEN, build=(*history(source), _step(source, draft.manifest))))
+
+
+def history(bundle: Bundle) -> tuple[dict[str, Any], ...]:
+    """Return the build record of a bundle: one entry for each stage from the source to this bundle.
+
+    A source bundle has no ``build`` of its own, and ``optimize`` hands a bundle out without a stage; their entries are
+    what their manifests say. A bundle from before there was a record has an incomplete one, or none.
+    """
+    manifest = bundle.manifest
+    made, recorded = manifest.made_by, manifest.build
+    if not recorded and str(made.get("stage", "")).startswith("sources."):
+        recorded = ({**made, "factory": manifest.source.get("factory", "")},)
+    if "candidate" not in made or (recorded and recorded[-1]["stage"] == HANDED_OUT):
+        return recorded
+    options = {name: made[name] for name in ("candidate", "profile") if name in made}
+    handed = {"vlatool": made.get("vlatool", ""), "stage": HANDED_OUT, "options": options, "input": manifest.parent}
+    decided = {name: getattr(manifest, name) for name in DECIDED if getattr(manifest, name)}
+    return (*recorded, {**handed, **decided})
+
+
+def _step(source: Bundle, draft: Manifest) -> dict[str, Any]:
+    """Return the entry of the stage that made ``draft`` from ``source``."""
+    starts = str(draft.made_by.get("stage", "")).startswith("sources.")
+    graphs = {name: record.sha256 for name, record in draft.files.items() if name.startswith("graphs/")}
+    seed = draft.made_by.get("seed", SEED)
+    return {**draft.made_by, "seed": seed, "input": "" if starts else source.hash, "graphs": graphs}
 
 
 def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]) -> Bundle:
@@ -72,8 +107,8 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
         observations: Raw observations without the batch axis.
         out: The bundle's directory.
     """
-    policy = Policy.open(draft, threads=1, seed=0)
-    random = np.random.default_rng(0)
+    policy = Policy.open(draft, threads=1, seed=SEED)
+    random = np.random.default_rng(SEED)
     arrays: dict[str, list[Any]] = {}
     for observation in observations[:GOLDEN_COUNT]:
         noise = {name: draw(wanted, random) for step in draft.manifest.program for name, wanted in step.noise.items()}

@@ -11,13 +11,55 @@ from vlatool.report import Measurement, Row
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
+    from vlatool.spec import PolicySpec
 
 TOLERANCE = 1e-12
 TIE = 1.05
 AGAINST_FLOAT32 = "against float32"
-MEASURED_ENGINE = "ort_cpu"
+MEASURED_ENGINES = ("ort_cpu", "openvino")
+PROXY = 0.05
+"""Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
 DROPS = ("success_drop", "agreement_drop", "error_increase")
 """Which accuracy decides: the closed loop where there is one, else recorded observations."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a plan may cost in accuracy, in a measure that recorded observations give.
+
+    Args:
+        name: The measurement, or ``unit:UNIT`` for the worst action element of that unit.
+        value: The largest allowed.
+    """
+
+    name: str
+    value: float
+
+    def of(self, row: Row) -> Measurement | None:
+        """Return the measurement of a row that the budget is about, None when there is none."""
+        if self.name == "disagreement":
+            found = row.get("agreement_baseline")
+            return None if found is None else replace(found, name=self.name, value=1.0 - found.value)
+        if self.name.startswith("unit:"):
+            unit = self.name.partition(":")[2]
+            alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
+            return max(alike, key=lambda m: m.value, default=None)
+        return row.get(self.name) or row.get(f"error_baseline.{self.name}")
+
+
+def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
+    """Return the budget on recorded observations.
+
+    Args:
+        limits: What was asked for.
+        spec: The policy's.
+        proxy: Whether something else decides in the end (episodes, the expert's actions), so that a plan is only worth
+            a look when it is near float32.
+    """
+    if limits.metric:
+        return Budget(limits.metric, limits.max_metric or 0.0)
+    name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
+    return Budget(name, max(PROXY, limits.max_drop) if proxy else limits.max_drop)
 
 
 @dataclass(frozen=True)
@@ -41,14 +83,14 @@ class Judged:
     warnings: tuple[str, ...] = ()
 
 
-def judge(row: Row, baseline: Row, limits: Limits, profile: Profile, on_board: bool = False) -> Judged:
+def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_board: bool = False) -> Judged:
     """Hold a candidate's row against the limits.
 
     Args:
         row: The candidate, or the baseline itself.
         baseline: The float32 row.
         limits: What was asked for.
-        profile: The board.
+        profile: The board; None for this host.
         on_board: Whether this host is that board, so that its own latency decides.
 
     Returns:
@@ -57,13 +99,15 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile, on_board: b
     is_baseline = row is baseline
     row = _with_drop(row, baseline)
     decisive = next((found for name in DROPS if (found := row.get(name)) is not None), None)
-    rate = _judge_rate(row, limits, profile, on_board)
+    if limits.metric:
+        decisive = Budget(limits.metric, 0.0).of(row)
+    rate = _both(_judge_rate(row, limits, profile, on_board), _judge_memory(row, limits, profile, on_board))
     if is_baseline:
         reason = "; ".join(rate.reasons) or "the reference"
         return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
     accuracy = _judge_accuracy(row, decisive, limits)
     reasons = (*accuracy.reasons, *rate.reasons)
-    kept = f"{_drop_words(decisive)}, within {_points(limits.max_drop)}" if decisive else ""
+    kept = f"{_drop_words(decisive)}, within {_allowed(limits, decisive)}" if decisive else ""
     row = replace(row, role="outside" if reasons else "within", reason="; ".join(reasons) or kept)
     warnings = (*rate.warnings, *(() if reasons else accuracy.warnings))
     drop = decisive.value if decisive else math.nan
@@ -83,6 +127,12 @@ def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verd
     if drop is None or not drop.known:
         reason = "its accuracy is unmeasured: the policy brings neither an environment nor evaluation data"
         return _Verdict((reason,), math.inf)
+    if limits.metric:
+        allowed = limits.max_metric or 0.0
+        if drop.value <= allowed:
+            return _Verdict()
+        told = f"{_drop_words(drop)}, allowed {_allowed(limits, drop)}"
+        return _Verdict((told,), drop.value / max(allowed, 1e-9) - 1)
     over = drop.value - limits.max_drop
     if over > TOLERANCE:
         return _Verdict((f"{_drop_words(drop)}, {_points(over)} over the budget",), over / max(limits.max_drop, 0.001))
@@ -97,7 +147,7 @@ def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verd
     )
 
 
-def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
+def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False) -> list[Judged]:
     """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside.
 
     Of rows within ``TIE`` of the fastest, which timing noise cannot tell apart, the most accurate is chosen, and of
@@ -105,11 +155,12 @@ def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
 
     Args:
         judged: The baseline first.
+        small: Whether memory was asked for: float32 is then no answer while a smaller plan keeps to the limits.
         engine: The engine of the board. When it is not the one that was measured here, predictions for the board rank
             the candidates, where every candidate has one.
     """
     origin = "measured"
-    if engine != MEASURED_ENGINE and all(_p50(item.row, "predicted") < math.inf for item in judged):
+    if engine not in MEASURED_ENGINES and all(_p50(item.row, "predicted") < math.inf for item in judged):
         origin = "predicted"
     quantized = [item for item in judged if item.row.role != "baseline"]
     inside = [item for item in quantized if item.within]
@@ -121,7 +172,7 @@ def choose(judged: list[Judged], engine: str = MEASURED_ENGINE) -> list[Judged]:
             *(f"{item.row.name}: {item.row.reason}." for item in quantized),
         )
     else:
-        baseline = [item for item in judged if item.row.role == "baseline" and item.within]
+        baseline = [item for item in judged if item.row.role == "baseline" and item.within and not small]
         best = _fastest([*inside, *baseline], origin)
         first = min(_p50(item.row, origin) for item in [*inside, *baseline])
         tied = f"within {TIE - 1:.0%} of the fastest inside the limits and the most accurate of those"
@@ -203,23 +254,42 @@ def _with_drop(row: Row, baseline: Row) -> Row:
     return replace(row, measurements=(*row.measurements, *found))
 
 
-def _judge_rate(row: Row, limits: Limits, profile: Profile, on_board: bool) -> _Verdict:
-    """Judge the rate: on the board by what was measured, elsewhere by the prediction for the board."""
-    if limits.hz is None:
+def _both(first: _Verdict, second: _Verdict) -> _Verdict:
+    reasons, warnings = (*first.reasons, *second.reasons), (*first.warnings, *second.warnings)
+    return _Verdict(reasons, first.miss + second.miss, warnings)
+
+
+def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
+    """Judge the memory: by what a fresh process took here, or by the prediction for another board."""
+    if limits.max_memory_mb is None:
         return _Verdict()
-    budget_ms = 1000.0 / limits.hz
-    if on_board:
+    measured = profile is None or on_board
+    found = row.get("peak_rss") if measured else row.get("memory", "predicted")
+    if found is None or not found.known:
+        return _Verdict(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
+    if found.value <= limits.max_memory_mb:
+        return _Verdict()
+    told = f"needs {found.value:.4g} MB{'' if measured else ' (predicted)'} > {limits.max_memory_mb:g} MB"
+    return _Verdict((told,), found.value / limits.max_memory_mb - 1)
+
+
+def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
+    """Judge the latency: on the board by what was measured, elsewhere by the prediction for the board."""
+    budget_ms = limits.latency_ms
+    if budget_ms is None:
+        return _Verdict()
+    if on_board or profile is None:
         found = row.get("latency_p90") or row.get("latency_p50")
         p90 = found.value if found else math.inf
         late = (f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms",)
         return _Verdict(late, p90 / budget_ms - 1) if p90 > budget_ms else _Verdict()
     predicted = row.get("latency_p50", "predicted")
     if predicted is None or not predicted.known:
-        unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {limits.hz:g} Hz is unjudged"
+        unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {_rate(limits)} is unjudged"
         return _Verdict(warnings=(unjudged,))
     low, high = predicted.low or predicted.value, predicted.high or predicted.value
     told = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
-    told += f", {limits.hz:g} Hz needs {budget_ms:.3g} ms"
+    told += f", {_rate(limits)} needs {budget_ms:.3g} ms"
     if low > budget_ms:
         return _Verdict((told,), predicted.value / budget_ms - 1)
     if high > budget_ms:
@@ -227,7 +297,20 @@ def _judge_rate(row: Row, limits: Limits, profile: Profile, on_board: bool) -> _
     return _Verdict()
 
 
+def _rate(limits: Limits) -> str:
+    slow = limits.hz is None or (limits.max_latency_ms is not None and limits.max_latency_ms < 1000.0 / limits.hz)
+    return "--max-latency-ms" if slow else f"{limits.hz:g} Hz"
+
+
+def _allowed(limits: Limits, drop: Measurement) -> str:
+    if not limits.metric:
+        return _points(limits.max_drop)
+    return f"{limits.max_metric:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
+
+
 def _drop_words(drop: Measurement) -> str:
+    if drop.name not in DROPS:
+        return f"{drop.name} is {drop.value:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
     subject = {
         "success_drop": "success",
         "agreement_drop": "agreement with the expert",

@@ -11,6 +11,7 @@ from vlatool.errors import BundleError, SpecError, nearest
 from vlatool.spec import PolicySpec
 
 SCHEMA = 1
+COMPUTES = ("", "float32", "bfloat16")
 DISTRIBUTIONS = ("normal", "uniform", "zeros")
 
 
@@ -30,11 +31,19 @@ class Graph:
         file: Path inside the bundle.
         precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1).
         opset: Opset of the default ONNX domain.
+        compute: Dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
     """
 
     file: str
     precision: dict[str, float] = field(default_factory=dict)
     opset: int = 0
+    compute: str = ""
+
+    def __post_init__(self) -> None:
+        if self.compute not in COMPUTES:
+            raise BundleError(
+                f"The graph {self.file} computes in {self.compute!r}; allowed: {', '.join(COMPUTES[1:])}."
+            )
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,8 @@ class Manifest:
         files: Path inside the bundle -> SHA-256 and size, of every file but the reports.
         parent: ``sha256:...`` of the bundle that this one was made from.
         made_by: Version of vlatool, stage, options, versions of the packages that change the result.
+        build: The build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
+            of its input, the SHA-256 of its graphs, of its input files and of its calibration samples.
         source: Factory and hashes of the code and weights (a source bundle, and those exported from it).
         environment: Factory and tasks of the closed-loop evaluation.
         parts: Part of the policy -> globs of module names.
@@ -108,6 +119,7 @@ class Manifest:
         accuracy: Measured accuracy: name -> value, interval, samples.
         description: One sentence.
         license: SPDX identifier of the policy's licence.
+        engine: Engine that the graphs were made for; ONNX Runtime on the CPU when empty.
         schema: Version of this format.
     """
 
@@ -119,6 +131,7 @@ class Manifest:
     files: dict[str, FileRecord] = field(default_factory=dict)
     parent: str = ""
     made_by: dict[str, Any] = field(default_factory=dict)
+    build: tuple[dict[str, Any], ...] = ()
     source: dict[str, Any] = field(default_factory=dict)
     environment: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, list[str]] = field(default_factory=dict)
@@ -126,6 +139,7 @@ class Manifest:
     accuracy: dict[str, Any] = field(default_factory=dict)
     description: str = ""
     license: str = ""
+    engine: str = ""
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -165,6 +179,7 @@ class Manifest:
             values["spec"] = PolicySpec.from_dict(values["spec"])
             values["graphs"] = {name: Graph(**graph) for name, graph in data.get("graphs", {}).items()}
             values["program"] = program_from(data.get("program", []))
+            values["build"] = _build_record(data.get("build", ()))
             values["files"] = {path: FileRecord(**record) for path, record in data.get("files", {}).items()}
         except (TypeError, AttributeError) as error:
             raise BundleError(f"The manifest is malformed: {error}.", "export the policy again") from error
@@ -252,6 +267,12 @@ def _inside(path: str) -> None:
     pure = PurePosixPath(path)
     if pure.is_absolute() or ".." in pure.parts or not path:
         raise BundleError(f"The manifest names the file '{path}', which is not inside the bundle.")
+
+
+def _build_record(data: Any) -> tuple[dict[str, Any], ...]:
+    if not isinstance(data, list | tuple) or not all(isinstance(item, Mapping) and "stage" in item for item in data):
+        raise BundleError("The manifest has a malformed 'build'; it must be a list of mappings that name a stage.")
+    return tuple(dict(item) for item in data)
 
 
 def _nonempty(value: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from vlatool.errors import RecipeError, SourceError, VlatoolError
 from vlatool.evaluate._paired import compare_success
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
+from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
 from vlatool.host import fingerprint, matches
@@ -21,15 +22,18 @@ from vlatool.judge import Judged, choose, judge
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.predict import predictions
 from vlatool.profile import Profile
-from vlatool.recipe import Recipe, stage_entries
+from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
 from vlatool.report import Measurement, Report, Row
+from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Stage, Transform, build_stage
 
 BASELINE = "float32"
+EXPLAIN_SECONDS = 20.0
+"""What the layers' errors may take; one observation is always used."""
 ROBOT_FOLDERS = ("assets", "graphs", "golden")
 """What of a bundle a robot needs; recorded data stays behind."""
 
@@ -43,9 +47,14 @@ class Plan:
     export: tuple[Transform, ...]
     candidates: dict[str, tuple[Transform, ...]]
     recipe: Recipe
-    profile: Profile
+    profile: Profile | None
     cache: Path
     fresh: bool = False
+
+    @property
+    def board(self) -> str:
+        """Name of the profile, or of what stands in for it."""
+        return self.profile.name if self.profile else "this host"
 
     @property
     def closed_loop(self) -> ClosedLoop | None:
@@ -69,8 +78,11 @@ class Plan:
         loop = self.closed_loop
         yield "evaluate    recorded observations" + (f", {loop.episodes} paired closed-loop episodes" if loop else "")
         limits = self.recipe.limits
-        yield f"limits      drop <= {100 * limits.max_drop:g} points" + (f", {limits.hz:g} Hz" if limits.hz else "")
-        yield f"profile     {self.profile.name} (predicted, unless this host is that board)"
+        if self.recipe.search:
+            yield "search      engines, methods, mixed-precision plans; the fastest inside the budget become candidates"
+        yield f"limits      {', '.join(_limits(limits))}"
+        told = " (predicted, unless this host is that board)" if self.profile else " (measured)"
+        yield f"profile     {self.board}{told}"
         yield f"cache       {self.cache}"
 
 
@@ -103,12 +115,12 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
     )
 
 
-def make_plan(source: str, profile: Profile, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
+def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
     """Build and check every stage; nothing has run when this returns.
 
     Args:
         source: See ``source_stage``.
-        profile: The board.
+        profile: The board; None for this host.
         recipe: Candidates, limits and effort.
         cache: Where finished stages are kept.
         fresh: Measure again, even what was measured before.
@@ -137,17 +149,57 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
     with writing(out, force=force) as draft:
         source = cached_transform(plan.source, None, plan.cache, context)
         baseline = _chain(plan.export, source, plan, context)
+        plan, searched = _searched(plan, baseline, context)
         bundles, failures = _candidates(plan, baseline, context)
         rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
-        on_board = matches(plan.profile.model_strings, fingerprint())
+        on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
         judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
-        judged = choose(judged, plan.profile.engine)
+        small = plan.recipe.limits.max_memory_mb is not None
+        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+        tables = {**searched, **_explained(judged, bundles, baseline, context)}
+        judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
         report = _report(plan, baseline, judged, failures, warnings, context)
         chosen = next(item.row for item in judged if item.row.role == "chosen")
         chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
         _write_bundle(plan, chosen, chosen_bundle, draft)
         write_reports(report, draft / "reports")
     return report
+
+
+def _with_tables(item: Judged, tables: dict[str, list[dict[str, Any]]]) -> Judged:
+    return replace(item, row=replace(item.row, details={**item.row.details, **tables}))
+
+
+def _explained(
+    judged: list[Judged], bundles: dict[str, Bundle], baseline: Bundle, context: Context
+) -> dict[str, list[dict[str, Any]]]:
+    """Say of the chosen bundle where its time goes and what costs its accuracy."""
+    name = next(item.row.name for item in judged if item.row.role == "chosen")
+    if name not in bundles:
+        return {}
+    sentences = explanation(bundles[name], baseline, context, samples=4, runs=10, seconds=EXPLAIN_SECONDS)
+    return {"Explanation (vlatool explain says more)": [{"what": sentence} for sentence in sentences]}
+
+
+def _searched(plan: Plan, baseline: Bundle, context: Context) -> tuple[Plan, dict[str, list[dict[str, Any]]]]:
+    """Add what the search finds to the candidates of the plan; return also the tables of what it tried."""
+    if not plan.recipe.search:
+        return plan, {}
+    search = Search(baseline, plan.recipe.limits, plan.profile, plan.cache, context, plan.recipe.effort.threads)
+    found = search.run(plan.recipe.candidates)
+    candidates = {**plan.recipe.candidates, **found}
+    recipe = plan.recipe.model_copy(update={"candidates": candidates})
+    stages = {name: _transforms(entries) for name, entries in candidates.items()}
+    return replace(plan, recipe=recipe, candidates=stages), search.tables()
+
+
+def _limits(limits: Limits) -> list[str]:
+    """Return the limits in words."""
+    drop = f"drop <= {100 * limits.max_drop:g} points"
+    told = [f"{limits.metric} <= {limits.max_metric:g}" if limits.metric else drop]
+    told += [f"{limits.hz:g} Hz"] if limits.hz else []
+    told += [f"latency <= {limits.max_latency_ms:g} ms"] if limits.max_latency_ms else []
+    return told + ([f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else [])
 
 
 def _transforms(stages: Any) -> tuple[Transform, ...]:
@@ -202,7 +254,7 @@ def _measure(
             paired = success[name] if name == BASELINE else compare_success(success[BASELINE], success[name])
             found += paired.measurements
             row = replace(row, raw={**row.raw, **paired.raw}, details={**row.details, **paired.details})
-        found += predictions(plan.profile, bundle)
+        found += predictions(plan.profile, bundle) if plan.profile else []
         rows[name] = replace(row, measurements=(*row.measurements, *found))
     return rows, warnings
 
@@ -240,11 +292,14 @@ def _report(
     chosen = next(item for item in judged if item.row.role == "chosen")
     wanted = plan.recipe.limits
     name = "max_success_drop_points" if plan.closed_loop else "max_drop_points"
-    limits = {name: 100 * wanted.max_drop, "hz": wanted.hz, "profile": plan.profile.name}
+    limits = {name: 100 * wanted.max_drop, "hz": wanted.hz, "profile": plan.board}
+    if wanted.metric:
+        limits = {wanted.metric: wanted.max_metric, "hz": wanted.hz, "profile": plan.board}
+    limits |= {"max_latency_ms": wanted.max_latency_ms, "max_memory_mb": wanted.max_memory_mb}
     warnings = tuple(dict.fromkeys([*notes, *(warning for item in judged for warning in item.warnings)]))
     return Report(
         "optimize",
-        f"{baseline.manifest.name} for {plan.profile.name}",
+        f"{baseline.manifest.name} for {plan.board}",
         "pass" if chosen.within else "fail",
         summary=chosen.sentences,
         rows=rows,
@@ -263,7 +318,7 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
         if found is not None and found.known:
             interval = {"low": found.low, "high": found.high} if found.low is not None else {}
             accuracy[name] = {"value": found.value, **interval, "samples": found.samples}
-    made_by = {**bundle.manifest.made_by, "candidate": chosen.name, "profile": plan.profile.name}
+    made_by = {**bundle.manifest.made_by, "candidate": chosen.name, "profile": plan.board}
     manifest = replace(
         bundle.manifest,
         parent=bundle.hash,
@@ -274,7 +329,8 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
     )
     reseal(bundle, draft, manifest, ROBOT_FOLDERS)
     stages = plan.recipe.candidates.get(chosen.name)
-    repeat = plan.recipe if stages is None else plan.recipe.model_copy(update={"candidates": {chosen.name: stages}})
+    only = {"candidates": {chosen.name: stages}, "search": False}
+    repeat = plan.recipe if stages is None else plan.recipe.model_copy(update=only)
     (draft / "recipe.yaml").write_text(repeat.to_yaml(), encoding="utf-8")
 
 

@@ -12,4 +12,5 @@ from vlatool.report import Measurement
 def predictions(profile: Profile, bundle: Bundle) -> list[Measurement]:
     """Return predicted latency and memory of a bundle on a board; NaN with a note where there is no ground for one."""
     load = workload(bundle)
-    return [predict(profile, load), predict_memory(profile, load)]
+    engine = bundle.manifest.engine if bundle.manifest.engine in profile.engines else None
+    return [predict(profile, load, engine), predict_memory(profile, load, engine)]

@@ -19,7 +19,18 @@ class Limits(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_drop: float = Field(0.01, ge=0, le=1, description="largest drop against float32, a share (0.01 = 1 point)")
+    metric: str = Field("", description="a measurement that decides instead, such as relative_error, or unit:m")
+    max_metric: float | None = Field(None, ge=0, description="largest value of that measurement")
     hz: float | None = Field(None, gt=0, description="inferences per second")
+    max_latency_ms: float | None = Field(None, gt=0, description="largest latency of one inference")
+    max_memory_mb: float | None = Field(None, gt=0, description="largest memory of the process, 10^6 bytes")
+
+    @property
+    def latency_ms(self) -> float | None:
+        """What one inference may take, by rate and latency."""
+        given = [1000.0 / self.hz] if self.hz else []
+        given += [self.max_latency_ms] if self.max_latency_ms else []
+        return min(given) if given else None
 
 
 class Effort(BaseModel):
@@ -40,6 +51,7 @@ class Recipe(BaseModel):
     schema_: int = Field(1, alias="schema", ge=1, le=1)
     export: StageList = ({"export.onnx": {}},)
     candidates: dict[str, StageList] = Field(min_length=1)
+    search: bool = False
     limits: Limits = Limits()
     effort: Effort = Effort()
 
@@ -68,8 +80,9 @@ def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str
         candidates["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
     if calibrated:
         candidates["static_int8"] = ({"quantize.static_int8": layout},)
-        candidates["static_int8_percentile"] = ({"quantize.static_int8": {"method": "percentile", **layout}},)
-    return Recipe(candidates=candidates, limits=limits, effort=effort)
+        if not own:
+            candidates["static_int8_percentile"] = ({"quantize.static_int8": {"method": "percentile", **layout}},)
+    return Recipe(candidates=candidates, search=own, limits=limits, effort=effort)
 
 
 def read_recipe(path: Path) -> Recipe:

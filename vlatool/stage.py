@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from vlatool import __version__, registry
-from vlatool.bundle import Bundle
+from vlatool.bundle import Bundle, hash_file
 from vlatool.errors import RecipeError, nearest
 from vlatool.report import Report
 
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
+RECORD = 1
+"""Version of the build record, part of the cache key: an output without a record is not taken for one with it."""
 
 
 def _silent(_what: str, _share: float | None) -> None:
@@ -46,12 +48,50 @@ class Context:
     command: str = ""
 
 
+class SampleSet:
+    """A fingerprint of the samples that a stage calibrates on, taken while they stream by.
+
+    Example:
+        >>> samples = SampleSet()
+        >>> for observation in samples.watch([{"proprio": [0.5, 1.0]}]): pass
+        >>> samples.record()["samples"]
+        1
+    """
+
+    def __init__(self) -> None:
+        self._hashes: list[str] = []
+
+    def watch(self, observations: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+        """Yield the observations, each hashed before it is handed on; go through one ``SampleSet`` once."""
+        for observation in observations:
+            self._hashes.append(_sample_hash(observation))
+            yield observation
+
+    def record(self) -> dict[str, Any]:
+        """Return ``samples``, how many there were, and ``sha256``, the hash of their hashes in order."""
+        return {"samples": len(self._hashes), "sha256": hashlib.sha256("\n".join(self._hashes).encode()).hexdigest()}
+
+
+def _sample_hash(observation: Mapping[str, Any]) -> str:
+    """Hash names, types, shapes and values of one observation."""
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for name in sorted(observation):
+        value = np.ascontiguousarray(observation[name])
+        text = value.dtype.kind in "US"
+        content = json.dumps(value.tolist()).encode() if text else value.tobytes()
+        kind = "text" if text else value.dtype.str
+        digest.update(json.dumps([name, kind, list(np.shape(observation[name])), len(content)]).encode() + content)
+    return digest.hexdigest()
+
+
 class Stage(BaseModel):
     """Base of every stage: options as fields, extra keys refused, frozen."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     packages: ClassVar[tuple[str, ...]] = ()
-    """Distributions whose versions change the result; part of the cache key."""
+    """Distributions whose versions change the result whatever the options; part of the cache key and the record."""
 
     @classmethod
     def kind(cls) -> str:
@@ -74,18 +114,15 @@ class Stage(BaseModel):
         """Files outside the source whose content changes the result; part of the cache key."""
         return ()
 
+    def used_packages(self) -> tuple[str, ...]:
+        """Return the distributions whose versions change the result of a stage with these options."""
+        return self.packages
+
     def key(self, source_hash: str) -> str:
         """Return the cache key of this stage's output: 16 hex digits."""
-        from importlib import metadata
-
-        versions: dict[str, str | None] = {}
-        for package in self.packages:
-            try:
-                versions[package] = metadata.version(package)
-            except metadata.PackageNotFoundError:
-                versions[package] = None
+        versions = {package: installed_version(package) for package in self.used_packages()}
         files = [_content(path) for path in self.inputs()]
-        content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, __version__]
+        content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, __version__, RECORD]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -105,13 +142,37 @@ class Transform(Stage):
                 told[name] = f"{value.name} sha256:{_content(value)[:16]}"
         return told
 
-    def made_by(self, seed: int | None = None) -> dict[str, Any]:
-        """Return the ``made_by`` entry of the manifest."""
+    def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
+        """Return the ``made_by`` entry of the manifest.
+
+        Args:
+            seed: Seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
+            calibration: The samples that the stage calibrated on, after the last one was used.
+
+        Returns:
+            ``vlatool``, ``stage``, ``options`` that differ from their defaults, ``versions``, and where there are any
+            ``files`` (name -> SHA-256 of each file outside the source), ``seed`` and ``calibration``. No paths, no
+            times: the same command gives the same entry in another directory and on another day.
+        """
         from importlib import metadata
 
-        versions = {package: metadata.version(package) for package in self.packages}
+        versions = {package: metadata.version(package) for package in self.used_packages()}
         made: dict[str, Any] = {"vlatool": __version__, "stage": self.name(), "options": self._told_options()}
-        return {**made, "versions": versions, **({} if seed is None else {"seed": seed})}
+        files = self.input_hashes()
+        made |= {"versions": versions, **({"files": files} if files else {})}
+        made |= {} if seed is None else {"seed": seed}
+        return made | ({} if calibration is None else {"calibration": calibration.record()})
+
+    def input_hashes(self) -> dict[str, str]:
+        """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
+        found: dict[str, str] = {}
+        for path in (path for path in self.inputs() if path.is_file()):
+            digest, name, number = hash_file(path), path.name, 1
+            while found.get(name, digest) != digest:
+                number += 1
+                name = f"{path.name} ({number})"
+            found[name] = digest
+        return found
 
 
 class Measure(Stage):
@@ -177,5 +238,15 @@ def _problem(item: Mapping[str, Any], known: list[str]) -> str:
     return f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
 
 
+def installed_version(package: str) -> str | None:
+    """Return the version of a distribution, None when it is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def _content(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else f"absent:{path.name}"
+    return hash_file(path) if path.is_file() else f"absent:{path.name}"

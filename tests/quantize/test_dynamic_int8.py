@@ -65,14 +65,21 @@ def test_only_the_included_node_is_quantized(quantized, float_bundle, operators,
 
 
 def test_exclude_wins_over_include(quantized, operators):
-    bundle = quantized(DynamicInt8(include=("*",), exclude=("*",)))
-    assert "MatMulInteger" not in operators(bundle)
-    assert bundle.manifest.graphs["main"].precision == {"float32": 1.0}
+    bundle = quantized(DynamicInt8(include=("*",), exclude=("blocks.*", "state")))
+    assert operators(bundle)["MatMulInteger"] == 1
+    with pytest.raises(RecipeError, match="No layer is left to quantize: include, exclude and parts rule out all 7"):
+        quantized(DynamicInt8(include=("*",), exclude=("*",)))
+
+
+def test_parts_choose_layers_by_their_modules(quantized, operators):
+    assert operators(quantized(DynamicInt8(parts=("head",))))["MatMulInteger"] == 1
+    with pytest.raises(RecipeError, match="No layer is left"):
+        quantized(DynamicInt8(parts=("vision",)))  # a convolution alone
 
 
 @pytest.mark.parametrize("option", ["include", "exclude"])
 def test_a_glob_that_matches_no_node_is_a_typing_error(quantized, option):
-    with pytest.raises(RecipeError, match="No MatMul/Gemm node matches 'no_such_node'; "):
+    with pytest.raises(RecipeError, match="No node matches 'no_such_node'; "):
         quantized(DynamicInt8(**{option: ("no_such_node",)}))
 
 

@@ -1,3 +1,4 @@
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -6,8 +7,10 @@ import pytest
 
 from vlatool.bundle import Bundle, seal
 from vlatool.data import recorded_observations
-from vlatool.errors import DataError, RecipeError
-from vlatool.quantize.static_int8 import StaticInt8, record_feeds
+from vlatool.errors import DataError, MissingExtra, RecipeError
+from vlatool.quantize import static_int8
+from vlatool.quantize.bfloat16 import Bfloat16
+from vlatool.quantize.static_int8 import StaticInt8, engines_differ
 from vlatool.stage import build_stage
 
 
@@ -35,7 +38,7 @@ def test_convolution_and_products_with_weights_are_int8(int8_bundle, operators):
     assert sum(shares.values()) == pytest.approx(1.0, abs=0.002)
 
 
-@pytest.mark.parametrize("method", ["entropy", "percentile"])
+@pytest.mark.parametrize("method", ["entropy", "percentile", "mse"])
 def test_other_methods_of_calibration(quantized, drift, method):
     assert 0 < drift(quantized(StaticInt8(method=method, samples=8))) < 0.15
 
@@ -61,9 +64,14 @@ def test_both_layouts_compute_the_same_numbers(quantized, drift, int8_bundle, op
         {"activations": "int8"},
         {"per_channel": False},
         {"reduce_range": True},
-        {"quantize_outputs": True},
         {"layout": "qdq", "activations": "int8"},
         {"ops": ("MatMul",)},
+        {"ops": ("Gemm",)},
+        {"attention": True},
+        {"elementwise": True},
+        {"layout": "openvino"},
+        {"layout": "openvino", "attention": True},
+        {"layout": "openvino", "compute": "bfloat16"},
     ],
     ids=str,
 )
@@ -76,7 +84,7 @@ def test_every_option_gives_a_policy_near_float(quantized, drift, options):
 
 def test_activations_have_the_asked_type(quantized):
     for activations, data_type in (("uint8", onnx.TensorProto.UINT8), ("int8", onnx.TensorProto.INT8)):
-        bundle = quantized(StaticInt8(samples=4, activations=activations))
+        bundle = quantized(StaticInt8(samples=8, activations=activations))
         graph = onnx.load(bundle.path / "graphs/main.onnx").graph
         zero_points = {tensor.name: tensor for tensor in graph.initializer}
         quantizers = [node for node in graph.node if node.op_type == "QuantizeLinear"]
@@ -88,18 +96,84 @@ def test_equal_inputs_give_equal_bytes(quantized, int8_bundle):
     assert quantized(StaticInt8()).hash == int8_bundle.hash
 
 
-def test_excluded_convolutions_stay_in_float(quantized, float_bundle):
-    graph = onnx.load(float_bundle.path / "graphs/main.onnx").graph
-    convolution = next(node.name for node in graph.node if node.op_type == "Conv")
-    bundle = quantized(StaticInt8(samples=4, exclude=(convolution,)))
+def test_excluded_convolutions_stay_in_float(quantized):
+    bundle = quantized(StaticInt8(samples=8, exclude=("vision/Conv",)))
     assert bundle.manifest.graphs["main"].precision["float32"] > 0.2
-    only = quantized(StaticInt8(samples=4, include=(convolution,)))
+    only = quantized(StaticInt8(samples=8, include=("vision",)))
     assert 0 < only.manifest.graphs["main"].precision["int8"] < 0.8
 
 
+def test_parts_are_those_of_the_policy(quantized, operators):
+    bundle = quantized(StaticInt8(samples=8, parts=("head",)))
+    assert operators(bundle)["MatMulIntegerToFloat"] == 1
+    with pytest.raises(RecipeError, match="no part 'haed'; did you mean 'head'"):
+        quantized(StaticInt8(samples=8, parts=("haed",)))
+
+
+def test_only_gemm_is_quantized_when_only_gemm_is_asked_for(quantized, operators):
+    assert operators(quantized(StaticInt8(samples=8, ops=("Gemm",))))["MatMulIntegerToFloat"] == 2  # state and head
+
+
+def test_layers_are_counted_before_the_work(float_bundle):
+    assert StaticInt8().layer_count(float_bundle) == 8
+    assert StaticInt8(attention=True).layer_count(float_bundle) == 10
+
+
 def test_a_glob_that_matches_no_node_is_a_typing_error(quantized):
-    with pytest.raises(RecipeError, match="No MatMul/Gemm/Conv node matches 'no_such_node'"):
-        quantized(StaticInt8(samples=4, exclude=("no_such_node",)))
+    with pytest.raises(RecipeError, match=r"No node matches 'visoin'; known: .*vision/Conv"):
+        quantized(StaticInt8(exclude=("visoin",)))
+
+
+def test_openvino_is_in_the_key_and_the_record_only_where_it_runs(quantized, float_bundle, monkeypatch):
+    from vlatool import stage
+
+    own, other = StaticInt8(samples=8, layout="openvino"), StaticInt8(samples=8, layout="qdq")
+    assert "openvino" in quantized(own).manifest.made_by["versions"]
+    assert "openvino" not in quantized(other).manifest.made_by["versions"]
+    assert "openvino" in quantized(Bfloat16()).manifest.made_by["versions"]
+    before = [each.key("x") for each in (own, other, Bfloat16())]
+    real = stage.installed_version
+    monkeypatch.setattr(stage, "installed_version", lambda name: "9" if name == "openvino" else real(name))
+    assert [a == b for a, b in zip(before, (each.key("x") for each in (own, other, Bfloat16())), strict=True)] == [
+        False,
+        True,
+        False,
+    ]
+
+
+def test_without_openvino_the_other_layouts_work(quantized, monkeypatch):
+    monkeypatch.setitem(sys.modules, "openvino", None)
+    for refused in (StaticInt8(layout="openvino"), Bfloat16()):
+        with pytest.raises(MissingExtra, match="openvino") as caught:
+            refused.check(None, None)
+        assert caught.value.fix == "pip install 'vlatool[openvino]'"
+    assert quantized(StaticInt8(samples=8, layout="qdq")).manifest.engine == ""
+
+
+def test_openvino_and_onnxruntime_agree_on_an_int8_graph(quantized, float_bundle, monkeypatch):
+    made = quantized(StaticInt8(layout="openvino"))
+    assert engines_differ(made, recorded_observations(float_bundle, 4)) < 0.05
+    monkeypatch.setattr(static_int8, "DIFFERENCE", -1.0)
+    with pytest.warns(UserWarning, match="OpenVINO computes other values than the int8 graph says"):
+        quantized(StaticInt8(layout="openvino"))
+
+
+def test_other_dtypes_need_the_layout_that_computes_in_them():
+    with pytest.raises(RecipeError, match="The layout ort does not compute in bfloat16") as caught:
+        StaticInt8(compute="bfloat16").check(None, None)
+    assert caught.value.fix == "use layout openvino"
+
+
+def test_nodes_without_names_are_told_apart(quantized, float_bundle, copied, resealed, drift, int8_bundle, operators):
+    """Some exporters leave names empty."""
+    bundle = copied(float_bundle)
+    model = onnx.load(bundle.path / "graphs/main.onnx")
+    for node in model.graph.node:
+        node.name = ""
+    onnx.save(model, bundle.path / "graphs/main.onnx")
+    made = quantized(StaticInt8(), resealed(bundle))
+    assert operators(made) == operators(int8_bundle)
+    assert drift(made, int8_bundle) < 1e-6
 
 
 def test_without_calibration_data_the_other_method_is_named(uncalibrated, quantized):
@@ -123,21 +197,7 @@ def test_calibration_data_that_does_not_fit_is_named(float_bundle, tmp_path: Pat
         StaticInt8(calibration=tmp_path / "c.npz").check(float_bundle, None)
 
 
-def test_feeds_are_recorded_as_the_graph_sees_them(float_bundle):
-    observations = recorded_observations(float_bundle, 3)
-    feeds = record_feeds(float_bundle, observations)
-    assert [len(found) for found in feeds.values()] == [3]
-    first = feeds["main"][0]
-    assert {name: (value.shape, str(value.dtype)) for name, value in first.items()} == {
-        "image": ((1, 8, 8, 3), "uint8"),
-        "proprio": ((1, 3), "float32"),
-        "instruction": ((1, 4), "int64"),
-    }
-    wanted = (observations[0]["proprio"] - [0.1, -0.2, 0.5]) / [0.5, 0.25, 2.0]
-    np.testing.assert_allclose(first["proprio"][0], wanted, rtol=1e-5)
-
-
-@pytest.mark.parametrize("options", [{"samples": 0}, {"percentile": 50}, {"method": "mse"}, {"layout": "tensorrt"}])
+@pytest.mark.parametrize("options", [{"samples": 0}, {"percentile": 50}, {"method": "median"}, {"layout": "tensorrt"}])
 def test_impossible_options_are_refused(options):
     with pytest.raises(RecipeError, match=next(iter(options))):
         build_stage("quantize.static_int8", options)

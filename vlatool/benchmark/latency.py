@@ -36,7 +36,7 @@ class Latency(Measure):
     iterations: int = Field(200, ge=20, description="inferences of each policy")
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
     threads: int = Field(1, ge=1, description="intra-op threads")
-    engine: str = Field("ort_cpu", description="engine of the runtime")
+    engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     cold: bool = Field(True, description="also load each bundle in a fresh process: load time and peak memory")
 
     def inputs(self) -> tuple[Path, ...]:

@@ -9,12 +9,15 @@ from typing import Annotated, Any
 import typer
 
 from vlatool import __version__
+from vlatool.cli._console import plain_warnings
 from vlatool.cli._stages import StageGroup
 from vlatool.cli.compare import compare
 from vlatool.cli.doctor import doctor
+from vlatool.cli.explain import explain
 from vlatool.cli.inspect import inspect
 from vlatool.cli.optimize import optimize
 from vlatool.cli.profiles import app as profiles
+from vlatool.cli.rebuild import rebuild
 from vlatool.cli.samples import app as samples
 from vlatool.errors import VlatoolError
 
@@ -58,6 +61,8 @@ for _kind, _text in (
     app.add_typer(typer.Typer(cls=StageGroup, help=_text, rich_markup_mode=None), name=_kind)
 app.command("compare")(compare)
 app.command("inspect")(inspect)
+app.command("explain")(explain)
+app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
 app.add_typer(profiles, name="profiles")
 app.add_typer(samples, name="samples")
@@ -69,7 +74,8 @@ def main(arguments: list[str] | None = None) -> None:
     0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
     """
     try:
-        code = app(arguments, standalone_mode=False) or 0
+        with plain_warnings():
+            code = app(arguments, standalone_mode=False) or 0
         if code == INTERRUPTED:  # typer catches Ctrl-C itself
             raise KeyboardInterrupt
         sys.exit(code)

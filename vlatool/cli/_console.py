@@ -7,10 +7,12 @@ import os
 import re
 import shlex
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -65,6 +67,26 @@ def _plain_lines() -> Tell:
             typer.echo(f"... {what}", err=True)
 
     return tell
+
+
+@contextlib.contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Show what vlatool warns of on stderr, as one sentence and once, however often a stage says it."""
+    shown: set[str] = set()
+    elsewhere = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if not issubclass(category, UserWarning):
+            elsewhere(message, category, *where, **more)
+        elif str(message) not in shown:
+            shown.add(str(message))
+            typer.echo(f"warning: {message}", err=True)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = elsewhere
 
 
 def refuse_existing(out: Path | None, force: bool) -> None:

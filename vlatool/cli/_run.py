@@ -12,10 +12,10 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, progress, refuse_existing, show
-from vlatool.errors import MissingExtra
+from vlatool.errors import BundleError, MissingExtra
 from vlatool.launch import cache_directory, run_transform
 from vlatool.report import Report
-from vlatool.stage import Measure, Transform
+from vlatool.stage import Context, Measure, Transform
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
@@ -75,7 +75,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
             if bundle.manifest.graphs:  # an ONNX file: its source stage is all the export that there is
                 stage, bundle = source_stage(source)[0], None
         else:
-            bundle = exported(source, cache_directory(), context)
+            bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         made = run_transform(stage, bundle, out, context, force=force)
     summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
     precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
@@ -83,8 +83,24 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         typer.echo(json.dumps({**summary, "precision": precision}))
         return
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
+    for line in stage.lines(made) if hasattr(stage, "lines") else ():
+        typer.echo(f"  {line}")
     for name, shares in precision.items():
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
+
+
+def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
+    """Return the bundle of a policy whose weights the stage reads from their shards itself, None for any other."""
+    from vlatool.pipeline import sourced
+
+    if not getattr(stage, "streams", False):
+        return None
+    bundle = sourced(source, cache_directory(), context)
+    try:
+        stage.check(bundle, None)
+    except BundleError:
+        return None
+    return bundle
 
 
 def measure(

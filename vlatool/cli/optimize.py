@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,10 +17,17 @@ def optimize(
     source: Annotated[str, typer.Argument(help="policy directory, path.py:make or .onnx file", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
     profile: Annotated[
-        str, typer.Option(help="board to optimise for (see: vlatool profiles list)", show_default=False)
-    ],
-    max_drop: Annotated[str | None, typer.Option(help="largest drop against float32, such as 1% (default)")] = None,
+        str | None, typer.Option(help="board to optimise for (see: vlatool profiles list); this host if unset")
+    ] = None,
+    max_drop: Annotated[
+        str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")
+    ] = None,
     hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
+    max_latency_ms: Annotated[float | None, typer.Option(min=0.001, help="largest latency of one inference")] = None,
+    max_memory_mb: Annotated[float | None, typer.Option(min=1, help="largest memory of the process")] = None,
+    search: Annotated[
+        bool | None, typer.Option("--search/--no-search", help="search for faster plans (default without --recipe)")
+    ] = None,
     recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
     iterations: Annotated[int | None, typer.Option(min=20, help="timed inferences of each candidate (200)")] = None,
@@ -41,20 +48,23 @@ def optimize(
     from vlatool.profile import load_profile
     from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
 
-    board = load_profile(profile)
+    board = load_profile(profile) if profile else None
     if hz is not None and not math.isfinite(hz):
         raise UsageError(f"--hz is {hz}; allowed: a rate in Hz above 0.")
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
-    asked: dict[str, float] = {} if max_drop is None else {"max_drop": share(max_drop)}
-    asked |= {} if hz is None else {"hz": hz}
+    asked: dict[str, Any] = {} if max_drop is None else budget(max_drop)
+    limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
+    asked |= {name: value for name, value in limits.items() if value is not None}
     if recipe is None:
         calibrated = pipeline.brings_calibration(source)
-        chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine)
+        chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine if board else "ort_cpu")
     else:
         read = read_recipe(recipe)
         update = {"limits": read.limits.model_copy(update=asked), "effort": read.effort.model_copy(update=effort)}
         chosen = read.model_copy(update=update)
+    if search is not None:
+        chosen = chosen.model_copy(update={"search": search})
     plan = pipeline.make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
     if dry_run:
         for line in plan.lines():
@@ -69,6 +79,21 @@ def optimize(
     leave(report)
 
 
+def budget(text: str) -> dict[str, Any]:
+    """Read ``1%``, ``0.01``, ``METRIC=VALUE`` (with a unit or without), or ``0.002m``.
+
+    Raises:
+        UsageError: for anything else.
+    """
+    named = re.fullmatch(r"\s*([A-Za-z_][\w.]*)\s*=\s*([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*(%?)\s*", text)
+    if named:
+        return {"metric": named[1], "max_metric": float(named[2]) / (100 if named[3] else 1)}
+    physical = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*([A-Za-z][A-Za-z/]*)\s*", text)
+    if physical:
+        return {"metric": f"unit:{physical[2]}", "max_metric": float(physical[1])}
+    return {"max_drop": share(text)}
+
+
 def share(text: str) -> float:
     """Read ``1%`` or ``0.01`` as a share.
 
@@ -79,6 +104,7 @@ def share(text: str) -> float:
     value = float(match[1]) / (100 if match[2] else 1) if match else -1.0
     if not 0 <= value <= 1:
         raise UsageError(
-            f"--max-drop is '{text}'; allowed: a percentage such as 1%, or a share from 0 to 1 such as 0.01."
+            f"--max-drop is '{text}'; allowed: a percentage such as 1%, a share from 0 to 1 such as 0.01, "
+            "METRIC=VALUE such as relative_error=0.04, or an action error such as 0.002m."
         )
     return value

@@ -8,11 +8,22 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle import Bundle
-from vlatool.data._recording import read_recording
+from vlatool.data._recording import Recording, read_recording
 from vlatool.spec import PolicySpec, TensorSpec
 
 CALIBRATION = "data/calibration.npz"
 EVALUATION = "data/evaluation.npz"
+
+
+def calibration_recording(source: Bundle, path: Path | None = None) -> Recording | None:
+    """Return the calibration recording of a bundle, or the one at ``path``; None when there is neither.
+
+    Raises:
+        DataError: when it is missing, corrupt, or does not fit the spec.
+    """
+    own = source.path / CALIBRATION if CALIBRATION in source.manifest.files else None
+    chosen = path or own
+    return None if chosen is None else read_recording(chosen, source.manifest.spec)
 
 
 def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
@@ -21,12 +32,8 @@ def recorded_observations(source: Bundle, count: int, path: Path | None = None) 
     Args:
         path: A recording to read in the place of the bundle's own.
     """
-    own = source.path / CALIBRATION if CALIBRATION in source.manifest.files else None
-    chosen = path or own
-    if chosen is None:
-        return []
-    recording = read_recording(chosen, source.manifest.spec)
-    return [recording.observation(index) for index in recording.spread(count)]
+    recording = calibration_recording(source, path)
+    return [] if recording is None else [recording.observation(index) for index in recording.spread(count)]
 
 
 def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:

@@ -15,6 +15,8 @@ from vlatool.errors import DataError, nearest
 from vlatool.spec import PolicySpec, TensorSpec
 
 Array = NDArray[Any]
+EXPERT = ("action", "episode")
+"""Arrays that a recording may hold beside the inputs."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,14 @@ class Recording:
         inputs: Input name -> array with a leading sample axis, physical values, text as a unicode array.
         actions: (N, T, A) float32 in physical units, or (N,) int64 for discrete actions; None when not recorded.
         episodes: (N,) int64 episode of each sample; None when not recorded.
+        ignored: Names of arrays that the spec does not know.
     """
 
     path: Path
     inputs: Mapping[str, Array]
     actions: Array | None
     episodes: Array | None
+    ignored: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -80,7 +84,7 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
     for tensor in spec.inputs:
         if tensor.name not in arrays:
             raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.")
-        inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name])
+        inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name], spec)
     actions, episodes = arrays.get(spec.action.name, arrays.get("action")), arrays.get("episode")
     lengths = {name: len(values) for name, values in inputs.items()}
     for name, recorded in (("action", actions), ("episode", episodes)):
@@ -92,7 +96,10 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
         raise DataError(f"{path} holds no samples.")
     if episodes is not None and episodes.dtype.kind not in "iu":
         raise DataError(f"'episode' in {path} is {episodes.dtype}; wanted whole numbers.")
-    return Recording(path, inputs, None if actions is None else _checked_action(path, spec.action, actions), episodes)
+    known = {*inputs, *EXPERT, *(tensor.name for tensor in spec.outputs)}
+    ignored = tuple(name for name in arrays if name not in known)
+    action = None if actions is None else _checked_action(path, spec.action, actions)
+    return Recording(path, inputs, action, episodes, ignored)
 
 
 def _length(path: Path, name: str, values: Array) -> int:
@@ -101,7 +108,7 @@ def _length(path: Path, name: str, values: Array) -> int:
     return len(values)
 
 
-def _checked_input(path: Path, tensor: TensorSpec, values: Array) -> Array:
+def _checked_input(path: Path, tensor: TensorSpec, values: Array, spec: PolicySpec) -> Array:
     where = f"'{tensor.name}' in {path}"
     if tensor.kind == "text":
         if values.dtype.kind != "U":
@@ -111,15 +118,41 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Array) -> Array:
         return values.reshape(-1)
     if values.ndim == len(tensor.shape) + 1 and values.shape[1] == 1:
         values = values[:, 0]
+    if not _fits(tensor, values):
+        others = [other.name for other in spec.inputs if other.kind != "text" and _fits(other, values)]
+        raise DataError(
+            f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, tensor.shape[1:]))}].",
+            f"it would fit '{others[0]}'; are the names swapped?" if others else "",
+        )
+    return _finite(where, _typed(where, tensor, values))
+
+
+def _fits(tensor: TensorSpec, values: Array) -> bool:
     wanted = tensor.shape[1:]
-    fits = values.ndim == len(wanted) + 1 and all(
+    return values.ndim == len(wanted) + 1 and all(
         isinstance(want, str) or want == got for want, got in zip(wanted, values.shape[1:], strict=True)
     )
-    if not fits:
-        raise DataError(f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, wanted))}].")
-    if tensor.dtype == "uint8" and values.dtype != np.uint8:
-        raise DataError(f"{where} is {values.dtype}; the policy takes uint8.", "store raw pixel values from 0 to 255")
-    return _finite(where, values)
+
+
+def _typed(where: str, tensor: TensorSpec, values: Array) -> Array:
+    """Refuse a type that the runtime would refuse, and numbers that the policy's type cannot hold."""
+    wanted, got = np.dtype(tensor.dtype), values.dtype
+    numbers = got == wanted or (got.kind in "iu" and wanted.kind in "iu" and np.can_cast(got, wanted))
+    if wanted.kind == "f":
+        numbers = got.kind in "iuf"
+    if not numbers:
+        hint = "store raw pixel values from 0 to 255" if tensor.dtype == "uint8" else f"store it as {tensor.dtype}"
+        raise DataError(f"{where} is {values.dtype}; the policy takes {tensor.dtype}.", hint)
+    if wanted.kind == "f" and values.dtype.kind == "f" and values.dtype.itemsize > wanted.itemsize:
+        limit = float(np.finfo(wanted).max)
+        beyond = np.isfinite(values) & (np.abs(values) > limit)
+        if beyond.any():
+            first = int(np.flatnonzero(beyond.reshape(len(values), -1).any(axis=1))[0])
+            raise DataError(
+                f"{where} exceeds {tensor.dtype} in sample {first}: {float(values[beyond][0]):g}; allowed: {limit:g}.",
+                "repair the recording",
+            )
+    return values
 
 
 def _checked_action(path: Path, action: TensorSpec, values: Array) -> Array:

@@ -38,7 +38,7 @@ class ClosedLoop(Measure):
     first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode of every task")
     baseline: Path | None = Field(None, description="bundle to pair with, usually float32")
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
-    engine: str = Field("ort_cpu", description="engine of the runtime")
+    engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
 
     def inputs(self) -> tuple[Path, ...]:
         """The baseline's manifest, and the environment's file with its neighbours, which it may import."""

@@ -34,7 +34,7 @@ class Recorded(Measure):
     data: Path | None = Field(None, description="recorded observations and actions; the bundle's own when not given")
     baseline: Path | None = Field(None, description="bundle to compare with, usually float32")
     samples: int = Field(100_000, ge=1, description="largest number of samples, spread over the recording")
-    engine: str = Field("ort_cpu", description="engine of the runtime")
+    engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
 
     def inputs(self) -> tuple[Path, ...]:
         """Data and the baseline's manifest."""
@@ -122,7 +122,12 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     mean, count = errors.mean(axis=(0, 1)), len(got)
     spread = wanted.std(axis=(0, 1))
     relative = float(np.mean(mean[spread > 0] / spread[spread > 0])) if np.any(spread > 0) else math.nan
+    norms = np.linalg.norm(wanted.reshape(count, -1), axis=1)
+    distances = np.linalg.norm((got - wanted).reshape(count, -1), axis=1) / np.where(norms > 0, norms, 1.0)
     found = [Measurement(f"error_{whose}", relative, "1", samples=count, note="mean |error| / standard deviation")]
+    if whose == "baseline":
+        note = "mean over samples of |difference|2 / |action|2"
+        found.append(Measurement("relative_error", float(distances.mean()), "1", samples=count, note=note))
     for index, (label, unit) in enumerate(zip(labels, action.units(), strict=True)):
         found.append(
             Measurement(f"error_{whose}.{label}", float(mean[index]), unit, samples=count, note="mean |error|")

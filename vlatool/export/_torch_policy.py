@@ -15,6 +15,7 @@ from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.sources._description import read_location
 from vlatool.sources._factory import call_factory, factory_file
+from vlatool.sources._shards import read_header, shard_files
 
 if TYPE_CHECKING:
     from torch import nn
@@ -40,7 +41,34 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
             raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, modules)}.")
         if not isinstance(modules[name], torch.nn.Module):
             raise SourceError(f"The factory gave a {type(modules[name]).__name__} for '{name}'; wanted a torch module.")
+    if origin.get("weights"):
+        for name in wanted:
+            _load_weights(name, modules[name], folder, str(origin["weights"]))
     return {name: modules[name].eval() for name in sorted(wanted)}
+
+
+def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:
+    """Fill a module from shards whose tensors are named as in ``state_dict()``, or ``GRAPH.`` before that.
+
+    Raises:
+        SourceError: when a tensor is missing or has another shape.
+    """
+    safetensors = require("safetensors.torch", "build")
+    stored: dict[str, Any] = {}
+    for file in shard_files(folder, pattern):
+        read_header(file)
+        stored.update(safetensors.load_file(str(file)))
+    own = module.state_dict()
+    found = {}
+    for name, value in own.items():
+        tensor = stored.get(f"{graph}.{name}", stored.get(name))
+        if tensor is None:
+            raise SourceError(f"No shard of {folder / pattern} has '{name}' of '{graph}'; {nearest(name, stored)}.")
+        if tensor.shape != value.shape:
+            got, want = list(tensor.shape), list(value.shape)
+            raise SourceError(f"'{name}' has the shape {got} in the shards; the module's is {want}.")
+        found[name] = tensor.to(value.dtype)
+    module.load_state_dict(found)
 
 
 def _check_code(origin: Mapping[str, Any], folder: Path) -> None:

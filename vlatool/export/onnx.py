@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import io
 import logging
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -89,6 +91,7 @@ class ExportOnnx(Transform):
             ) from error
         file = f"graphs/{name}.onnx"
         (out / "graphs").mkdir(exist_ok=True)
+        name_by_module(exported.model)
         strip_notes(exported.model)
         exported.save(str(out / file), external_data=_weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
         return Graph(file, {"float32": 1.0}, self.opset)
@@ -104,6 +107,23 @@ class ExportOnnx(Transform):
                     f"allowed {self.tolerance:g}.",
                     "look for random numbers or in-place state in forward(), or raise --tolerance if you know why",
                 )
+
+
+def name_by_module(model: Any) -> None:
+    """Name every node after the torch module that it comes from, so that globs can choose layers.
+
+    ``blocks.0.mlp.fc1/MatMul``; a second node of that type in the module is ``blocks.0.mlp.fc1/MatMul_1``. What belongs
+    to no module keeps the exporter's name.
+    """
+    seen: Counter[str] = Counter()
+    for node in model.graph.all_nodes():
+        scopes = node.metadata_props.get("pkg.torch.onnx.name_scopes", "")
+        found = ast.literal_eval(scopes) if scopes.startswith("[") else []
+        if len(found) < 2 or not found[-2]:
+            continue
+        base = f"{found[-2]}/{node.op_type}"
+        node.name = base if not seen[base] else f"{base}_{seen[base]}"
+        seen[base] += 1
 
 
 def strip_notes(model: Any) -> None:

@@ -19,6 +19,8 @@ CONVOLUTIONS = {"Conv", "ConvInteger", "QLinearConv", "FusedConv"}
 OTHERS = {"Gemm", "QGemm", "ConvTranspose", "MatMulNBits", "Einsum", "Attention", "LSTM", "GRU", "RNN"}
 OPAQUE = {"FusedMatMul", "QAttention", "MultiHeadAttention", "GroupQueryAttention"}
 """They compute, but nothing here counts them: a graph that has one has an unknown layer, never a wrong sum."""
+MOVED = {"Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "MaxPool"}
+"""They move values and leave their precision as it is."""
 COMPUTE = MATMULS | CONVOLUTIONS | OTHERS | OPAQUE
 
 
@@ -32,11 +34,19 @@ def precision_of(node: Any, tensors: Tensors) -> str:
         return "int8"
     if node.op_type == "MatMulNBits":
         return f"int{tensors.attribute(node, 'bits', 4)}"
-    sources = [tensors.producer(name) for name in node.input[:2]]
+    sources = [_source(name, tensors) for name in node.input[:2]]
     if len(sources) == 2 and all(source is not None and source.op_type == "DequantizeLinear" for source in sources):
         stored = [tensors.dtype(source.input[0]) for source in sources if source is not None]
         return min((name.removeprefix("u") for name in stored), key=bits)
     return tensors.dtype(node.input[0])
+
+
+def _source(name: str, tensors: Tensors) -> Any:
+    """Return the node that gave a value before it was moved."""
+    node = tensors.producer(name)
+    while node is not None and node.op_type in MOVED:
+        node = tensors.producer(node.input[0])
+    return node
 
 
 def node_macs(node: Any, tensors: Tensors) -> int | None:

@@ -8,7 +8,8 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,15 +19,20 @@ from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, GraphError, RecipeError, VlatoolError, nearest, require
 from vlatool.finish import carry_over, finish
-from vlatool.manifest import Graph
+from vlatool.manifest import Graph, ProgramStep
+from vlatool.quantize._nodes import name_nodes
+from vlatool.quantize._phase import cut_phases
 from vlatool.quantize._precision import precision_shares
 from vlatool.stage import Context, Transform, source_of
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
-QuantizeGraph = Callable[[str, Path, Path], None]
+QuantizeGraph = Callable[[str, Path, Path], str | None]
+"""Graph name, original file, new file -> dtype of what is not quantized (float32 when None)."""
 QUANTIZED_OPS = ("MatMul", "Gemm", "Conv")
+FLOATS = ("float64", "float32", "float16")
+"""Precisions of a graph that is not quantized yet."""
 
 
 class Quantization(Transform):
@@ -34,10 +40,13 @@ class Quantization(Transform):
 
     include: tuple[str, ...] = Field((), description="globs of node names to quantize; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of node names to leave in float32")
+    parts: tuple[str, ...] = Field(
+        (), description="parts of the policy to quantize, as policy.yaml names them; all when empty"
+    )
     graphs: tuple[str, ...] = Field((), description="globs of graph names to quantize; all when empty")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """There is a graph to quantize, and every pattern for graphs matches one."""
+        """There is a graph to quantize, every pattern for graphs matches one, and none of them is quantized already."""
         if source is None:
             return
         if not source.manifest.graphs:
@@ -47,52 +56,130 @@ class Quantization(Transform):
         for pattern in self.graphs:
             if not fnmatch.filter(source.manifest.graphs, pattern):
                 raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.")
+        for name in self.chosen_graphs(source):
+            graph = source.manifest.graphs[name]
+            lower = [kind for kind in graph.precision if kind not in FLOATS] or [graph.compute]
+            if lower != ["float32"] and lower != [""]:
+                raise BundleError(
+                    f"The graph '{name}' of {source.path} is {' and '.join(lower)} already; {self.name()} starts from "
+                    "float32.",
+                    "quantize the float32 bundle that this one was made from, or leave the graph out with --graphs",
+                )
 
-    def transform(self, source: Bundle | None, out: Path, context: Context, quantize: QuantizeGraph) -> Bundle:
-        """Run ``quantize(graph name, original file, new file)`` on each selected graph and finish the bundle."""
+    def transform(
+        self,
+        source: Bundle | None,
+        out: Path,
+        context: Context,
+        quantize: QuantizeGraph,
+        engine: str = "",
+        made_by: dict[str, Any] | None = None,
+    ) -> Bundle:
+        """Run ``quantize(graph name, original file, new file)`` on each selected graph and finish the bundle.
+
+        A graph that shall compute in bfloat16 leaves its phases (see ``_phase``) to a float32 graph of its own.
+        """
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         (out / "graphs").mkdir()
-        made = {}
+        made: dict[str, Graph] = {}
+        program = bundle.manifest.program
         for number, (name, graph) in enumerate(bundle.manifest.graphs.items()):
             context.tell(f"quantizing {name}", number / len(bundle.manifest.graphs))
             original, target = bundle.file(graph.file), out / graph.file
-            selected = not self.graphs or any(fnmatch.fnmatch(name, pattern) for pattern in self.graphs)
-            with _foreign_errors(name):
+            selected = name in self.chosen_graphs(bundle)
+            compute: str | None = None
+            with foreign_errors(name):
                 if selected:
-                    quantize(name, original, target)
+                    compute = quantize(name, original, target)
                 else:
                     save(load(original), target)
+                if compute == "bfloat16":
+                    program, parted = part_phases(program, name, target)
+                    made.update({key: replace(part, opset=graph.opset) for key, part in parted.items()})
                 shares = precision_shares(target)
-            made[name] = Graph(graph.file, shares, graph.opset)
+            if compute:
+                shares = {compute if key == "float32" else key: share for key, share in shares.items()}
+            made[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
         context.tell("running the quantized graphs", None)
         observations = observations_for(bundle, 2)
-        return finish(bundle, out, made_by=self.made_by(), graphs=made, observations=observations)
+        changes = {"program": program, "engine": engine or bundle.manifest.engine}
+        told = made_by or self.made_by()
+        return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)
 
-    def excluded_nodes(self, model: Any, ops: tuple[str, ...], *, attention: bool = False) -> list[str]:
-        """Return the names of the nodes of those operators that must stay in float32.
+    def chosen_graphs(self, bundle: Bundle) -> list[str]:
+        """Return the names of the graphs that are quantized."""
+        names = bundle.manifest.graphs
+        return [name for name in names if not self.graphs or any(fnmatch.fnmatch(name, glob) for glob in self.graphs)]
 
-        Args:
-            model: An ``onnx.ModelProto``.
-            ops: Operator types that are quantized at all.
-            attention: Whether products of two activations are quantized too.
+    def selected(self, names: Iterable[str], bundle: Bundle) -> set[str]:
+        """Return which of those nodes are quantized, by include, exclude and parts.
+
+        A pattern is held against the whole name (``blocks.0.mlp.fc1/MatMul``) and against the module's
+        (``blocks.0.mlp.fc1``).
 
         Raises:
-            RecipeError: when a pattern matches no node, so that a typing error does not pass in silence.
+            RecipeError: when a pattern matches no node, or a part is unknown, so that a typing error does not pass in
+                silence; when no node is left.
         """
-        candidates = [node.name for node in model.graph.node if node.op_type in ops]
+        candidates = list(names)
+        if not candidates:
+            raise RecipeError(
+                f"No layer of {bundle.path} can be quantized by {self.name()}: it takes MatMul, Gemm and Conv with a "
+                "float32 weight.",
+                "look at --ops and --graphs, and at the precision of the graphs: vlatool inspect BUNDLE",
+            )
         for pattern in (*self.include, *self.exclude):
-            if not fnmatch.filter(candidates, pattern):
-                raise RecipeError(f"No {'/'.join(ops)} node matches '{pattern}'; {nearest(pattern, candidates[:12])}.")
-        constants = {tensor.name for tensor in model.graph.initializer}
-        weightless = {
-            node.name
-            for node in model.graph.node
-            if node.op_type in ("MatMul", "Gemm") and not attention and not constants.intersection(node.input)
-        }
-        kept = {name for name in candidates if not self.include or _any(name, self.include)} - weightless
-        return [name for name in candidates if name not in kept or _any(name, self.exclude)]
+            if not any(_any(name, (pattern,)) for name in candidates):
+                raise RecipeError(f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.")
+        parts = bundle.manifest.parts
+        for part in self.parts:
+            if part not in parts:
+                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.")
+        globs = tuple(pattern for part in self.parts for pattern in parts[part])
+        kept = {name for name in candidates if not self.include or _any(name, self.include)}
+        if self.parts:
+            kept = {name for name in kept if _any(name, globs)}
+        kept = {name for name in kept if not _any(name, self.exclude)}
+        if not kept:
+            raise RecipeError(
+                f"No layer is left to quantize: include, exclude and parts rule out all {len(candidates)}.",
+                f"widen them; the first layers are {', '.join(candidates[:3])}",
+            )
+        return kept
+
+
+def part_phases(
+    program: tuple[ProgramStep, ...], name: str, path: Path
+) -> tuple[tuple[ProgramStep, ...], dict[str, Graph]]:
+    """Move the phases of a graph into a file beside it; return the new program and the new graph.
+
+    Nothing changes when there is no phase that depends on an input, or when the graph runs in a loop, which a program
+    cannot share between two graphs.
+    """
+    steps = [step for step in program if step.graph == name]
+    if any(step.repeat > 1 for step in steps):
+        return program, {}
+    model = load(path)
+    cut = cut_phases(model)
+    if cut is None:
+        return program, {}
+    other = f"{name}_phases"
+    file = f"graphs/{other}.onnx"
+    save(model, path)
+    save(cut.model, path.parent / f"{other}.onnx")
+    values = {value: f"{other}.{value}" for value in cut.values}
+    found: list[ProgramStep] = []
+    for step in program:
+        if step.graph != name:
+            found.append(step)
+            continue
+        before = {key: getattr(step, key) for key in ("schedule", "noise", "keep")}
+        feeds = {key: step.feeds[key] for key in cut.kept}
+        found.append(ProgramStep(other, {key: step.feeds[key] for key in cut.inputs}, values, **before))
+        found.append(replace(step, feeds={**feeds, **values}, schedule={}, noise={}, keep={}))
+    return tuple(found), {other: Graph(file, {}, 0)}
 
 
 def quantization_library() -> Any:
@@ -107,9 +194,26 @@ def load(path: Path) -> Any:
     The dynamo exporter records the shape of a Gemm's weight before a transposition that the quantizer undoes; without
     ``value_info`` the shapes are inferred afresh.
     """
-    onnx = require("onnx", "build")
-    model = onnx.load(str(path))
+    model = read(path)
     del model.graph.value_info[:]
+    return model
+
+
+def read(path: Path, *, weights: bool = True) -> Any:
+    """Read an ONNX model, with a name of its own for every node.
+
+    Raises:
+        GraphError: when a file with its weights is missing.
+    """
+    onnx = require("onnx", "build")
+    try:
+        model = onnx.load(str(path), load_external_data=weights)
+    except (OSError, onnx.checker.ValidationError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+        raise GraphError(
+            f"The weights of {path} cannot be read: {reason}.", "put the file with its weights beside the graph"
+        ) from error
+    name_nodes(model)
     return model
 
 
@@ -141,7 +245,7 @@ def quiet_quantizer() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _foreign_errors(graph: str) -> Iterator[None]:
+def foreign_errors(graph: str) -> Iterator[None]:
     try:
         yield
     except (VlatoolError, OSError, MemoryError):
@@ -152,4 +256,5 @@ def _foreign_errors(graph: str) -> Iterator[None]:
 
 
 def _any(name: str, patterns: tuple[str, ...]) -> bool:
-    return any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
+    module = name.rpartition("/")[0] or name
+    return any(fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(module, pattern) for pattern in patterns)

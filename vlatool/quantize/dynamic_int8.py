@@ -8,8 +8,17 @@ from typing import ClassVar
 from pydantic import Field
 
 from vlatool.bundle import Bundle
-from vlatool.quantize._graphs import Quantization, load, quantization_library, quiet_quantizer, save
-from vlatool.stage import Context
+from vlatool.quantize._graphs import (
+    Quantization,
+    foreign_errors,
+    load,
+    quantization_library,
+    quiet_quantizer,
+    read,
+    save,
+)
+from vlatool.quantize._qdq import check_weights, find_layers
+from vlatool.stage import Context, source_of
 
 OPS = ("MatMul", "Gemm")
 
@@ -28,12 +37,25 @@ class DynamicInt8(Quantization):
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Quantize every selected graph."""
-        return self.transform(source, out, context, self._quantize)
+        bundle = source_of(source, self.name())
+        self.check(bundle, None)
+        layers: dict[str, list[str]] = {}
+        for name in self.chosen_graphs(bundle):
+            with foreign_errors(name):
+                model = read(bundle.file(bundle.manifest.graphs[name].file), weights=False)
+                layers[name] = [layer.name for layer in find_layers(model, OPS)]
+        kept = self.selected([layer for found in layers.values() for layer in found], bundle)
 
-    def _quantize(self, name: str, original: Path, target: Path) -> None:
+        def quantize(name: str, original: Path, target: Path) -> None:
+            self._quantize(original, target, kept.intersection(layers[name]))
+
+        return self.transform(bundle, out, context, quantize)
+
+    def _quantize(self, original: Path, target: Path, kept: set[str]) -> None:
         quantization = quantization_library()
         model = load(original)
-        excluded = self.excluded_nodes(model, OPS)
+        check_weights(model, [layer for layer in find_layers(model, OPS) if layer.name in kept])
+        excluded = [node.name for node in model.graph.node if node.op_type in OPS and node.name not in kept]
         with quiet_quantizer() as scratch:
             quantization.quantize_dynamic(
                 model,

@@ -59,6 +59,7 @@ th{font-weight:560}
 thead th{font-size:12.5px;color:var(--muted);border-bottom-color:var(--muted);vertical-align:bottom}
 tbody th{font-weight:560}
 th.n,td.n{text-align:right;padding:7px 0 7px 16px}
+th.n+th:not(.n),td.n+td:not(.n){padding-left:16px}
 td.n>span:first-child{white-space:nowrap}
 .aside{display:block;font-size:12px;line-height:1.4;color:var(--muted);font-weight:400}
 .aside b{font-weight:400;white-space:nowrap}

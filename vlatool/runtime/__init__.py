@@ -16,7 +16,7 @@ __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 def load(
     path: str | os.PathLike[str],
     *,
-    engine: str = "ort_cpu",
+    engine: str = "",
     threads: int | None = None,
     seed: int | None = None,
     warmup: int = 2,
@@ -26,7 +26,7 @@ def load(
 
     Args:
         path: The bundle directory.
-        engine: Name of an engine, see ``vlatool doctor``.
+        engine: Name of an engine, see ``vlatool doctor``; the one that the bundle was made for when empty.
         threads: Intra-op threads of the engine; the cores that this process may use when None.
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).

@@ -20,6 +20,7 @@ from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
 from vlatool.spec import PolicySpec, TensorSpec
 
+DEFAULT_ENGINE = "ort_cpu"
 Array = NDArray[Any]
 
 
@@ -59,16 +60,15 @@ class Policy:
         self.golden_error: float | None = None
 
     @classmethod
-    def open(
-        cls, bundle: Bundle, *, engine: str = "ort_cpu", threads: int | None = None, seed: int | None = None
-    ) -> Policy:
+    def open(cls, bundle: Bundle, *, engine: str = "", threads: int | None = None, seed: int | None = None) -> Policy:
         """Open every graph of a verified bundle; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
             raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+        engine = engine or manifest.engine or DEFAULT_ENGINE
         session = registry.load("engines", engine)
         sessions: dict[str, Session] = {
-            name: session(bundle.file(graph.file), threads) for name, graph in manifest.graphs.items()
+            name: session(bundle.file(graph.file), threads, graph.compute) for name, graph in manifest.graphs.items()
         }
         return cls(bundle, Program(manifest.program, sessions, seed), engine)
 

@@ -14,7 +14,7 @@ from vlatool.samples._observations import observations
 from vlatool.samples._words import vocabulary
 from vlatool.spec import PolicySpec
 
-COUNTS = {"calibration": 16, "evaluation": 8}
+COUNTS = {"calibration": 48, "evaluation": 12}
 
 
 def write_sample(name: str, out: Path, seed: int = 0) -> None:

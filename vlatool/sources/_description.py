@@ -16,7 +16,7 @@ from vlatool.spec import PolicySpec
 FILE = "policy.yaml"
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
-    "parts", "calibration", "evaluation",
+    "parts", "calibration", "evaluation", "weights",
 )  # fmt: skip
 
 
@@ -32,6 +32,8 @@ class Description:
         environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation.
         parts: Part name -> globs of module names.
         calibration, evaluation: Recorded observations, or None.
+        weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
+            module alone. Empty when the factory loads the weights.
     """
 
     folder: Path
@@ -47,6 +49,7 @@ class Description:
     evaluation: Path | None = None
     description: str = ""
     license: str = ""
+    weights: str = ""
 
     def assets(self) -> set[str]:
         """Files, relative to the folder, that the spec needs on the robot."""
@@ -92,7 +95,15 @@ def read_description(path: Path) -> Description:
         evaluation=_data_file(file, data, "evaluation"),
         description=str(data.get("description", "")),
         license=str(data.get("license", "")),
+        weights=_weights(file, data.get("weights", "")),
     )
+
+
+def _weights(file: Path, pattern: Any) -> str:
+    """A glob inside the policy's folder."""
+    if not isinstance(pattern, str) or pattern.startswith("/") or ".." in pattern.split("/"):
+        raise SourceError(f"{file}: 'weights' must be a glob inside the folder, as \"*.safetensors\"; got {pattern!r}.")
+    return pattern
 
 
 def write_location(out: Path, folder: Path) -> None:

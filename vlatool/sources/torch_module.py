@@ -13,6 +13,7 @@ from vlatool.errors import SourceError
 from vlatool.manifest import Manifest
 from vlatool.sources._description import Description, read_description, write_location
 from vlatool.sources._factory import factory_file, split_factory
+from vlatool.sources._shards import fingerprint, sampled_hash, shard_files
 from vlatool.stage import Context, Transform
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ class TorchModule(Transform):
 
     def key(self, source_hash: str) -> str:
         """The bundle notes where the code is, so the place belongs to the key."""
-        return super().key(str(read_description(self.policy).folder.resolve()))
+        described = read_description(self.policy)
+        return super().key(f"{described.folder.resolve()} {_shards(described)}")
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the spec, the assets and the recorded data."""
@@ -60,7 +62,7 @@ class TorchModule(Transform):
             spec=described.spec,
             program=described.program,
             made_by={**self.made_by(), "options": {}},
-            source={"factory": factory, "arguments": described.arguments, "code": code},
+            source={"factory": factory, "arguments": described.arguments, "code": code, **_weights(described)},
             environment=described.environment,
             parts=described.parts,
             description=described.description,
@@ -85,7 +87,20 @@ class TorchModule(Transform):
         path = factory_file(self._factory(described), described.folder)
         if path is None:
             return []
-        return sorted({found for pattern in CODE for found in path.parent.glob(pattern)})
+        shards = set(described.folder.resolve().glob(described.weights)) if described.weights else set()
+        return sorted({found for pattern in CODE for found in path.parent.glob(pattern)} - shards)
+
+
+def _shards(described: Description) -> str:
+    """Return a fingerprint of the shards that vlatool itself loads, with their times of change."""
+    return fingerprint(shard_files(described.folder, described.weights)) if described.weights else ""
+
+
+def _weights(described: Description) -> dict[str, str]:
+    """Return what the manifest says of such shards."""
+    if not described.weights:
+        return {}
+    return {"weights": described.weights, "shards": sampled_hash(shard_files(described.folder, described.weights))}
 
 
 def copy_assets(described: Description, out: Path) -> None:

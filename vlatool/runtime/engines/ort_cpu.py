@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,20 +35,24 @@ class OrtCpuSession:
     Args:
         path: The ONNX file; external data is found beside it.
         threads: Intra-op threads; the cores that this process may use when None.
+        compute: ``float32`` or empty.
 
     Raises:
-        GraphError: when ONNX Runtime refuses the file, or opened it on another provider.
+        GraphError: when ONNX Runtime refuses the file, opened it on another provider, or shall compute in another
+            dtype: it has no other one.
         MissingExtra: when onnxruntime is not installed.
     """
 
-    def __init__(self, path: Path, threads: int | None = None) -> None:
+    def __init__(self, path: Path, threads: int | None = None, compute: str = "") -> None:
         ort = require("onnxruntime", "ort")
+        if compute not in ("", "float32"):
+            raise GraphError(f"ONNX Runtime on the CPU does not compute in {compute}.", "use the engine openvino")
         options = ort.SessionOptions()
         options.log_severity_level = 3
         options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
         options.inter_op_num_threads = 1
         try:
-            self._session = ort.InferenceSession(str(path), options, providers=[PROVIDER], enable_fallback=0)
+            self._session = _open(ort, path, options)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
             raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}") from error
         self._session.disable_fallback()
@@ -137,6 +142,21 @@ def _buffer(node: Any) -> Array | None:
     if 0 in node.shape or int(np.prod(node.shape)) * dtype.itemsize > SMALL:
         return None
     return np.zeros(node.shape, dtype)
+
+
+def _open(ort: Any, path: Path, options: Any) -> Any:
+    """Open a session; without the rewriting of QDQ pairs where that breaks the graph.
+
+    ONNX Runtime (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such
+    type. The first error is the one that is told.
+    """
+    try:
+        return ort.InferenceSession(str(path), options, providers=[PROVIDER], enable_fallback=0)
+    except Exception:
+        options.add_session_config_entry("session.disable_quant_qdq", "1")
+        with contextlib.suppress(Exception):
+            return ort.InferenceSession(str(path), options, providers=[PROVIDER], enable_fallback=0)
+        raise
 
 
 def _first_line(error: Exception) -> str:

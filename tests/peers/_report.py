@@ -1,0 +1,176 @@
+"""Rows -> the table, the checks, JSON and Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _interleave import CLOCKS, Contestant
+
+from vlatool.statistics import quantile_interval
+
+TOLERANCE = 0.02
+"""Share of the latency within which two contestants count as equally fast."""
+BUDGET = 0.04
+TARGET = 3.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the verdict."""
+
+    passed: bool
+    text: str
+
+    def __str__(self) -> str:
+        return f"{'PASS' if self.passed else 'FAIL'} {self.text}"
+
+
+class Table:
+    """The rows of one workload, compared by one clock.
+
+    Args:
+        workload: Its name.
+        rows: All contestants, failed ones too.
+        clock: ``cpu`` or ``wall``.
+    """
+
+    def __init__(self, workload: str, rows: Sequence[Contestant], clock: str) -> None:
+        self.workload, self.clock = workload, clock
+        self.failed = [row for row in rows if row.failed]
+        measured = [row for row in rows if not row.failed]
+        self.rows = sorted(measured, key=lambda row: -self.speedup(row)[0])
+
+    def p50(self, row: Contestant, clock: str = "") -> float:
+        """Return the median milliseconds."""
+        return float(np.median(row.rounds[clock or self.clock]))
+
+    def speedup(self, row: Contestant, clock: str = "") -> tuple[float, float | None, float | None]:
+        """Return the reference's median over the row's, within a round: median over the rounds and its interval."""
+        clock = clock or self.clock
+        ratios = np.asarray(row.reference[clock]) / np.asarray(row.rounds[clock])
+        _, low, high = quantile_interval(ratios, 0.5)
+        return float(np.median(ratios)), low, high
+
+    def relative(self, row: Contestant, other: Contestant) -> float:
+        """Return the latency of a row over that of another, within rounds where both took turns."""
+        if row.group == other.group:
+            pairs = zip(row.rounds[self.clock], other.rounds[self.clock], strict=True)
+            return float(np.median([own / theirs for own, theirs in pairs]))
+        return self.speedup(other)[0] / self.speedup(row)[0]
+
+    def dominates(self, row: Contestant, other: Contestant) -> bool:
+        """Say whether a row is faster by more than the tolerance and at most as wrong."""
+        return row.error <= other.error and self.relative(row, other) < 1 - TOLERANCE
+
+    def dominated_by(self, row: Contestant) -> Contestant | None:
+        """Return the fastest of the other side that dominates the row."""
+        return next((other for other in self.rows if other.ours != row.ours and self.dominates(other, row)), None)
+
+    def frontier(self) -> list[Contestant]:
+        """Return our rows that none of ours makes needless: less wrong and, within the tolerance, as fast."""
+        ours = [row for row in self.rows if row.ours]
+
+        def needless(row: Contestant) -> bool:
+            return any(
+                (other.error, self.p50(other), other.name) < (row.error, self.p50(row), row.name)
+                and self.relative(other, row) <= 1 + TOLERANCE
+                for other in ours
+            )
+
+        return [row for row in ours if not needless(row)]
+
+    def uncovered(self) -> list[Contestant]:
+        """Return the peers' rows that none of ours equals in both latency (within the tolerance) and error."""
+        ours = [row for row in self.rows if row.ours]
+
+        def covered(peer: Contestant) -> bool:
+            return any(own.error <= peer.error and self.relative(own, peer) <= 1 + TOLERANCE for own in ours)
+
+        return [row for row in self.rows if not row.ours and not covered(row)]
+
+    def told(self, row: Contestant) -> str:
+        """Return a row in short."""
+        return f"'{row.name}' ({interval(self.speedup(row))}, error {row.error:.4f})"
+
+    def checks(self) -> list[Check]:
+        """Return the verdict."""
+        ours = [row for row in self.rows if row.ours]
+        peers = [row for row in self.rows if not row.ours]
+        if not ours or not peers:
+            return [Check(False, "nothing to compare: there are no figures of both sides")]
+        return [self._check_domination(), self._check_budget(ours), self._check_fastest(ours[0], peers[0])]
+
+    def _check_domination(self) -> Check:
+        frontier = self.frontier()
+        beaten = [(row, by) for row in frontier if (by := self.dominated_by(row)) is not None]
+        names = ", ".join(f"'{row.name}'" for row in frontier)
+        if not beaten:
+            return Check(True, f"(a) no peer dominates a point of our frontier: {names}")
+        lines = [f"{self.told(row)} is dominated by {self.told(by)}" for row, by in beaten]
+        return Check(False, "(a) " + "; ".join(lines))
+
+    def _check_budget(self, ours: Sequence[Contestant]) -> Check:
+        inside = [row for row in ours if row.error <= BUDGET]
+        if not inside:
+            return Check(False, f"(b) none of ours has an error of at most {BUDGET}")
+        reached = self.speedup(inside[0])[0] >= TARGET
+        return Check(reached, f"(b) our fastest at error <= {BUDGET}: {self.told(inside[0])}; wanted {TARGET:g}x")
+
+    def _check_fastest(self, own: Contestant, peer: Contestant) -> Check:
+        ratio = self.relative(own, peer)
+        text = f"(c) our fastest {self.told(own)} takes {ratio:.3f} of the time of the fastest peer {self.told(peer)}"
+        return Check(ratio <= 1 + TOLERANCE, text)
+
+    def lines(self) -> list[str]:
+        """Return the table in Markdown."""
+        head = ("config", "CPU p50 ms", "wall p50 ms", "speed-up (CPU)", "speed-up (wall)", "error", "peak MB")
+        found = ["| " + " | ".join((*head, "dominated by")) + " |", "|" + "---|" * (len(head) + 1)]
+        for row in self.rows:
+            by = self.dominated_by(row)
+            cells = [
+                f"**{row.name}**" if row.ours else row.name,
+                *(f"{self.p50(row, clock):.2f}" for clock in CLOCKS),
+                *(interval(self.speedup(row, clock)) for clock in CLOCKS),
+                f"{row.error:.4f}",
+                f"{row.peak_mb:.0f}",
+                by.name if by else "",
+            ]
+            found.append("| " + " | ".join(cells) + " |")
+        empty = " | " * 6
+        found += [f"| {row.name} | failed: {row.failed.replace('|', '/')}{empty}|" for row in self.failed]
+        return found
+
+
+def interval(value: tuple[float, float | None, float | None]) -> str:
+    """Return a ratio with its interval."""
+    middle, low, high = value
+    return f"{middle:.2f}x" + (f" ({low:.2f}-{high:.2f})" if low is not None and high is not None else "")
+
+
+def markdown(table: Table) -> str:
+    """Return the section of one workload."""
+    lines = [f"### {table.workload}", "", *table.lines(), ""]
+    lines += [f"- {check}" for check in table.checks()]
+    if uncovered := table.uncovered():
+        told = ", ".join(table.told(row) for row in uncovered)
+        lines.append(f"- peers that none of ours equals in both latency and error: {told}")
+    return "\n".join(lines) + "\n"
+
+
+def save(path: Path, rows: Sequence[Contestant], about: dict[str, Any]) -> None:
+    """Write everything that was measured."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {**about, "rows": [asdict(row) for row in rows]}
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def read(path: Path) -> tuple[list[Contestant], dict[str, Any]]:
+    """Return what ``save`` wrote."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    rows = [Contestant(**row) for row in content.pop("rows")]
+    return rows, content

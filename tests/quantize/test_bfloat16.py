@@ -1,0 +1,75 @@
+"""bfloat16 through OpenVINO: what the processor can, and a named refusal where it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import onnx
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.errors import BundleError, GraphError
+from vlatool.quantize.bfloat16 import Bfloat16
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime import load
+
+
+def computes_bfloat16() -> bool:
+    import openvino
+
+    return "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
+@pytest.fixture
+def halved(quantized: Callable[..., Bundle]) -> Bundle:
+    if not computes_bfloat16():
+        with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this processor; wanted bf16"):
+            quantized(Bfloat16())
+        pytest.skip("this processor has no bfloat16; it was refused by name")
+    return quantized(Bfloat16())
+
+
+def test_the_policy_stays_near_float(halved: Bundle, drift: Callable[..., float]) -> None:
+    assert 1e-5 < drift(halved) < 0.05
+    assert load(halved.path, threads=1).engine == "openvino"
+
+
+def test_the_bundle_says_what_it_computes_in(halved: Bundle, float_bundle: Bundle) -> None:
+    manifest = Bundle.open(halved.path).manifest
+    assert manifest.engine == "openvino"
+    assert {name: (graph.compute, graph.precision) for name, graph in manifest.graphs.items()} == {
+        "main": ("bfloat16", {"bfloat16": 1.0})
+    }
+    assert manifest.parent == float_bundle.hash
+    assert set(manifest.made_by["versions"]) == {*Bfloat16.packages}
+    assert manifest.program == float_bundle.manifest.program
+
+
+def test_the_weights_are_stored_as_they_were(halved: Bundle, float_bundle: Bundle) -> None:
+    stored, before = (onnx.load(each.path / "graphs/main.onnx") for each in (halved, float_bundle))
+    assert {tensor.name: tensor.raw_data for tensor in stored.graph.initializer} == {
+        tensor.name: tensor.raw_data for tensor in before.graph.initializer
+    }
+
+
+def test_another_engine_refuses_it(halved: Bundle) -> None:
+    with pytest.raises(GraphError, match="ONNX Runtime on the CPU does not compute in bfloat16") as caught:
+        load(halved.path, engine="ort_cpu")
+    assert caught.value.fix == "use the engine openvino"
+
+
+def test_equal_inputs_give_equal_graphs(halved: Bundle, quantized: Callable[..., Bundle]) -> None:
+    names = [name for name in halved.manifest.files if name.startswith("graphs/")]
+    again = quantized(Bfloat16())
+    assert [halved.manifest.files[name] for name in names] == [again.manifest.files[name] for name in names]
+
+
+def test_what_is_lower_already_is_refused(
+    halved: Bundle, int8_bundle: Bundle, quantized: Callable[..., Bundle], tmp_path: Path
+) -> None:
+    for bundle, kind in ((int8_bundle, "int8"), (halved, "bfloat16")):
+        for stage in (Bfloat16(), StaticInt8()):
+            with pytest.raises(BundleError, match=f"The graph 'main' of .* is {kind} already") as caught:
+                stage.check(bundle, None)
+            assert "quantize the float32 bundle" in caught.value.fix

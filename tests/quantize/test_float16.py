@@ -1,0 +1,231 @@
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+
+from vlatool.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.errors import DataError, RecipeError
+from vlatool.quantize._beyond import find_beyond
+from vlatool.quantize._float16_graph import around, look_at_weights, phase_nodes, to_float16
+from vlatool.quantize._graphs import load, save
+from vlatool.quantize.float16 import Float16
+from vlatool.stage import Context
+
+HALF, FLOAT = TensorProto.FLOAT16, TensorProto.FLOAT
+
+
+def node(kind: str, inputs: str, output: str, **attributes):
+    return helper.make_node(kind, inputs.split(), output.split(), name=f"{output}/{kind}", **attributes)
+
+
+def model_of(nodes: list, constants: dict[str, np.ndarray], outputs: tuple[str, ...] = ("y",)):
+    made = helper.make_graph(
+        nodes,
+        "g",
+        [helper.make_tensor_value_info("x", FLOAT, [2, 4])],
+        [helper.make_tensor_value_info(name, FLOAT, [2, 4]) for name in outputs],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def run(model, x: np.ndarray) -> list[np.ndarray]:
+    """Compute in the types that the graph says; ONNX Runtime's processor kernels compute in float32 instead."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return ReferenceEvaluator(model).run(None, {"x": x})
+
+
+def types_of(model) -> dict[str, int]:
+    inferred = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
+    return {value.name: value.type.tensor_type.elem_type for value in (*inferred.value_info, *inferred.output)}
+
+
+def phases():
+    """sin and cos of a large phase that depends on the input, multiplied into a product."""
+    constants = {"w": np.eye(4, dtype=np.float32), "f": np.full(4, 700, np.float32), "b": np.full(4, 0.3, np.float32)}
+    nodes = [
+        node("Mul", "x f", "p"),
+        node("Add", "p b", "q"),
+        node("Sin", "q", "s"),
+        node("Cos", "q", "c"),
+        node("MatMul", "x w", "m"),
+        node("Mul", "m s", "a"),
+        node("Add", "a b", "d"),
+        node("Mul", "d c", "y"),
+    ]
+    return model_of(nodes, constants)
+
+
+@pytest.fixture(scope="module")
+def half(float_bundle, tmp_path_factory) -> Bundle:
+    """The tiny policy in float16; read only."""
+    out = tmp_path_factory.mktemp("half") / "bundle"
+    out.mkdir()
+    return Float16(samples=8).run(float_bundle, out, Context())
+
+
+def test_the_policy_runs_in_float16_near_float32(half, drift):
+    assert Bundle.open(half.path) == half
+    assert 0 < drift(half) < 3e-3
+    assert half.manifest.graphs["main"].precision == {"float16": 1.0}
+    assert half.manifest.made_by["calibration"]["samples"] == 8
+    assert half.manifest.made_by["float16"]["beyond"] == []
+    assert "nodes stay float32" in Float16().lines(half)[0]
+
+
+def test_inputs_and_outputs_keep_their_types_and_the_file_halves(half, float_bundle):
+    models = [onnx.load(bundle.path / "graphs/main.onnx") for bundle in (float_bundle, half)]
+    before, after = ([v.type.tensor_type.elem_type for v in (*m.graph.input, *m.graph.output)] for m in models)
+    assert before == after
+    sizes = [sum(len(tensor.raw_data) for tensor in model.graph.initializer) for model in models]
+    assert sizes[1] < 0.55 * sizes[0]
+    onnx.checker.check_model(models[1], full_check=True)
+
+
+def test_equal_inputs_give_equal_bytes(quantized, half):
+    assert quantized(Float16(samples=8)).hash == half.hash
+
+
+def test_excluded_nodes_and_other_parts_stay_in_float32(quantized, drift):
+    kept = quantized(Float16(samples=2, exclude=("blocks.0.mlp*",)))
+    shares = kept.manifest.graphs["main"].precision
+    assert 0.2 < shares["float32"] < 0.8
+    assert drift(kept) < 3e-3
+    part = quantized(Float16(samples=2, parts=("head",)))
+    assert 0 < part.manifest.graphs["main"].precision["float16"] < 0.1
+    with pytest.raises(RecipeError, match="No node matches"):
+        quantized(Float16(samples=2, include=("nothing",)))
+
+
+def test_a_quantized_bundle_is_refused(int8_bundle):
+    with pytest.raises(Exception, match="int8"):
+        Float16().check(int8_bundle, None)
+    Float16().check(None, None)
+
+
+def test_phases_are_computed_in_float32():
+    model = phases()
+    x = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
+    (wanted,) = run(model, x)
+    kept = phase_nodes(model)
+    assert kept == {"p/Mul", "q/Add", "s/Sin", "c/Cos"}
+    careless = to_float16(phases(), set())
+    careful = to_float16(phases(), kept)
+    assert np.abs(run(careless, x)[0] - wanted).max() > 0.05
+    assert np.abs(run(careful, x)[0] - wanted).max() < 5e-3
+    types = types_of(careful)
+    assert {types[name] for name in ("p", "q")} == {FLOAT}
+    assert types["m"] == HALF
+    onnx.checker.check_model(careful, full_check=True)
+
+
+def test_constants_that_kept_nodes_share_are_not_rounded():
+    model = to_float16(phases(), phase_nodes(phases()))
+    kinds = {tensor.name: tensor.data_type for tensor in model.graph.initializer}
+    assert kinds == {"w": HALF, "f": FLOAT, "b": HALF, "b.float32": FLOAT}
+
+
+def test_what_leads_to_an_index_stays_in_float32():
+    nodes = [
+        node("Mul", "x k", "s"),
+        node("Cast", "s", "i", to=TensorProto.INT64),
+        node("Cast", "i", "y", to=FLOAT),
+    ]
+    model = model_of(nodes, {"k": np.array(3000.7, np.float32)})
+    assert phase_nodes(model) == {"s/Mul", "i/Cast"}
+
+
+def test_large_values_and_outputs_of_kept_nodes_pass_in_float32():
+    constants = {"big": np.array(1e5, np.float32), "small": np.array(1e-5, np.float32)}
+    nodes = [node("Mul", "x big", "l"), node("Mul", "l small", "y"), node("Abs", "l", "z")]
+    model = model_of(nodes, constants, ("y", "z"))
+    x = np.full((2, 4), 3, np.float32)
+    wanted = run(model, x)
+    assert not np.isfinite(run(to_float16(model_of(nodes, constants, ("y", "z")), set()), x)[1]).all()
+    kept = around(model, ["l"])
+    assert kept == {"l/Mul", "y/Mul", "z/Abs"}
+    converted = to_float16(model, kept)
+    for got, value in zip(run(converted, x), wanted, strict=True):
+        np.testing.assert_array_equal(got, value)
+    assert "Cast" not in {each.op_type for each in converted.graph.node}
+
+
+def test_weights_beyond_float16_keep_their_nodes_and_small_ones_are_counted():
+    w = np.eye(4, dtype=np.float32)
+    w[0, 0], w[1, 2], w[2, 3] = 1e5, 1e-6, 1e-9
+    model = model_of([node("MatMul", "x w", "m"), node("Add", "m s", "y")], {"w": w, "s": np.float32([1, 0, 1e-6, 0])})
+    found = look_at_weights(model, set())
+    assert found.beyond == ("m/MatMul",)
+    assert found.subnormal == 1
+    assert look_at_weights(model, {"m/MatMul", "y/Add"}).subnormal == 0
+
+
+def test_infinite_constants_are_no_reason_to_stay():
+    mask = np.float32([0, -np.inf, 0, 0])
+    model = model_of([node("Add", "x mask", "m"), node("Softmax", "m", "y")], {"mask": mask})
+    assert look_at_weights(model, set()).beyond == ()
+    (got,) = run(to_float16(model, set()), np.zeros((2, 4), np.float32))
+    np.testing.assert_allclose(got, np.float32([[1 / 3, 0, 1 / 3, 1 / 3]] * 2), atol=1e-3)
+
+
+def large_values(bundle: Bundle) -> None:
+    """Let the mlp's first product be a million times as large and its second undo that, through a Relu-free path."""
+    path = bundle.path / "graphs/main.onnx"
+    model = load(path)
+    constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    last = next(each for each in model.graph.node if each.name.startswith("head/"))
+    for position, factor in ((1, 1e6), (2, 1e6)):
+        tensor = constants[last.input[position]]
+        tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor) * np.float32(factor), tensor.name))
+    result = last.output[0]
+    for each in model.graph.node:
+        for place, name in enumerate(each.input):
+            if name == result:
+                each.input[place] = f"{result}.back"
+    index = [each.name for each in model.graph.node].index(last.name)
+    model.graph.initializer.append(numpy_helper.from_array(np.array(1e-6, np.float32), "back"))
+    model.graph.node.insert(index + 1, helper.make_node("Mul", [result, "back"], [f"{result}.back"], name="back/Mul"))
+    path.unlink()
+    save(model, path)
+
+
+def test_values_beyond_float16_are_named_and_stay_in_float32(float_bundle, copied, resealed, quantized, drift):
+    bundle = copied(float_bundle)
+    large_values(bundle)
+    bundle = resealed(bundle)
+    told: list[str] = []
+    observations = recorded_observations(bundle, 4)
+    found = find_beyond(bundle, ["main"], observations, 65504.0, Context())["main"]
+    assert len(found) >= 1
+    assert {each.sample for each in found.values()} == {0}
+    out = bundle.path.with_name("half")
+    out.mkdir()
+    half = Float16(samples=4).run(bundle, out, Context(tell=lambda what, _share: told.append(what)))
+    assert drift(half) < 3e-3
+    (first, *_) = half.manifest.made_by["float16"]["beyond"]
+    assert first["graph"] == "main"
+    assert first["value"] in found
+    assert first["largest"] > 65504
+    assert any(f"{first['value']} reaches" in what for what in told)
+    assert any("beyond float16" in line for line in Float16().lines(half))
+    assert half.manifest.graphs["main"].precision["float32"] > 0
+
+
+def test_a_sample_that_does_not_fit_is_named(float_bundle):
+    observations = recorded_observations(float_bundle, 2)
+    observations[1]["proprio"] = np.zeros(5, np.float32)
+    with pytest.raises(DataError, match="Calibration sample 1"):
+        find_beyond(float_bundle, ["main"], observations, 1.0, Context())
+
+
+def test_the_calibration_file_is_an_input(tmp_path: Path):
+    assert Float16().inputs() == ()
+    assert Float16(calibration=tmp_path / "c.npz").inputs() == (tmp_path / "c.npz",)

@@ -1,0 +1,150 @@
+"""The search: variants, mixed plans, resuming, and what it never does."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.judge import Budget
+from vlatool.launch import cached_transform
+from vlatool.profile import load_profile
+from vlatool.quantize._sensitivity import LayerError
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.recipe import Limits
+from vlatool.search import Search, Trial, built, has_bfloat16, variants_for
+from vlatool.stage import Context
+
+BAD = ({"quantize.static_int8": {"samples": 1, "method": "percentile", "percentile": 60, "per_channel": False}},)
+
+
+@pytest.fixture
+def search(float_bundle, tmp_path):
+    def start(profile: str | None = "raspberry-pi-5", **limits) -> Search:
+        given = limits or {"metric": "relative_error", "max_metric": 0.1}
+        return Search(float_bundle, Limits(**given), load_profile(profile) if profile else None, tmp_path, Context())
+
+    return start
+
+
+def test_a_board_with_onnx_runtime_alone_gets_its_variants() -> None:
+    assert set(variants_for(load_profile("raspberry-pi-5"), calibrated=True)) == {
+        "dynamic_int8",
+        "static_int8",
+        "static_int8_mse",
+    }
+    assert set(variants_for(load_profile("raspberry-pi-5"), calibrated=False)) == {"dynamic_int8"}
+
+
+def test_bfloat16_is_tried_only_where_the_processor_has_it() -> None:
+    nuc = variants_for(load_profile("intel-nuc-13-pro"), calibrated=True)
+    assert "openvino_int8" in nuc
+    assert "openvino_bf16" not in nuc
+    assert not has_bfloat16(load_profile("intel-nuc-13-pro"))
+
+
+def test_every_variant_can_be_built_as_stages() -> None:
+    for stages in variants_for(None, calibrated=True).values():
+        assert len(built(stages)) == 1
+
+
+def test_every_plan_is_tried_and_the_fastest_inside_join(search) -> None:
+    run = search(metric="relative_error", max_metric=0.5)
+    found = run.run({"static_int8": ({"quantize.static_int8": {}},)})
+    assert {trial.name for trial in run.trials} >= {"static_int8", "static_int8_mse", "dynamic_int8"}
+    assert all(trial.speedup > 0 and math.isfinite(trial.error) for trial in run.trials)
+    assert "static_int8" not in found
+    table = run.tables()["Plans tried by the search"]
+    assert len(table) == len(run.trials)
+
+
+def test_a_plan_that_cannot_be_made_is_a_trial_that_says_why(search) -> None:
+    run = search()
+    trial = run._try("lost", ({"quantize.static_int8": {"include": ["nothing_like_it"]}},))
+    assert trial.speedup == 0
+    assert "nothing_like_it" in trial.note
+    assert not trial.within
+
+
+@pytest.mark.filterwarnings("ignore:ranges from")
+def test_a_bad_plan_is_mended_by_leaving_layers_in_float(search) -> None:
+    run = search(metric="relative_error", max_metric=1.0)
+    bad = run._try("bad", BAD)
+    assert bad.error > 0.02
+    run.budget = Budget("relative_error", 0.6 * bad.error)
+    run._mix(bad, built(BAD)[-1])
+    mixed = [trial for trial in run.trials if "mixed" in trial.name]
+    assert mixed
+    assert min(trial.error for trial in mixed) < bad.error
+    assert any(trial.within for trial in mixed)
+    assert all("exclude" in trial.stages[-1]["quantize.static_int8"] for trial in mixed)
+
+
+def test_when_nothing_is_inside_the_most_accurate_plan_stays(search) -> None:
+    run = search(metric="relative_error", max_metric=0.0)
+    found = run.run({})
+    assert len(found) == 1
+    least = min((trial for trial in run.trials if trial.speedup), key=lambda trial: trial.error)
+    assert list(found) == [least.name]
+
+
+def test_a_second_search_makes_and_measures_nothing_again(search, tmp_path) -> None:
+    search().run({})
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").iterdir()}
+    search().run({})
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").iterdir()} == before
+
+
+def test_an_interrupted_search_goes_on_where_it_was(search, tmp_path) -> None:
+    first = search()
+    told: list[str] = []
+
+    def stop(what: str, share: float | None) -> None:
+        told.append(what)
+        if "plan 2" in what:
+            raise KeyboardInterrupt
+
+    first.context = Context(stop)
+    with pytest.raises(KeyboardInterrupt):
+        first.run({})
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").iterdir()}
+    assert kept
+    search().run({})
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert "of at most" in told[0]
+
+
+def test_the_estimate_leaves_out_as_many_layers_as_independent_errors_need(search) -> None:
+    run = search()
+    run.budget = Budget("relative_error", 0.05)
+    layers = [
+        LayerError(str(index), "main", error, {}, 0.0, 0.0, 0.1) for index, error in enumerate((0.09, 0.03, 0.03))
+    ]
+    assert run._estimate(layers, 0.1) == 1
+    assert run._estimate(layers, 0.05) == 1
+    assert run._estimate(layers, 10.0) == 3
+
+
+def test_finalists_are_the_fastest_inside_and_the_most_accurate(search) -> None:
+    run = search()
+    run.trials = [
+        Trial("a", BAD, 4.0, 0.04, True),
+        Trial("b", BAD, 3.9, 0.03, True),
+        Trial("c", BAD, 5.0, 0.09, False),
+        Trial("d", BAD, 1.5, 0.01, True),
+        Trial("e", BAD, 0.5, 0.001, True),
+    ]
+    assert [trial.name for trial in run._finalists()] == ["a", "b"]
+    run.trials.pop()
+    assert [trial.name for trial in run._finalists()] == ["a", "b", "d"]
+
+
+def test_the_plan_of_a_trial_makes_the_bundle_that_was_tried(search, float_bundle: Bundle, tmp_path: Path) -> None:
+    run = search(metric="relative_error", max_metric=0.5)
+    trial = run._try("static_int8", ({"quantize.static_int8": {"samples": 8}},))
+    stage = built(trial.stages)[-1]
+    assert isinstance(stage, StaticInt8)
+    made = cached_transform(stage, float_bundle, tmp_path, Context())
+    assert run._error(made, Context()) == trial.error

@@ -1,0 +1,40 @@
+"""``vlatool explain``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlatool.bundle import Bundle
+from vlatool.cli._console import progress, refuse_existing, show
+
+
+def explain(
+    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False)],
+    baseline: Annotated[
+        Path | None, typer.Option(help="float32 bundle that it was made from; looked for in the cache when not given")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="recorded observations to take errors on; the bundle's own when not given")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="observations at most, spread over the recording")] = 16,
+    threads: Annotated[int, typer.Option(min=1, help="intra-op threads")] = 1,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="the layers are measured on fewer observations when all would take longer")
+    ] = 300.0,
+    suggest: Annotated[bool, typer.Option(help="make and measure what could be done about it")] = True,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Say which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
+    from vlatool.explain import Options
+    from vlatool.explain import explain as found_out
+
+    refuse_existing(output, force)
+    with progress() as context:
+        options = Options(baseline, data, samples, threads=threads, suggest=suggest, seconds=seconds)
+        report = found_out(Bundle.open(bundle), options, context)
+    show(report, as_json=as_json, out=output, force=force)

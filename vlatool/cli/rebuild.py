@@ -1,0 +1,122 @@
+"""``vlatool rebuild``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vlatool.bundle import Bundle
+from vlatool.cli._console import emit, progress, refuse_existing
+from vlatool.errors import GateFailed, UsageError
+
+if TYPE_CHECKING:
+    from vlatool.rebuild import Rebuilt
+
+Versions = dict[str, tuple[str, str]]
+
+
+def rebuild(
+    bundle: Annotated[Path, typer.Argument(help="a bundle that a stage or optimize made", show_default=False)],
+    source: Annotated[
+        str | None,
+        typer.Option(help="policy directory, path.py:make, .onnx file or an earlier bundle; where it was if unset"),
+    ] = None,
+    check: Annotated[bool, typer.Option("--check", help="exit 1 when a byte differs")] = False,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="write the rebuilt bundle here")] = None,
+    file: Annotated[
+        list[Path] | None, typer.Option(help="a file that an option named (calibration), when not beside the source")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Make a bundle again from its build record, without the cache, and compare it byte by byte.
+
+    Exits 0 when all is identical, 1 with --check when a file differs, 3 when the source is not the recorded one.
+    """
+    from vlatool.launch import cache_directory
+    from vlatool.rebuild import build_record, version_changes
+    from vlatool.rebuild import rebuild as run
+
+    if not check and output is None:
+        raise UsageError("rebuild has nothing to do.", "pass --check to compare, -o OUT to keep the bundle, or both")
+    refuse_existing(output, force)
+    opened = Bundle.open(bundle)
+    versions = version_changes(build_record(opened))
+    if versions and not as_json:
+        emit(f"versions differ from the recorded ones: {_told(versions)}\n")
+    with progress() as context:
+        files = tuple(file or ())
+        made = run(opened, context, source=source, files=files, cache=cache_directory(), out=output, force=force)
+    emit(_json(made, versions, output) if as_json else _text(made, versions, output))
+    if check and not made.identical:
+        _fail(made, versions)
+
+
+def _told(versions: Versions) -> str:
+    return ", ".join(f"{name} {recorded} recorded, {now} installed" for name, (recorded, now) in versions.items())
+
+
+def _text(made: Rebuilt, versions: Versions, output: Path | None) -> str:
+    lines = [
+        f"source    {made.source}",
+        f"stages    {' -> '.join(name for name, _ in made.stages)}",
+        f"versions  {'not as recorded' if versions else 'as recorded'}",
+    ]
+    if made.left_out:
+        lines.append(
+            f"left out  {', '.join(made.left_out)} in manifest.json: measured, so not the same twice; reports/"
+        )
+    width = max(len(item.file) for item in made.files)
+    lines += ["", f"{'file':<{width}}  {'bytes':>12}  identical"]
+    lines += [f"{item.file:<{width}}  {item.bytes:>12}  {'yes' if item.identical else 'NO'}" for item in made.files]
+    differing = [item for item in made.files if not item.identical]
+    lines += ["", *(f"{item.file}: {item.why}" for item in differing)]
+    total = sum(item.bytes for item in made.files)
+    if differing:
+        lines.append(
+            f"differs: {len(differing)} of {len(made.files)} files; {made.bundle.hash[:19]} is {made.hash[:19]}"
+        )
+    else:
+        lines.append(f"identical: {len(made.files)} files, {total} bytes, {made.hash}")
+    return "\n".join([*lines, *([f"bundle: {output}"] if output else [])]) + "\n"
+
+
+def _json(made: Rebuilt, versions: Versions, output: Path | None) -> str:
+    told = {
+        "bundle": str(made.bundle.path),
+        "source": made.source,
+        "identical": made.identical,
+        "hash": {"recorded": made.bundle.hash, "rebuilt": made.hash},
+        "left_out": list(made.left_out),
+        "versions": {name: {"recorded": one, "installed": two} for name, (one, two) in versions.items()},
+        "stages": [{"stage": name, "graphs_identical": same} for name, same in made.stages],
+        "files": [
+            {"file": item.file, "bytes": item.bytes, "identical": item.identical, "why": item.why}
+            for item in made.files
+        ],
+        "output": str(output) if output else None,
+    }
+    return json.dumps(told, indent=1) + "\n"
+
+
+def _fail(made: Rebuilt, versions: Versions) -> None:
+    """Raise for the first file that differs.
+
+    Raises:
+        GateFailed: with the likely cause as the fix.
+    """
+    first = made.first_difference
+    if first is None:
+        return
+    stage = next((name for name, same in made.stages if not same), None)
+    since = f" The graphs differ since {stage}." if stage else ""
+    if versions:
+        cause = f"the likely cause are the versions ({_told(versions)}); install the recorded ones"
+    elif first.file.startswith("golden/"):
+        cause = "golden outputs are what the graphs gave on the machine that made the bundle; check on that processor"
+    else:
+        cause = "the versions are the recorded ones: look for random numbers or the time in the policy's code"
+    raise GateFailed(f"{first.file} differs: {first.why}.{since}", cause)

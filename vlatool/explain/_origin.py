@@ -1,0 +1,162 @@
+"""Which stage lowered the precision of a bundle, from which bundle, and what to run both on."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle import MANIFEST, Bundle
+from vlatool.data import recorded_observations, synthetic_observations
+from vlatool.errors import BundleError, VlatoolError
+from vlatool.launch import cache_directory
+from vlatool.quantize.dynamic_int8 import DynamicInt8
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.stage import Stage, stage_class, validated
+
+EVALUATION = "data/evaluation.npz"
+INT8 = (StaticInt8, DynamicInt8)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The quantization that made a bundle.
+
+    Args:
+        stage: The stage with the options that it had; None when the bundle was not quantized.
+        inputs: Hashes of bundles that it may have started from, the likeliest first.
+        notes: What of its options could not be taken over.
+    """
+
+    stage: Stage | None = None
+    inputs: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def int8(self) -> bool:
+        """Whether its layers can be switched to int8 one by one."""
+        return isinstance(self.stage, INT8)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What the bundles are run on.
+
+    Args:
+        values: Raw observations.
+        words: Where they are from.
+        recorded: Whether they are recorded, so that errors on them mean something.
+    """
+
+    values: list[dict[str, Any]] = field(default_factory=list)
+    words: str = ""
+    recorded: bool = True
+
+
+def origin(bundle: Bundle) -> Origin:
+    """Return the last quantization in a bundle's history."""
+    manifest = bundle.manifest
+    for entry in (*reversed(manifest.build), manifest.made_by):
+        name = str(entry.get("stage", ""))
+        if not name.startswith("quantize."):
+            continue
+        inputs = tuple(dict.fromkeys(text for text in (str(entry.get("input", "")), manifest.parent) if text))
+        stage, notes = _stage(name, entry.get("options", {}))
+        return Origin(stage, inputs, notes)
+    return Origin()
+
+
+def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[str, ...]]:
+    """Return the stage, without the options that name files of another time and place."""
+    try:
+        kind = stage_class(name)
+    except VlatoolError:
+        return None, (f"this vlatool knows no stage {name}",)
+    kept = {key: value for key, value in options.items() if key in kind.model_fields and key != "calibration"}
+    notes = tuple(f"the option {key}: {value} was not taken over" for key, value in options.items() if key not in kept)
+    try:
+        return validated(kind, kept, name), notes
+    except VlatoolError as error:
+        return None, (*notes, error.message)
+
+
+def find_baseline(bundle: Bundle, made: Origin, given: Path | None) -> Bundle | None:
+    """Return the float32 bundle that a bundle was quantized from: the one given, else one in the cache.
+
+    Raises:
+        BundleError: when the given one is damaged, or is another policy's.
+    """
+    if given is None:
+        return _cached(made.inputs)
+    found = Bundle.open(given)
+    missing = [name for name in bundle.manifest.graphs if name not in found.manifest.graphs and not _phases(name)]
+    if missing or found.manifest.spec != bundle.manifest.spec:
+        what = f"it has no graph '{missing[0]}'" if missing else "its inputs or outputs are others"
+        raise BundleError(
+            f"{given} is not what {bundle.path} was made from: {what}.",
+            "name the float32 bundle of the same policy: vlatool export SOURCE -o BUNDLE",
+        )
+    return found
+
+
+def _phases(name: str) -> bool:
+    return name.endswith("_phases")
+
+
+def _cached(hashes: tuple[str, ...]) -> Bundle | None:
+    """Return the bundle of the cache whose hash is one of those."""
+    for path in sorted((cache_directory() / "stages").glob(f"*/{MANIFEST}")):
+        if "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest() in hashes:
+            try:
+                found = Bundle.open(path.parent)
+            except BundleError:
+                continue
+            if found.manifest.graphs:
+                return found
+    return None
+
+
+def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, count: int) -> Observations:
+    """Return observations that calibration has not seen, where there are any.
+
+    Raises:
+        DataError: when the given data does not fit the policy.
+    """
+    if data is not None:
+        return Observations(recorded_observations(bundle, count, data), data.name)
+    sources = [each for each in (bundle, baseline) if each is not None]
+    for source in sources:
+        if EVALUATION in source.manifest.files:
+            found = recorded_observations(source, count, source.path / EVALUATION)
+            return Observations(found, "recorded observations that calibration has not seen")
+    for source in sources:
+        if found := recorded_observations(source, count):
+            return Observations(found, "the calibration's own observations")
+    made = synthetic_observations(bundle.manifest.spec, count)
+    return Observations(made, "synthetic observations", recorded=False)
+
+
+def sensitivity_stage(stage: Stage | None) -> StaticInt8 | None:
+    """Return the stage that names the layers of an int8 stage; None when it is none."""
+    if isinstance(stage, StaticInt8):
+        return stage
+    if isinstance(stage, DynamicInt8):
+        same = ("include", "exclude", "parts", "graphs", "per_channel", "reduce_range")
+        return StaticInt8(ops=("MatMul", "Gemm"), **{name: getattr(stage, name) for name in same})
+    return None
+
+
+def command(stage: Stage, source: str, out: str = "BUNDLE") -> str:
+    """Return the command line that runs a stage."""
+    words = [f"vlatool quantize {stage.name().partition('.')[2].replace('_', '-')} {source} -o {out}"]
+    for name, value in stage.options().items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif isinstance(value, list):
+            words += [f"--{flag} '{item}'" for item in value]
+        else:
+            words.append(f"--{flag} {value}")
+    return " ".join(words)

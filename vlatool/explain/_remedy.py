@@ -1,0 +1,175 @@
+"""What to do about it: candidates that are really made, and measured beside the bundle as it is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.benchmark._contest import Contestant, run_interleaved
+from vlatool.bundle import Bundle
+from vlatool.errors import VlatoolError
+from vlatool.explain._islands import Fallback
+from vlatool.launch import run_transform
+from vlatool.quantize._sensitivity import LayerError
+from vlatool.quantize.dynamic_int8 import DynamicInt8
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.policy import Policy, relative_error
+from vlatool.stage import Context, Stage, Transform
+
+MOST_LAYERS = (1, 2, 4)
+"""How many of the worst layers the candidates leave in float32."""
+SLOWER = 1.10
+"""A candidate may be so much slower than the bundle as it is and still be suggested for its accuracy."""
+BETTER = 0.9
+"""A candidate is suggested when it makes the error, or the latency, at most so much of what it is."""
+NEAR = 1.25
+"""Of those within so much of the least error the one that changes least is suggested."""
+ITERATIONS = 40
+
+
+@dataclass
+class Candidate:
+    """One change of the quantization, made and measured.
+
+    Args:
+        name: What is changed, in words.
+        stage: With the change.
+        layers: How many further layers stay in float32.
+        bundle: None until it was made.
+        error: Relative L2 error of the raw action to float32, mean over the observations.
+        contestant: Holds its latencies.
+        failed: Why it could not be made.
+    """
+
+    name: str
+    stage: Stage | None
+    layers: int = 0
+    bundle: Bundle | None = None
+    error: float = float("nan")
+    contestant: Contestant | None = None
+    failed: str = ""
+
+    @property
+    def ms(self) -> float:
+        """Median latency in ms, NaN when it was not measured."""
+        return float(np.median(self.contestant.samples)) if self.contestant else float("nan")
+
+
+@dataclass(frozen=True)
+class Contest:
+    """Bundles measured in one run.
+
+    Args:
+        now: The bundle as it is.
+        baseline: The float32 bundle; None when it was not found.
+        others: What was tried.
+    """
+
+    now: Candidate
+    baseline: Candidate | None
+    others: list[Candidate] = field(default_factory=list)
+
+    @property
+    def speed(self) -> float:
+        """Median latency of float32 over that of the bundle as it is; NaN without float32."""
+        return self.baseline.ms / self.now.ms if self.baseline is not None else float("nan")
+
+    @property
+    def suggested(self) -> Candidate | None:
+        """Return the candidate that helps most for the least change; None when none does."""
+        fair = [each for each in self.others if each.error <= self.now.error * NEAR]
+        exact = [each for each in fair if each.error <= BETTER * self.now.error and each.ms <= SLOWER * self.now.ms]
+        if exact:
+            least = min(each.error for each in exact)
+            return min((each for each in exact if each.error <= NEAR * least), key=lambda each: each.layers)
+        fast = [each for each in fair if each.ms <= BETTER * self.now.ms]
+        return min(fast, key=lambda each: each.ms) if fast else None
+
+
+def plans(stage: Stage | None, worst: Sequence[LayerError], found: Sequence[Fallback], engine: str) -> list[Candidate]:
+    """Return what is worth trying for a stage: the worst layers in float32, other ranges, the layout for the engine."""
+    tried: list[Candidate] = []
+    fixed, before = stage, ""
+    if isinstance(stage, StaticInt8) and found:
+        if engine != "openvino" and stage.layout != "ort":
+            fixed, before = stage.model_copy(update={"layout": "ort"}), "layout ort"
+        elif stage.activations != "auto":
+            fixed, before = stage.model_copy(update={"activations": "auto"}), "activations auto"
+        if before:
+            tried.append(Candidate(before, fixed))
+    if isinstance(fixed, StaticInt8 | DynamicInt8):
+        for count in MOST_LAYERS:
+            if count < len(worst):
+                names = tuple(pattern(each.name) for each in worst[:count])
+                words = f"without {count} layer{'s' if count > 1 else ''}"
+                changed = fixed.model_copy(update={"exclude": (*fixed.exclude, *names)})
+                tried.append(Candidate(", ".join(filter(None, (before, words))), changed, count))
+    if isinstance(fixed, StaticInt8) and fixed.method == "minmax" and worst:
+        words = ", ".join(filter(None, (before, "method mse")))
+        tried.append(Candidate(words, fixed.model_copy(update={"method": "mse"})))
+    return tried
+
+
+def pattern(name: str) -> str:
+    """Return a glob that matches a node's name and nothing else."""
+    return re.sub(r"([\[*?])", r"[\1]", name)
+
+
+def measure(
+    bundle: Bundle,
+    baseline: Bundle | None,
+    tried: Sequence[Candidate],
+    observations: Sequence[Mapping[str, Any]],
+    scratch: Path,
+    threads: int,
+    context: Context,
+) -> Contest:
+    """Make the candidates and measure error and interleaved latency of all.
+
+    Args:
+        bundle: As it is.
+        baseline: float32.
+        tried: From ``plans``.
+        observations: Raw observations that the errors and latencies are taken on.
+        scratch: Where the candidates are made.
+        threads: Intra-op threads.
+        context: For progress.
+    """
+    now = Candidate("as it is", None, bundle=bundle)
+    base = Candidate("float32", None, bundle=baseline) if baseline is not None else None
+    for number, each in enumerate(tried):
+        context.tell(f"making a candidate: {each.name}", None)
+        if baseline is None or not isinstance(each.stage, Transform):
+            continue
+        try:
+            each.bundle = run_transform(each.stage, baseline, scratch / str(number), Context())
+        except VlatoolError as error:
+            each.failed = error.message
+    made = [each for each in (base, now, *tried) if each is not None and each.bundle is not None]
+    reference: list[Any] = []
+    for each in made:
+        if each.bundle is None:
+            continue
+        context.tell(f"errors of the candidate: {each.name}", None)
+        policy = Policy.open(each.bundle, threads=threads, seed=0)
+        outputs = _outputs(policy, observations)
+        if base is not None:
+            reference = reference or outputs
+            each.error = float(np.mean([relative_error(*pair) for pair in zip(outputs, reference, strict=True)]))
+        each.contestant = Contestant(each.name, each.bundle, policy, [dict(item) for item in observations])
+    run_interleaved([each.contestant for each in made if each.contestant], ITERATIONS, 5, context)
+    return Contest(now, base, [each for each in tried if each.bundle is not None])
+
+
+def _outputs(policy: Policy, observations: Sequence[Mapping[str, Any]]) -> list[Any]:
+    """Return the raw action of each observation, each an episode of its own."""
+    found = []
+    for observation in observations:
+        policy.reset()
+        found.append(np.array(policy.infer(observation).outputs[policy.spec.action.name]))
+    return found

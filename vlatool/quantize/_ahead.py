@@ -1,0 +1,130 @@
+"""Compute records ahead of the one that is wanted, in several processes, and hand them on in order."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from vlatool import errors
+from vlatool.quantize._records import Record, Tools, compute
+
+SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Ahead:
+    """Iterates over (record, figures) in order, each when it is in its place in the file.
+
+    Args:
+        records: All records of the file.
+        start: The first that is wanted.
+        file: Where they are written.
+        processes: Processes that compute; with 0 each record is computed here when it is asked for.
+    """
+
+    def __init__(self, records: list[Record], start: int, file: Path, processes: int) -> None:
+        self._offset = sum(record.size for record in records[:start])
+        self._records, self._file, self._tools = records[start:], file, Tools()
+        self._idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+        self._workers = [Worker() for _ in range(processes)]
+        for worker in self._workers:
+            self._idle.put(worker)
+        self._threads = ThreadPoolExecutor(max(processes, 1), "record")
+
+    def __enter__(self) -> Ahead:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for worker in self._workers:
+            worker.stop()
+        self._threads.shutdown(wait=True)
+        self._tools.read.close()
+
+    def __iter__(self) -> Iterator[tuple[Record, dict[str, Any]]]:
+        pending: deque[tuple[Record, int, Future[dict[str, Any]] | None]] = deque()
+        waiting, offset, room = iter(self._records), self._offset, 2 * len(self._workers) + 1
+        while True:
+            for record in waiting:
+                pending.append((record, offset, self._submit(record, offset)))
+                offset += record.size
+                if len(pending) >= room:
+                    break
+            if not pending:
+                return
+            record, place, future = pending.popleft()
+            note = future.result() if future else compute(record.fill, record.size, self._file, place, self._tools)
+            yield record, note
+
+    def _submit(self, record: Record, offset: int) -> Future[dict[str, Any]] | None:
+        if not (self._workers and record.portable):
+            return None
+        return self._threads.submit(self._send, record, offset)
+
+    def _send(self, record: Record, offset: int) -> dict[str, Any]:
+        worker = self._idle.get()
+        try:
+            return worker.compute(record, self._file, offset)
+        finally:
+            self._idle.put(worker)
+
+
+class Worker:
+    """A process that computes one record at a time."""
+
+    def __init__(self) -> None:
+        package = str(Path(__file__).parents[2])
+        path = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "vlatool.quantize._worker"],
+            env={**os.environ, "PYTHONPATH": path, **dict.fromkeys(SINGLE, "1")},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def compute(self, record: Record, file: Path, offset: int) -> dict[str, Any]:
+        """Let the process compute and write a record; return its figures.
+
+        Raises:
+            OSError: when the disk is full.
+            VlatoolError: what the record raises, or GraphError when the process died.
+        """
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        request = {"job": record.fill.to_json(), "size": record.size, "file": str(file), "offset": offset}
+        line = ""
+        with contextlib.suppress(BrokenPipeError, ValueError):
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        if not line:
+            raise errors.GraphError(
+                f"The process that quantized '{record.name}' died (exit {self._process.poll()}).",
+                "it may have run out of memory; run the same command again, finished tensors are kept",
+            )
+        answer: dict[str, Any] = json.loads(line)
+        if "note" in answer:
+            note: dict[str, Any] = answer["note"]
+            return note
+        if "errno" in answer:
+            raise OSError(answer["errno"], answer["message"], str(file))
+        if answer["error"] == "MemoryError":
+            raise MemoryError(answer["message"])
+        raise getattr(errors, answer["error"])(answer["message"], answer["fix"])
+
+    def stop(self) -> None:
+        """End the process; what it was computing is lost."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()  # type: ignore[union-attr]

@@ -1,0 +1,165 @@
+"""GPTQ and AWQ over a whole policy: layer after layer, each fed with what the quantized layers before it give."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.manifest import ProgramStep
+from vlatool.quantize._blocks import METHODS
+from vlatool.quantize._compute import figures, piece, records_of, store, stored_meaning, whole_weight
+from vlatool.quantize._gptq import Rounded, awq, gptq
+from vlatool.quantize._journal import DATA
+from vlatool.quantize._layerwise import Layerwise, Values
+from vlatool.quantize._records import Record, Tools, padded
+from vlatool.quantize._rewrite import Layer, Task
+from vlatool.quantize._weights_plan import WeightsPlan
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.program import draw
+from vlatool.stage import SampleSet
+
+if TYPE_CHECKING:
+    from vlatool.quantize.weight_only import WeightOnly
+
+Array = NDArray[Any]
+SLACK = 2.0
+"""How much more of a weight's norm a method may lose that spares the product instead."""
+
+
+def calibrated_records(
+    plan: WeightsPlan, bundle: Bundle, stage: WeightOnly, place: Path, seen: SampleSet
+) -> list[Record]:
+    """Return all records; those of quantized weights drive the policy from layer to layer and must run in order."""
+    observations = [dict(each) for each in seen.watch(recorded_observations(bundle, stage.samples, stage.calibration))]
+    walk = _Walk(plan, bundle, stage, place, observations)
+    records: list[Record] = []
+    for number, task in enumerate(plan.tasks):
+        if task.kind == "copy":
+            records += records_of(task, stage.form, stage.choose, 0.0)
+            continue
+        records.append(Record(task.label, padded(task.size), _Filler(walk, number), task.source.count, False))
+    return records
+
+
+class _Walk:
+    """The policy on all samples, halted at each layer that is quantized."""
+
+    def __init__(
+        self, plan: WeightsPlan, bundle: Bundle, stage: WeightOnly, place: Path, observations: list[dict[str, Any]]
+    ) -> None:
+        self._plan, self._bundle, self._stage, self._place = plan, bundle, stage, place
+        self._observations = observations
+        self._offsets = plan.offsets()
+        self._wanted = -1
+        self._shared = {id(layer): number for graph in plan.graphs.values() for layer, number in graph.layers}
+        owners: dict[int, int] = {}
+        for layer, number in self._shared.items():
+            owners.setdefault(number, layer)
+        self._numbers = {layer: number for number, layer in owners.items()}
+        self._target: Array | None = None
+        self._note: dict[str, Any] | None = None
+        self._steps: Iterator[None] | None = None
+        self._tools: Tools | None = None
+
+    def fill(self, number: int, tools: Tools, data: Array) -> dict[str, Any]:
+        """Go on to the layer of a task, quantize it into its record, and return its figures."""
+        self._wanted, self._target, self._note, self._tools = number, data, None, tools
+        if self._steps is None:
+            self._steps = self._walk()
+        while self._note is None:
+            next(self._steps)
+        return self._note
+
+    def _walk(self) -> Iterator[None]:
+        manifest = self._bundle.manifest
+        encode = ObservationEncoder(manifest.spec, self._bundle.path / "assets")
+        random = np.random.default_rng(0)
+        samples: list[Values] = [dict(encode(observation)) for observation in self._observations]
+        for step in manifest.program:
+            for values in samples:
+                _begin(step, values, random)
+            graph = self._plan.graphs[step.graph]
+            layers = [layer for layer, _ in graph.layers]
+            local = [{name: values[value] for name, value in step.feeds.items()} for values in samples]
+            assert self._tools is not None
+            yield from Layerwise(graph.skeleton, layers, self._product).run(local, self._tools)
+            for values, given in zip(samples, local, strict=True):
+                values.update({value: given[name] for name, value in step.gives.items()})
+                values.update({target: values[source] for source, target in step.carry.items()})
+
+    def _product(self, layer: Layer, rows: Array, tools: Tools) -> Array:
+        number = self._numbers.get(id(layer))
+        if number is None:  # a weight that was quantized for another layer: the float one serves
+            return rows @ whole_weight(self._plan.tasks[self._shared[id(layer)]], tools).T
+        task = self._plan.tasks[number]
+        if number < self._wanted:
+            return rows @ self._finished(task, number).T
+        weight = whole_weight(task, tools)
+        made = self._round(weight, rows)
+        data = self._target
+        assert data is not None
+        self._store(task, made, data)
+        self._note = _note(task, weight, made, rows, SLACK * self._stage.form.largest_error)
+        return rows @ made.meant.T
+
+    def _round(self, weight: Array, rows: Array) -> Rounded:
+        method = gptq if self._stage.method == "gptq" else awq
+        return method(weight, rows, self._stage.form, METHODS[self._stage.choose])
+
+    def _store(self, task: Task, made: Rounded, data: Array) -> None:
+        if task.kind == "blocks":
+            piece(task, 0, data)[:] = made.codes.reshape(-1)
+        store(task, self._stage.form, made.codes, made.scale, made.zero, data)
+        if made.inputs is not None:
+            piece(task, len(task.pieces) - 1, data)[:] = made.inputs.view(np.uint8)
+
+    def _finished(self, task: Task, number: int) -> Array:
+        """Return what an earlier run stored for a layer, as (columns, rows) float32."""
+        with (self._place / DATA).open("rb") as stream:
+            stream.seek(self._offsets[number])
+            data = np.frombuffer(stream.read(task.size), np.uint8)
+        return stored_meaning(task, data, self._stage.form)
+
+
+def _begin(step: ProgramStep, values: Values, random: np.random.Generator) -> None:
+    """Bring noise, the first entries of schedules and zeros for kept values into being."""
+    for name, wanted in step.noise.items():
+        values[name] = draw(wanted, random)
+    for name, numbers in step.schedule.items():
+        whole = all(isinstance(number, int) for number in numbers)
+        values[name] = np.array([numbers[0]], np.int64 if whole else np.float32)
+    for name, kept in step.keep.items():
+        values[name] = np.zeros(kept["shape"], kept.get("dtype", "float32"))
+
+
+def _note(task: Task, weight: Array, made: Rounded, rows: Array, tolerance: float) -> dict[str, Any]:
+    """Return the figures of a layer: what its weights and its products on the calibration samples lose."""
+    difference = made.meant - weight
+    lost, norm = float(np.vdot(difference, difference)), float(np.vdot(weight, weight))
+    wanted = rows @ weight.T
+    of_product = np.linalg.norm(rows @ difference.T) / (np.linalg.norm(wanted) or 1.0)
+    note = figures(task, lost, norm, tolerance)
+    return {**note, "product_error": float(of_product), "sha256": ""}
+
+
+@dataclass(frozen=True)
+class _Filler:
+    """Computes the record of one task; only here, and only after those before it."""
+
+    walk: _Walk
+    number: int
+
+    def __call__(self, tools: Tools, data: Array) -> dict[str, Any]:
+        """Fill the record."""
+        return self.walk.fill(self.number, tools, data)
+
+    def to_json(self) -> str:
+        """Never called: such a record is not portable."""
+        raise NotImplementedError(self.number)

@@ -1,0 +1,283 @@
+"""The ONNX graphs of a policy whose weights stay in their shards: exported with weights that take no memory."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.bundle import Bundle, hash_file
+from vlatool.data import observations_for
+from vlatool.errors import GraphError, SourceError, nearest, require
+from vlatool.export.onnx import _quiet, name_by_module, strip_notes
+from vlatool.manifest import ProgramStep
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.sources._description import read_description, read_location
+from vlatool.sources._factory import call_factory, factory_file
+from vlatool.sources._shards import StoredTensor, read_shards, stored_array
+
+FOLDED = 1 << 16
+"""Elements up to which constants are computed ahead."""
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A graph and where its constants are.
+
+    Args:
+        model: An ``onnx_ir.Model`` whose initializers have shapes and dtypes, and values only when they are small.
+        tensors: Initializer -> where its bytes are.
+        opset: Of the default domain.
+    """
+
+    model: Any
+    tensors: dict[str, StoredTensor]
+    opset: int
+
+
+def policy_weights(bundle: Bundle) -> tuple[Path, str]:
+    """Return the folder of a policy's code and the glob of its weights; empty when the factory loads them itself."""
+    folder = read_location(bundle.path)
+    return folder, read_description(folder).weights
+
+
+def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
+    """Export every graph of a source bundle without reading a weight: graph name -> skeleton.
+
+    The factory is called once, with every parameter put on torch's meta device as soon as it is registered; buffers are
+    computed. The export then runs under ``FakeTensorMode``.
+
+    Raises:
+        SourceError: when code has changed, the factory fails, or shards and modules do not fit together.
+        GraphError: when torch cannot export a module.
+    """
+    torch = require("torch", "build")
+    for package in ("onnx", "onnxscript"):
+        require(package, "build")
+    folder, pattern = policy_weights(bundle)
+    shards = read_shards(folder, pattern)
+    modules = _modules(torch, bundle, folder)
+    encode = ObservationEncoder(bundle.manifest.spec, bundle.path / "assets")
+    values = {name: (np.shape(array), array.dtype) for name, array in encode(observations_for(bundle, 1)[0]).items()}
+    found: dict[str, Skeleton] = {}
+    for step in bundle.manifest.program:
+        _declare(step, values)
+        module = modules[step.graph]
+        weights = _locate(torch, step.graph, module, shards, len(modules) > 1, folder / "policy.yaml")
+        with _fake(module) as (mode, real):
+            feeds = [_fake_tensor(torch, mode, *values[value]) for value in step.feeds.values()]
+            model = None if step.graph in found else _export(torch, step, module, feeds, opset)
+            outputs = _outputs(torch, step, module, feeds)
+        if model is not None:
+            found[step.graph] = _skeleton(model, weights, real, opset, folder / "policy.yaml")
+        for value, tensor in zip(step.gives.values(), outputs, strict=True):
+            values[value] = (tuple(tensor.shape), np.dtype(str(tensor.dtype).removeprefix("torch.")))
+        for source, target in step.carry.items():
+            values[target] = values[source]
+    return found
+
+
+def _declare(step: ProgramStep, values: dict[str, Any]) -> None:
+    """Add shape and dtype of what a step brings into being."""
+    for name, wanted in step.noise.items():
+        values[name] = (tuple(wanted["shape"]), np.dtype(np.float32))
+    for name, numbers in step.schedule.items():
+        whole = all(isinstance(number, int) for number in numbers)
+        values[name] = ((1,), np.dtype(np.int64 if whole else np.float32))
+    for name, kept in step.keep.items():
+        values[name] = (tuple(kept["shape"]), np.dtype(kept.get("dtype", "float32")))
+
+
+def _modules(torch: Any, bundle: Bundle, folder: Path) -> dict[str, Any]:
+    origin = bundle.manifest.source
+    path = factory_file(origin["factory"], folder)
+    for name, digest in origin.get("code", {}).items():
+        file = (path.parent if path else folder) / name
+        if file.suffix == ".py" and (not file.is_file() or hash_file(file) != digest):
+            raise SourceError(f"{file} has changed since the source bundle was made.", "start again from the source")
+    with _parameters_on_meta(torch):
+        made = call_factory(origin["factory"], folder, dict(origin.get("arguments", {})))
+    modules = made if isinstance(made, Mapping) else {"main": made}
+    for step in bundle.manifest.program:
+        given = modules.get(step.graph)
+        if given is None:
+            known = nearest(step.graph, modules)
+            raise SourceError(f"The program runs '{step.graph}', which the factory does not give; {known}.")
+        if not isinstance(given, torch.nn.Module):
+            raise SourceError(f"The factory gave a {type(given).__name__} for '{step.graph}'; wanted a torch module.")
+    return {step.graph: modules[step.graph].eval().float() for step in bundle.manifest.program}
+
+
+@contextlib.contextmanager
+def _parameters_on_meta(torch: Any) -> Iterator[None]:
+    """Move every parameter to the meta device when a module registers it; its memory was never touched."""
+    kind = torch.nn.Module
+    original = kind.register_parameter
+
+    def register(module: Any, name: str, parameter: Any) -> None:
+        if parameter is not None and not parameter.is_meta:
+            parameter = torch.nn.Parameter(parameter.detach().to("meta"), requires_grad=False)
+        original(module, name, parameter)
+
+    kind.register_parameter = register
+    try:
+        yield
+    finally:
+        kind.register_parameter = original
+
+
+def _locate(
+    torch: Any, graph: str, module: Any, shards: dict[str, StoredTensor], several: bool, file: Path
+) -> dict[str, StoredTensor]:
+    """Return where the bytes of every parameter and saved buffer are: name -> tensor.
+
+    Names are those of ``state_dict()``; with several graphs ``GRAPH.name`` comes first. Tied weights are stored once.
+
+    Raises:
+        SourceError: naming the first tensor that is missing or has another shape or dtype.
+    """
+    state = module.state_dict(keep_vars=True)
+    found: dict[str, StoredTensor] = {}
+    stored_as: dict[int, StoredTensor] = {}
+    for name, value in state.items():
+        tensor = (shards.get(f"{graph}.{name}") if several else None) or shards.get(name)
+        if tensor is not None:
+            found[name] = stored_as[id(value)] = tensor
+    for name, value in state.items():
+        tensor = found[name] = found.get(name) or stored_as.get(id(value)) or _missing(graph, name, shards, file)
+        if tuple(value.shape) != tensor.shape:
+            raise SourceError(
+                f"'{tensor.name}' in {tensor.file.name} has the shape {list(tensor.shape)}; the module built by the "
+                f"factory wants {list(value.shape)}.",
+                "check the factory's arguments in policy.yaml",
+            )
+        if value.is_floating_point() and tensor.dtype not in ("F32", "F16", "BF16"):
+            raise SourceError(
+                f"'{tensor.name}' in {tensor.file.name} is {tensor.dtype}; weights may be F32, F16 or BF16.",
+                "convert the shards (weights that are quantized already cannot be quantized again)",
+            )
+    return found
+
+
+def _missing(graph: str, name: str, shards: dict[str, StoredTensor], file: Path) -> StoredTensor:
+    raise SourceError(
+        f"No shard holds '{name}', which the module '{graph}' needs; {nearest(name, shards)}.",
+        f"names are those of state_dict(); check the weights and the arguments in {file}",
+    )
+
+
+@contextlib.contextmanager
+def _fake(module: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Put fake tensors in the place of parameters and buffers; yield the mode and the real buffers by name."""
+    from torch._subclasses import FakeTensorMode
+
+    real = {name: buffer for name, buffer in module.named_buffers() if not buffer.is_meta}
+    places = [
+        (held, key, value)
+        for part in module.modules()
+        for held in (part._parameters, part._buffers)
+        for key, value in held.items()
+        if value is not None
+    ]
+    made: dict[int, Any] = {}
+    mode = FakeTensorMode(allow_non_fake_inputs=True)
+    try:
+        for held, key, value in places:
+            if id(value) not in made:
+                made[id(value)] = _like(mode, value)
+            held[key] = made[id(value)]
+        with mode:
+            yield mode, real
+    finally:
+        for held, key, value in places:
+            held[key] = value
+
+
+def _like(mode: Any, value: Any) -> Any:
+    import torch
+
+    with mode:
+        fake = torch.empty(value.shape, dtype=value.dtype, device="cpu")
+        return torch.nn.Parameter(fake, requires_grad=False) if isinstance(value, torch.nn.Parameter) else fake
+
+
+def _fake_tensor(torch: Any, mode: Any, shape: tuple[int, ...], dtype: Any) -> Any:
+    return torch.empty(shape, dtype=getattr(torch, str(np.dtype(dtype))), device="cpu")
+
+
+def _outputs(torch: Any, step: ProgramStep, module: Any, feeds: list[Any]) -> list[Any]:
+    with torch.inference_mode(False), torch.no_grad():
+        given = module(*feeds)
+    outputs = list(given) if isinstance(given, tuple | list) else [given]
+    if len(outputs) != len(step.gives):
+        raise SourceError(f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.")
+    return outputs
+
+
+def _export(torch: Any, step: ProgramStep, module: Any, feeds: list[Any], opset: int) -> Any:
+    try:
+        with _quiet(), torch.no_grad():
+            exported = torch.onnx.export(
+                module,
+                tuple(feeds),
+                dynamo=True,
+                optimize=False,
+                opset_version=opset,
+                input_names=list(step.feeds),
+                output_names=list(step.gives),
+                verbose=False,
+            )
+    except Exception as error:  # the seam: the exporter raises many foreign types
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
+        raise GraphError(
+            f"torch cannot export the graph '{step.graph}' without its weights: {reason}.",
+            "forward() must not look at the values of weights; see docs/concepts/large-models.md",
+        ) from error
+    return exported.model
+
+
+def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any], opset: int, file: Path) -> Skeleton:
+    """Give initializers their values or their place in a shard, then fold what is computed from small constants."""
+    import onnx_ir
+    import onnxscript.optimizer
+
+    tensors: dict[str, StoredTensor] = {}
+    for name, value in model.graph.initializers.items():
+        if name in weights:
+            tensors[name] = weights[name]
+            value.const_value = None
+        elif name in real:
+            value.const_value = onnx_ir.tensor(real[name].detach().cpu().numpy(), name=name)
+        elif type(value.const_value.raw).__name__ == "FakeTensor" if hasattr(value.const_value, "raw") else False:
+            raise GraphError(
+                f"The value of the constant '{name}' is not known: it was made while the graph was exported.",
+                "make it in the module's __init__ and register it as a buffer",
+            )
+    with _quiet(), _silent("onnx_ir"):
+        onnxscript.optimizer.optimize_ir(model, input_size_limit=FOLDED, output_size_limit=FOLDED)
+    name_by_module(model)
+    strip_notes(model)
+    kept = {}
+    for name, value in model.graph.initializers.items():
+        if value.const_value is None:
+            kept[name] = tensors[name]
+        else:
+            kept[name] = stored_array(name, value.const_value.numpy(), file)
+    return Skeleton(model, kept, opset)
+
+
+@contextlib.contextmanager
+def _silent(name: str) -> Iterator[None]:
+    """Keep a logger quiet: it warns about every initializer whose value stays in a shard."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

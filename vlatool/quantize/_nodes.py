@@ -1,0 +1,40 @@
+"""Names in a graph: what a node reads, and a name of its own for every node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+
+def reads(node: Any) -> Iterator[str]:
+    """Yield the values that a node reads, with those that the graphs inside it (If, Loop, Scan) take from outside."""
+    yield from (name for name in node.input if name)
+    for item in node.attribute:
+        for graph in (item.g, *item.graphs) if item.HasField("g") or item.graphs else ():
+            inside = {value.name for value in graph.input} | {tensor.name for tensor in graph.initializer}
+            inside.update(name for inner in graph.node for name in inner.output)
+            inside.discard("")
+            yield from (name for inner in graph.node for name in reads(inner) if name not in inside)
+            yield from (value.name for value in graph.output if value.name not in inside)
+
+
+def read_names(nodes: Iterable[Any]) -> set[str]:
+    """Return all values that nodes read."""
+    return {name for node in nodes for name in reads(node)}
+
+
+def name_nodes(model: Any) -> None:
+    """Give every node without a name, or with one that came before, a name of its own, in place.
+
+    Layers are chosen and rewritten by the names of their nodes; some exporters leave them empty or repeat them.
+    """
+    taken = {node.name for node in model.graph.node}
+    seen = {""}
+    for number, node in enumerate(model.graph.node):
+        if node.name in seen:
+            name = f"{node.name or node.op_type}_{number}"
+            while name in taken:
+                name += "_"
+            taken.add(name)
+            node.name = name
+        seen.add(node.name)

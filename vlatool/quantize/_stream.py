@@ -1,0 +1,143 @@
+"""Write one large file record by record; a run that was killed is continued by the next one.
+
+The place of every record is known before the first is computed. Processes compute and write records ahead; in order,
+each is then read back and hashed, and a journal notes it with the SHA-256 of the data up to its end. The next run of
+the same plan checks the finished records and goes on after them, and gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vlatool.errors import OutputError
+from vlatool.quantize._ahead import Ahead
+from vlatool.quantize._journal import DATA, Journal, hash_part
+from vlatool.quantize._records import Record
+from vlatool.sources._shards import reading
+
+if TYPE_CHECKING:
+    from vlatool.stage import Tell
+
+LOCK = "lock"
+COMMIT_BYTES = 1 << 28
+"""Bytes after which data and journal are flushed to the disk."""
+FORGOTTEN_S = 7 * 24 * 3600
+"""Age in seconds from which unfinished work that nobody continues is removed."""
+FULL = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file would be larger than the limit on file sizes",
+}
+
+
+@dataclass(frozen=True)
+class Written:
+    """The finished file.
+
+    Args:
+        path: Where it is, in the work directory.
+        sha256: Of the file, as hex.
+        bytes: Its size.
+        notes: What each record's ``fill`` returned.
+        resumed: Records that an earlier run had finished.
+    """
+
+    path: Path
+    sha256: str
+    bytes: int
+    notes: list[dict[str, Any]]
+    resumed: int
+
+
+def work_root() -> Path:
+    """Return where unfinished work is kept: ``streams`` in vlatool's cache directory."""
+    named = os.environ.get("VLATOOL_CACHE")
+    cache = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vlatool"
+    return cache / "streams"
+
+
+@contextlib.contextmanager
+def work_directory(place: Path) -> Iterator[Path]:
+    """Yield the directory of unfinished work, locked: one run at a time continues it, others wait."""
+    place.mkdir(parents=True, exist_ok=True)
+    _sweep(place)
+    handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        os.utime(place / LOCK)
+        yield place
+    finally:
+        os.close(handle)
+
+
+def forget(place: Path) -> None:
+    """Remove a work directory whose result has arrived."""
+    shutil.rmtree(place, ignore_errors=True)
+
+
+def _sweep(place: Path) -> None:
+    """Remove other work that nobody has continued for a week."""
+    for other in place.parent.iterdir():
+        with contextlib.suppress(OSError):
+            if other == place or time.time_ns() / 1e9 - (other / LOCK).stat().st_mtime < FORGOTTEN_S:
+                continue
+            handle = os.open(other / LOCK, os.O_RDWR)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                forget(other)
+            finally:
+                os.close(handle)
+
+
+def write_records(records: list[Record], plan: str, place: Path, processes: int, tell: Tell) -> Written:
+    """Write all records to ``place/data``, continuing what an earlier run of the same plan left.
+
+    Args:
+        records: What to write, in order.
+        plan: Identifies everything that the bytes depend on; work of another plan is thrown away.
+        place: A locked work directory.
+        processes: Processes that compute; with 0 everything happens here, in order.
+        tell: Told each record and the share of the parameters that is done.
+
+    Raises:
+        OutputError: when the disk is full; finished records are kept.
+        VlatoolError: what a record's ``fill`` raises.
+    """
+    data, journal = place / DATA, Journal(place, plan)
+    digest, notes = journal.resume(records)
+    resumed = len(notes)
+    offset = sum(record.size for record in records[:resumed])
+    total = sum(record.weights for record in records) or 1
+    done, unflushed = sum(record.weights for record in records[:resumed]), 0
+    try:
+        with reading() as reader, Ahead(records, resumed, data, processes) as ahead:
+            for record, note in ahead:
+                hash_part(reader, data, offset, record.size, digest)
+                journal.add(note, digest.hexdigest())
+                notes.append(note)
+                offset += record.size
+                unflushed += record.size
+                done += record.weights
+                tell(f"quantized {record.name}", done / total)
+                if unflushed >= COMMIT_BYTES:
+                    journal.flush()
+                    unflushed = 0
+        journal.flush()
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        kept = f"{len(notes)} of {len(records)} parts are finished and kept"
+        fix = "free some space (or set VLATOOL_CACHE to a larger disk) and run the same command again"
+        raise OutputError(f"Cannot write {place}: {FULL[error.errno]}; {kept}.", fix) from error
+    finally:
+        journal.close()
+    return Written(data, digest.hexdigest(), offset, notes, resumed)

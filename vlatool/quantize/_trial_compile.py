@@ -1,0 +1,30 @@
+"""Compile a graph in a process of its own first: OpenVINO crashes on some quantized graphs instead of refusing them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from vlatool.errors import GraphError
+
+CODE = """
+import sys
+from pathlib import Path
+from vlatool.runtime.engines.openvino import OpenvinoSession
+OpenvinoSession(Path(sys.argv[1]), 1)
+"""
+
+
+def compile_apart(path: Path) -> None:
+    """Let a child compile the graph.
+
+    Raises:
+        GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
+    """
+    done = subprocess.run([sys.executable, "-c", CODE, str(path)], capture_output=True, check=False)
+    if done.returncode < 0:
+        raise GraphError(
+            f"OpenVINO crashes (signal {-done.returncode}) when it compiles {path.name} with these layers in int8.",
+            "quantize fewer: leave out --elementwise or --attention, or use --exclude",
+        )

@@ -1,0 +1,38 @@
+"""bfloat16: what the processor's matrix units take, at half the bytes of float32."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from vlatool.bundle import Bundle
+from vlatool.errors import require
+from vlatool.quantize._graphs import Quantization, load, save
+from vlatool.stage import Context
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+
+class Bfloat16(Quantization):
+    """Compute in bfloat16 with OpenVINO; the weights stay float32 in the file.
+
+    Phases (what Sin and Cos take: positions, denoising time) stay in float32, in a graph of their own: bfloat16 has 8
+    significant bits, and a sine of a large argument would be noise.
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("onnx", "openvino", "numpy")
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """OpenVINO is installed."""
+        super().check(source, profile)
+        require("openvino", "openvino")
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Mark every selected graph."""
+
+        def mark(_name: str, original: Path, target: Path) -> str:
+            save(load(original), target)
+            return "bfloat16"
+
+        return self.transform(source, out, context, mark, "openvino")

@@ -1,0 +1,80 @@
+"""float16: half the bytes of float32, and what GPUs and TensorRT compute fastest without calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from vlatool.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.quantize._beyond import find_beyond
+from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
+from vlatool.quantize._graphs import Quantization, load, save
+from vlatool.stage import Context, SampleSet, source_of
+
+
+class Float16(Quantization):
+    """Store weights and compute in float16; inputs and outputs stay float32.
+
+    For GPUs and TensorRT, and for half the file: ONNX Runtime on a processor runs the result too, but casts most of it
+    back to float32. In float32 stay excluded nodes, phases (what leads to Sin and Cos) and indices, constants beyond
+    65504, and every value that goes beyond it on calibration data, with the nodes that give and read it. Sums inside a
+    product are not watched: an engine that adds up in float16 can overflow where the result does not.
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
+
+    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    samples: int = Field(16, ge=1, description="samples on which values beyond float16 are looked for")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The calibration file."""
+        return (self.calibration,) if self.calibration else ()
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Look for values beyond float16, then convert every selected graph."""
+        bundle = source_of(source, self.name())
+        self.check(bundle, None)
+        chosen = self.chosen_graphs(bundle)
+        candidates = []
+        for name in chosen:
+            model = load(bundle.file(bundle.manifest.graphs[name].file))
+            candidates += [node.name for node in model.graph.node]
+        selected = self.selected(candidates, bundle)
+        samples = SampleSet()
+        seen = samples.watch(observations_for(bundle, self.samples, self.calibration))
+        beyond = find_beyond(bundle, chosen, seen, LARGEST, context)
+        told: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": []}
+        for graph, values in beyond.items():
+            for value, found in values.items():
+                size = float(f"{found.largest:.4g}")
+                told["beyond"].append({"graph": graph, "value": value, "sample": found.sample, "largest": size})
+                context.tell(
+                    f"{value} reaches {size:g} in sample {found.sample}, beyond float16: it stays float32", None
+                )
+
+        def convert(name: str, original: Path, target: Path) -> None:
+            model = load(original)
+            kept = {node.name for node in model.graph.node} - selected
+            kept |= phase_nodes(model) | around(model, beyond.get(name, {}))
+            weights = look_at_weights(model, kept)
+            kept.update(weights.beyond)
+            told["kept"] += len(kept)
+            told["subnormal_weights"] += weights.subnormal
+            save(to_float16(model, kept), target)
+
+        made_by = {**self.made_by(calibration=samples), "float16": told}
+        return self.transform(bundle, out, context, convert, made_by=made_by)
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Return what a person wants to know about the new bundle."""
+        told = made.manifest.made_by["float16"]
+        lines = [
+            f"{told['kept']} nodes stay float32; {told['subnormal_weights']} weights are too small for all their bits"
+        ]
+        for found in told["beyond"]:
+            where = f"{found['graph']}/{found['value']} reaches {found['largest']:g} in sample {found['sample']}"
+            lines.append(f"{where}: beyond float16, so its nodes stay float32")
+        return tuple(lines)

@@ -1,0 +1,265 @@
+"""SmoothQuant: move the outliers of activations into weights, before quantization."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
+
+from vlatool.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.errors import DataError, GraphError, require
+from vlatool.quantize._calibrate import calibrate
+from vlatool.quantize._graphs import Quantization, foreign_errors, load, save
+from vlatool.quantize._qdq import find_layers
+from vlatool.quantize._ranges import Statistics
+from vlatool.quantize._smooth_groups import Edit, Group, find_groups
+from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
+from vlatool.runtime.policy import load_golden, relative_error
+from vlatool.stage import Context, SampleSet, source_of
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+Array = NDArray[Any]
+
+OPS = ("MatMul", "Gemm")
+REPORT = "reports/smooth_quant.json"
+SAME = 1e-4
+"""Largest relative L2 difference of the golden action to the source's: float32 rounding, and nothing else."""
+
+
+def _alpha(value: Any) -> str:
+    """Take a number from 0 to 1, or ``auto``, and return it as text."""
+    text = str(value).strip()
+    if text == "auto":
+        return text
+    try:
+        number = float(text)
+    except ValueError:
+        number = -1.0
+    if not 0 <= number <= 1:
+        raise ValueError("must be a number from 0 to 1, or auto")
+    return repr(number)
+
+
+class SmoothQuant(Quantization):
+    """Move outlier channels of activations into the weights that read them; the result computes the same in float32.
+
+    Run a quantization after it. Each input channel of a MatMul or Gemm is divided by a scale and its row of the weight
+    multiplied by it (Xiao et al., SmoothQuant, 2022). The division costs nothing where it goes into constants before
+    the layer: LayerNormalization, RMSNorm's weight, a linear layer, through ReLU, sums, and products with other
+    activations. What GELU or attention give can be divided only by a Mul of its own (--insert).
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
+
+    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
+    alpha: Annotated[str, BeforeValidator(_alpha)] = Field(
+        "0.5", description="0 to 1: how much moves into the weights; auto: by the estimated int8 error of each layer"
+    )
+    outliers: float = Field(
+        1.0, ge=1, description="smooth activations whose largest channel is this many times the median one"
+    )
+    insert: bool = Field(False, description="insert a Mul where the division cannot be folded into constants")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The calibration file."""
+        return (self.calibration,) if self.calibration else ()
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """There is calibration data."""
+        super().check(source, profile)
+        if source is not None and not recorded_observations(source, 1, self.calibration):
+            raise DataError(
+                f"{source.path} carries no calibration data, which {self.name()} needs.", "pass --calibration FILE.npz"
+            )
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Calibrate, smooth every selected graph, and compare the golden action with the source's."""
+        bundle = source_of(source, self.name())
+        self.check(bundle, None)
+        with foreign_errors("main"):
+            groups = self._plan(bundle)
+        wanted = {name: [value for group in found for value in group.activations] for name, found in groups.items()}
+        samples = SampleSet()
+        halves = self._halves(recorded_observations(bundle, self.samples, self.calibration))
+        seen = samples.watch([each for half in halves for each in half])
+        peaks = [_peaks(calibrate(bundle, wanted, islice(seen, len(half)), context, channels=True)) for half in halves]
+        notes: list[dict[str, Any]] = []
+
+        def smooth(name: str, original: Path, target: Path) -> None:
+            model = load(original)
+            for group in groups[name]:
+                note = self._smooth(model, group, _joint(peaks, name, group), sum(map(len, halves)))
+                notes.append({"graph": name, **note})
+            save(model, target)
+
+        made = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
+        (out / REPORT).parent.mkdir(exist_ok=True)
+        (out / REPORT).write_text(json.dumps({"groups": notes}, indent=1) + "\n", encoding="utf-8")
+        _check_same(bundle, made)
+        return made
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Return what a person wants to know about the new bundle."""
+        groups = json.loads((made.path / REPORT).read_text(encoding="utf-8"))["groups"]
+        count = {how: sum(group["how"] == how for group in groups) for how in ("folded", "inserted", "left")}
+        layers = sum(len(group["layers"]) for group in groups if group["how"] != "left")
+        told = f"smoothed what {layers} layers read: {count['folded']} activations folded, {count['inserted']} inserted"
+        blocked = sum(group["why"] == "only a Mul of its own could divide it" for group in groups)
+        more = f" ({blocked} of them for want of --insert)" if blocked else ""
+        return (f"{told}, {count['left']} left as they are{more}",)
+
+    def _plan(self, bundle: Bundle) -> dict[str, list[Group]]:
+        """Return graph -> groups of selected layers."""
+        models = {name: load(bundle.file(bundle.manifest.graphs[name].file)) for name in self.chosen_graphs(bundle)}
+        layers = {name: find_layers(model, OPS) for name, model in models.items()}
+        selected = self.selected([layer.name for found in layers.values() for layer in found], bundle)
+        return {
+            name: find_groups(model, [layer for layer in layers[name] if layer.name in selected])
+            for name, model in models.items()
+        }
+
+    def _halves(self, observations: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+        """Return all observations, or for ``auto`` every other one and the rest, whose peaks are compared."""
+        if self.alpha != "auto" or len(observations) < 2:
+            return [observations]
+        return [observations[::2], observations[1::2]]
+
+    def _smooth(self, model: Any, group: Group, halves: list[Array], samples: int) -> dict[str, Any]:
+        """Smooth one activation in place and return what was done.
+
+        Args:
+            model: An ``onnx.ModelProto``.
+            group: What is smoothed.
+            halves: Largest magnitude of each channel, for each part of the calibration.
+            samples: How many there were.
+        """
+        peaks = np.maximum.reduce(halves)
+        unseen = Unseen.between(halves[0], halves[-1], samples)
+        middle = float(np.median(peaks))
+        ratio = float(peaks.max()) / middle if middle else 0.0
+        note = {"value": group.value, "layers": [layer.name for layer in group.layers], "outliers": round(ratio, 3)}
+        if ratio < self.outliers:
+            return {**note, "how": "left", "why": "it has no outlier channels"}
+        if not group.edits and not self.insert:
+            return {**note, "how": "left", "why": "only a Mul of its own could divide it"}
+        writer = _Writer(model)
+        weights = [writer.weight(layer.weight, layer.axis) for layer in group.layers]
+        alpha: float | None
+        if self.alpha == "auto":
+            alpha, scales = best_alpha(peaks, weights, unseen)
+        else:
+            alpha = float(self.alpha)
+            scales = smooth_scales(peaks, weight_peaks(weights), alpha)
+        if alpha is None:
+            return {**note, "how": "left", "why": "no alpha lowers the estimated error"}
+        plain = int8_loss(peaks, weights, np.ones_like(scales), unseen)
+        gain = int8_loss(peaks, weights, scales, unseen) / plain if plain else 1.0
+        writer.apply(group, scales)
+        how = "folded" if group.edits else "inserted"
+        return {**note, "how": how, "why": "", "alpha": alpha, "estimated_loss": float(f"{gain:.4g}")}
+
+
+class _Writer:
+    """Multiplies constants of a graph in place, one reader's copy at a time."""
+
+    def __init__(self, model: Any) -> None:
+        self._onnx = require("onnx", "build")
+        self._graph = model.graph
+        self._constants = {tensor.name: tensor for tensor in model.graph.initializer}
+        self._nodes = {node.output[0]: node for node in model.graph.node}
+        self._layers = {node.name: node for node in model.graph.node}
+
+    def weight(self, name: str, axis: int) -> Array:
+        """Return a weight as (inputs, outputs)."""
+        values: Array = self._onnx.numpy_helper.to_array(self._constants[name])
+        return values if axis == 1 else values.T
+
+    def apply(self, group: Group, scales: Array) -> None:
+        """Divide the value of a group by the scales and multiply its weights by them."""
+        for edit in group.edits:
+            self._multiply(edit, scales)
+        for layer in group.layers:
+            self._multiply(Edit(self._layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
+        if not group.edits:
+            self._insert(group, scales)
+
+    def _multiply(self, edit: Edit, scales: Array) -> None:
+        node = self._nodes[edit.node]
+        name = self._own(node, edit.position)
+        values = self._onnx.numpy_helper.to_array(self._constants[name])
+        if edit.width and values.shape[-1:] != (edit.width,):
+            values = np.broadcast_to(values, (*values.shape[:-1], edit.width))
+        values = np.array(values, np.float32)
+        axis = edit.axis % values.ndim
+        place = (*(slice(None),) * axis, slice(edit.start, edit.start + len(scales)))
+        factors = scales if edit.power > 0 else (1 / scales.astype(np.float64)).astype(np.float32)
+        values[place] *= factors.reshape(-1, *(1,) * (values.ndim - 1 - axis))
+        self._constants[name].CopyFrom(self._onnx.numpy_helper.from_array(values, name))
+
+    def _own(self, node: Any, position: int) -> str:
+        """Return the name of a constant that this node alone reads, in this place alone; copy a shared one."""
+        name = str(node.input[position])
+        if sum(list(each.input).count(name) for each in self._graph.node) == 1:
+            return name
+        copy = f"{name}.{node.name}.{position}"
+        tensor = self._onnx.TensorProto()
+        tensor.CopyFrom(self._constants[name])
+        tensor.name = copy
+        self._graph.initializer.append(tensor)
+        self._constants[copy] = self._graph.initializer[-1]
+        node.input[position] = copy
+        return copy
+
+    def _insert(self, group: Group, scales: Array) -> None:
+        """Put a Mul before the layers of a group."""
+        value, smooth = group.value, f"{group.value}.smooth"
+        factors = (1 / scales.astype(np.float64)).astype(np.float32)
+        self._graph.initializer.append(self._onnx.numpy_helper.from_array(factors, f"{smooth}.scale"))
+        names = {layer.name for layer in group.layers}
+        places = [place for place, node in enumerate(self._graph.node) if node.name in names]
+        for place in places:
+            self._graph.node[place].input[0] = smooth
+        made = self._onnx.helper.make_node("Mul", [value, f"{smooth}.scale"], [smooth], name=f"{value}/smooth")
+        self._graph.node.insert(min(places), made)
+
+
+def _peaks(statistics: dict[str, dict[str, Statistics]]) -> dict[str, dict[str, Array]]:
+    return {
+        graph: {name: np.asarray(each.peaks) for name, each in found.items()} for graph, found in statistics.items()
+    }
+
+
+def _joint(peaks: list[dict[str, dict[str, Array]]], graph: str, group: Group) -> list[Array]:
+    """Return the largest magnitudes over all that the group reads, for each part of the calibration."""
+    return [np.maximum.reduce([half[graph][name] for name in group.activations]) for half in peaks]
+
+
+def _check_same(source: Bundle, made: Bundle) -> None:
+    """Refuse a bundle whose golden action is not the source's.
+
+    Raises:
+        GraphError: when it differs by more than float32 rounding explains.
+    """
+    before, after = load_golden(source), load_golden(made)
+    if before is None or after is None or not _equal(before[:2], after[:2]):
+        return
+    error = relative_error(after[2], before[2])
+    if not error <= SAME:
+        raise GraphError(f"Smoothing changed the golden action by {error:.3g}; allowed: {SAME:g}.", "report this")
+
+
+def _equal(first: Iterable[dict[str, Any]], second: Iterable[dict[str, Any]]) -> bool:
+    return all(
+        one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
+        for one, other in zip(first, second, strict=True)
+    )

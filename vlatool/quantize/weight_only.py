@@ -1,0 +1,224 @@
+"""Weight-only int4 and int8 in blocks, streamed: one tensor at a time, from safetensors shards or from a bundle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from vlatool.bundle import MANIFEST, Bundle, hash_file, manifest_bytes
+from vlatool.data import observations_for, recorded_observations
+from vlatool.errors import BundleError, DataError, require
+from vlatool.finish import SEED, carry_over, finish, history
+from vlatool.manifest import FileRecord, Graph, Manifest
+from vlatool.quantize._blocks import Format
+from vlatool.quantize._compute import records_of
+from vlatool.quantize._graphs import Quantization
+from vlatool.quantize._precision import precision_shares
+from vlatool.quantize._records import Record
+from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shards, weights_fingerprint
+from vlatool.quantize._stream import Written, forget, work_directory, work_root, write_records
+from vlatool.quantize._weights_plan import WeightsPlan, make_plan
+from vlatool.stage import Context, SampleSet, source_of
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+WEIGHTS = "graphs/weights.data"
+LOSSES = "reports/weights.json"
+RUN_BELOW = 1 << 30
+"""Bytes of weights up to which the new bundle is run, when ``verify`` is ``auto``."""
+WORTH_PROCESSES = 1 << 25
+"""Parameters from which processes are started."""
+CALIBRATED = ("gptq", "awq")
+
+
+class WeightOnly(Quantization):
+    """Quantize the weights of MatMul and Gemm to int4 or int8 in blocks; activations stay in float32.
+
+    Works on one tensor at a time, so that a policy of billions of parameters needs little memory: a policy whose
+    policy.yaml has ``weights`` is read from its safetensors shards, without a float32 export. Every weight is compared
+    with what its stored codes mean. A run that was killed goes on where it was.
+    """
+
+    packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnx-ir", "onnxscript", "numpy")
+    streams: ClassVar[bool] = True
+    """Takes a source bundle whose policy describes its shards, without an export before."""
+
+    bits: Literal[4, 8] = Field(4, description="bits of a weight: 4 or 8")
+    block: Literal[32, 64, 128] = Field(32, description="weights that share a scale: 32, 64 or 128")
+    method: Literal["rtn", "hqq", "gptq", "awq"] = Field("rtn", description="how weights are rounded")
+    symmetric: bool = Field(False, description="fix the zero point in the middle")
+    search: bool = Field(True, description="4 bits, rtn and awq: try several ranges for each block")
+    layout: Literal["ort", "qdq"] = Field("ort", description="MatMulNBits, or blocked DequantizeLinear (opset 21)")
+    accuracy_level: int = Field(4, ge=0, le=4, description="MatMulNBits: 4 lets activations be rounded to int8, 1 not")
+    embeddings: Literal["float16", "float32"] = Field("float16", description="how tables that are looked up are kept")
+    calibration: Path | None = Field(None, description="recorded observations for gptq and awq")
+    samples: int = Field(16, ge=1, description="calibration samples for gptq and awq")
+    verify: Literal["auto", "layers", "run"] = Field(
+        "auto", description="compare each layer's weights, or also run the new bundle; auto runs below 1 GiB"
+    )
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The calibration file, when one is given."""
+        return (self.calibration,) if self.calibration else ()
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """There is something to quantize, and calibration data for the methods that need it."""
+        if self.calibration and not self.calibration.is_file():
+            raise DataError(f"There is no calibration file {self.calibration}.")
+        if source is None:
+            return
+        if self.method in CALIBRATED and not recorded_observations(source, 1, self.calibration):
+            raise DataError(
+                f"{source.path} carries no calibration data, which the method {self.method} needs.",
+                "pass --calibration FILE.npz, or use --method rtn or hqq, which need none",
+            )
+        if source.manifest.graphs:
+            super().check(source, profile)
+        elif not takes_shards(source):
+            raise BundleError(
+                f"{source.path} has no graph to quantize, and its policy.yaml names no weights to stream.",
+                "export it first: vlatool export SOURCE -o BUNDLE; or add 'weights: \"*.safetensors\"' to policy.yaml",
+            )
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Plan, stream the weights into one file, write the graphs, and verify."""
+        bundle = source_of(source, self.name())
+        self.check(bundle, None)
+        for package in ("onnx", "onnx_ir"):
+            require(package, "build")
+        context.tell("reading the graphs", None)
+        (out / "graphs").mkdir()
+        plan = make_plan(skeletons_of(bundle, BLOCKED_OPSET), self, bundle, WEIGHTS)
+        samples = SampleSet() if self.method in CALIBRATED else None
+        with work_directory(self.work(bundle)) as place:
+            records = self._records(plan, bundle, place, samples)
+            written = write_records(records, self._identity(plan, bundle), place, _processes(records), context.tell)
+            _link(written.path, out / WEIGHTS)
+            made = self._finish(plan, bundle, out, written, samples, context)
+            forget(place)
+        return made
+
+    def _finish(
+        self,
+        plan: WeightsPlan,
+        bundle: Bundle,
+        out: Path,
+        written: Written,
+        samples: SampleSet | None,
+        context: Context,
+    ) -> Bundle:
+        """Write the graphs and everything else beside the weights, and verify."""
+        opsets = plan.save(out)
+        carry_over(bundle, out)
+        made_by = {**self.made_by(calibration=samples), **_told(written, out / LOSSES)}
+        context.tell("counting", None)
+        graphs = {
+            name: Graph(f"graphs/{name}.onnx", precision_shares(out / f"graphs/{name}.onnx"), opset)
+            for name, opset in opsets.items()
+        }
+        if self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW):
+            context.tell("running the quantized graphs", None)
+            return finish(bundle, out, made_by=made_by, graphs=graphs, observations=observations_for(bundle, 2))
+        return _sealed(bundle, out, written, made_by, graphs)
+
+    @property
+    def form(self) -> Format:
+        """The format of a quantized weight."""
+        return Format(self.bits, self.block, self.symmetric)
+
+    def work(self, source: Bundle) -> Path:
+        """Return the directory in which unfinished work on a source is kept."""
+        weights = hashlib.sha256(f"{self.key(source.hash)} {weights_fingerprint(source)}".encode()).hexdigest()
+        return work_root() / f"{self.name()}-{weights[:16]}"
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Return what a person wants to know about the new bundle."""
+        told = json.loads((made.path / LOSSES).read_text(encoding="utf-8"))
+        again = f", {told['resumed']} of them from the run before" if told["resumed"] else ""
+        if not told["layers"]:
+            return ("no layer was quantized",)
+        return (
+            f"{len(told['layers'])} weights in int{self.bits}, blocks of {self.block}{again}; relative L2 error: "
+            f"mean {told['mean']:.4f}, largest {told['max']:.4f} ({told['worst']})",
+        )
+
+    def _records(self, plan: WeightsPlan, bundle: Bundle, place: Path, samples: SampleSet | None) -> list[Record]:
+        if samples is not None:
+            from vlatool.quantize._calibrated import calibrated_records
+
+            return calibrated_records(plan, bundle, self, place, samples)
+        tolerance = self.form.largest_error
+        return [record for task in plan.tasks for record in records_of(task, self.form, self.choose, tolerance)]
+
+    @property
+    def choose(self) -> str:
+        """How scale and zero point of a block are found: a name in ``METHODS``."""
+        if self.method == "hqq":
+            return "hqq"
+        return "searched" if self.search and self.bits == 4 else "rtn"
+
+    def _identity(self, plan: WeightsPlan, bundle: Bundle) -> str:
+        content = [self.key(bundle.hash), weights_fingerprint(bundle), plan.identity()]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def _processes(records: list[Record]) -> int:
+    """Return how many processes compute: one more than cores, since each waits for the disk at times."""
+    work = sum(record.weights for record in records if record.portable)
+    return min(len(os.sched_getaffinity(0)), 8) + 1 if work >= WORTH_PROCESSES else 0
+
+
+def _link(data: Path, target: Path) -> None:
+    """Give the finished file a second name in the bundle; copy it where the file system is another one."""
+    try:
+        os.link(data, target)
+    except OSError:
+        shutil.copyfile(data, target)
+
+
+def _told(written: Written, file: Path) -> dict[str, Any]:
+    """Write the loss of every layer to ``reports/weights.json``; return what the manifest says of it."""
+    layers = [note for note in written.notes if "error" in note]
+    errors = [note["error"] for note in layers]
+    worst = max(layers, key=lambda note: note["error"])["layer"] if layers else ""
+    mean = sum(errors) / len(errors) if errors else 0.0
+    summary = {"mean": round(mean, 6), "max": round(max(errors, default=0.0), 6), "worst": worst}
+    file.parent.mkdir(exist_ok=True)
+    told = {**summary, "resumed": written.resumed, "layers": layers}
+    file.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    identity = sorted(f"{note['tensor']}:{note.get('first', 0)}:{note['sha256']}" for note in written.notes)
+    digest = hashlib.sha256("\n".join(identity).encode()).hexdigest()
+    return {"weights_sha256": digest, "weight_error": summary}
+
+
+def _sealed(bundle: Bundle, out: Path, written: Written, made_by: dict[str, Any], graphs: dict[str, Graph]) -> Bundle:
+    """Write the manifest without running the graphs; the large file was hashed while it was written."""
+    files = {WEIGHTS: FileRecord(written.sha256, written.bytes)}
+    for path in sorted(path for folder in ("assets", "data", "graphs") for path in (out / folder).rglob("*")):
+        name = path.relative_to(out).as_posix()
+        if path.is_file() and name != WEIGHTS:
+            files[name] = FileRecord(hash_file(path), path.stat().st_size)
+    origin = {key: value for key, value in bundle.manifest.source.items() if key != "arguments"}
+    hashes = {name: record.sha256 for name, record in files.items() if name.startswith("graphs/")}
+    step = {**made_by, "seed": SEED, "input": bundle.hash, "graphs": hashes}
+    manifest: Manifest = replace(
+        bundle.manifest,
+        parent=bundle.hash,
+        made_by=made_by,
+        graphs=graphs,
+        accuracy={},
+        golden="",
+        build=(*history(bundle), step),
+        source=origin,
+        files=dict(sorted(files.items())),
+    )
+    (out / MANIFEST).write_bytes(manifest_bytes(manifest))
+    return Bundle(out, manifest)

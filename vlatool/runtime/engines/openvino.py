@@ -1,0 +1,148 @@
+"""OpenVINO on the CPU."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import GraphError, nearest, require
+
+DEVICE = "CPU"
+HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
+"""What OpenVINO is told to compute in: left alone it silently takes bfloat16 where the processor has it."""
+
+
+class OpenvinoSession:
+    """One ONNX file compiled by OpenVINO for the CPU.
+
+    Args:
+        path: The ONNX file; external data is found beside it.
+        threads: Threads; the cores that this process may use when None.
+        compute: Dtype of what is not quantized: ``float32`` (also when empty) or ``bfloat16``.
+
+    Raises:
+        GraphError: when OpenVINO refuses the file or computes in another dtype than it was told to.
+        MissingExtra: when openvino is not installed.
+    """
+
+    def __init__(self, path: Path, threads: int | None = None, compute: str = "") -> None:
+        openvino = require("openvino", "openvino")
+        if compute not in HINTS:
+            raise GraphError(
+                f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}."
+            )
+        settings = {
+            "INFERENCE_PRECISION_HINT": HINTS[compute],
+            "INFERENCE_NUM_THREADS": threads or len(os.sched_getaffinity(0)),
+            "NUM_STREAMS": 1,
+            "PERFORMANCE_HINT": "LATENCY",
+            "ENABLE_CPU_PINNING": False,
+        }
+        try:
+            core = openvino.Core()
+            model = core.read_model(str(path))
+            self._compiled = core.compile_model(model, DEVICE, settings)
+            self._request = self._compiled.create_infer_request()
+        except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
+            raise GraphError(f"OpenVINO {version_of(openvino)} refuses {path}: {_last_line(error)}") from error
+        self.path = path
+        self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
+        if self.precision != HINTS[compute]:
+            raise GraphError(
+                f"OpenVINO computes {path} in {self.precision} on this processor; wanted {HINTS[compute]}.",
+                "make the bundle for this processor: vlatool optimize",
+            )
+        self._outputs = [(output.get_any_name(), number) for number, output in enumerate(self._compiled.outputs)]
+        self.outputs = [name for name, _ in self._outputs]
+        self.inputs = {port.get_any_name(): _described(port) for port in self._compiled.inputs}
+        self._buffers = self._bound(openvino)
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run the graph: input name -> array, output name -> array.
+
+        Raises:
+            GraphError: when an input is missing or of another dtype, or OpenVINO fails on these inputs.
+        """
+        try:
+            if self._buffers and self._fill(feeds):
+                self._request.infer()
+            else:
+                self._check(feeds)
+                self._request.infer(feeds)
+            return {name: np.array(self._request.get_output_tensor(number).data) for name, number in self._outputs}
+        except GraphError:
+            raise
+        except Exception as error:
+            raise GraphError(f"OpenVINO failed in {self.path.name}: {_last_line(error)}") from error
+
+    def _bound(self, openvino: Any) -> dict[str, NDArray[Any]]:
+        """Give the request arrays of ours as its inputs, once; none when a shape is dynamic or a type not numpy's.
+
+        Python's ``infer(feeds)`` checks and wraps every array at every call.
+        """
+        ports = self._compiled.inputs
+        if any(port.partial_shape.is_dynamic or port.element_type.get_type_name() == "bf16" for port in ports):
+            return {}
+        buffers = {}
+        for port in ports:
+            buffer = np.zeros(tuple(port.shape), port.element_type.to_dtype())
+            self._request.set_tensor(port, openvino.Tensor(buffer, shared_memory=True))
+            buffers[port.get_any_name()] = buffer
+        return buffers
+
+    def _fill(self, feeds: Mapping[str, Any]) -> bool:
+        """Copy the feeds into the request's inputs; say no, for OpenVINO to name the mistake, when one does not fit."""
+        if len(feeds) != len(self._buffers):
+            return False
+        for name, buffer in self._buffers.items():
+            value = feeds.get(name)
+            if not isinstance(value, np.ndarray) or value.shape != buffer.shape or value.dtype != buffer.dtype:
+                return False
+            buffer[...] = value
+        return True
+
+    def _check(self, feeds: Mapping[str, Any]) -> None:
+        """Refuse what OpenVINO takes: a missing input (an earlier run's is left there), another dtype (it casts)."""
+        for port in self._compiled.inputs:
+            name, wanted = port.get_any_name(), np.dtype(port.element_type.to_dtype())
+            value = feeds.get(name)
+            if not isinstance(value, np.ndarray) or value.dtype != wanted:
+                got = "missing" if value is None else str(getattr(value, "dtype", type(value).__name__))
+                raise GraphError(f"OpenVINO failed in {self.path.name}: the input '{name}' is {got}; wanted {wanted}.")
+            axes = self.inputs[name][0]
+            fits = len(axes) == value.ndim and all(isinstance(axis, str) or axis == got for axis, got in zip(
+                axes, value.shape, strict=True))  # fmt: skip
+            if not fits:
+                raise GraphError(
+                    f"OpenVINO failed in {self.path.name}: the input '{name}' has the shape {list(value.shape)}; "
+                    f"wanted {axes}."
+                )
+
+    @staticmethod
+    def version() -> str:
+        """Version of the engine.
+
+        Raises:
+            MissingExtra: when openvino is not installed.
+        """
+        return version_of(require("openvino", "openvino"))
+
+
+def version_of(openvino: Any) -> str:
+    """Return the release number without the build."""
+    return str(openvino.__version__).partition("-")[0]
+
+
+def _described(port: Any) -> tuple[list[Any], str]:
+    shape = [dimension.get_length() if dimension.is_static else str(dimension) for dimension in port.partial_shape]
+    return shape, str(port.element_type.get_type_name())
+
+
+def _last_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return (lines[-1] if lines else type(error).__name__)[:300]

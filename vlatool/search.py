@@ -1,0 +1,278 @@
+"""The search of ``optimize``: engines, methods and mixed-precision plans race each other; losers cost little.
+
+1. Every **variant** (an engine, a method, a compute dtype) is built and tried: a few timed inferences in turns with
+   float32, and its error on calibration observations.
+2. Where variants faster than the best one inside the budget miss the budget, the layers that cost the accuracy are
+   found by running each alone in int8, and left in float in growing numbers until the budget is kept (a mixed-precision
+   plan).
+3. The fastest few inside the budget become candidates, which ``optimize`` measures in full.
+
+Each trial is a cached stage: an interrupted search goes on where it was.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vlatool.benchmark.latency import Latency
+from vlatool.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.errors import VlatoolError
+from vlatool.evaluate.recorded import Recorded
+from vlatool.judge import budget_of
+from vlatool.launch import cached_measure, cached_transform
+from vlatool.profile import Profile
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.recipe import Limits, StageList, stage_entries
+from vlatool.stage import Context, Transform, build_stage
+
+if TYPE_CHECKING:
+    from vlatool.quantize._sensitivity import LayerError
+
+CALIBRATION = "data/calibration.npz"
+FINALISTS = 3
+FINE = 0.9
+"""Share of the budget that a plan may use on calibration observations: those that it is judged on are others."""
+ROUNDS = 5
+"""Plans that are tried for one variant, at most."""
+SECONDS = 120.0
+"""What the sensitivity of all layers may take; fewer samples are used for slow policies."""
+TIMED = 20
+BF16 = ("amx_bf16", "avx512_bf16")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a variant did when it was tried.
+
+    Args:
+        name: Name of the candidate that it may become.
+        stages: What makes it.
+        speedup: Against float32 in ONNX Runtime, from a few inferences; 0 when it could not be made.
+        error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
+        within: Whether ``error`` keeps to the budget.
+        note: What it is, or why it failed.
+    """
+
+    name: str
+    stages: StageList
+    speedup: float = 0.0
+    error: float = math.inf
+    within: bool = False
+    note: str = ""
+
+
+@dataclass
+class Search:
+    """One run of the search.
+
+    Args:
+        baseline: The float32 bundle.
+        limits: The budget.
+        profile: The board; None for this host.
+        cache: Where trials are kept.
+        context: For progress.
+        threads: Intra-op threads.
+    """
+
+    baseline: Bundle
+    limits: Limits
+    profile: Profile | None
+    cache: Path
+    context: Context
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        self.trials: list[Trial] = []
+        self._begun = time.monotonic()
+        self._planned = 1
+        self._layers: list[LayerError] | None = None
+        self._observations = recorded_observations(self.baseline, 256)
+        self.budget = budget_of(self.limits, self.baseline.manifest.spec)
+
+    def run(self, given: Mapping[str, StageList]) -> dict[str, StageList]:
+        """Try everything; return the finalists that are not among the given candidates, fastest first."""
+        variants = {**given, **variants_for(self.profile, calibrated=bool(self._observations))}
+        self._planned = len(variants) + 2 * ROUNDS
+        for name, stages in variants.items():
+            self._try(name, stages, str(stages[-1]))
+        self._repair()
+        chosen = self._finalists()
+        return {trial.name: trial.stages for trial in chosen if trial.name not in given}
+
+    def tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return what was tried, and which layers cost the accuracy, as tables of the report."""
+        found: dict[str, list[dict[str, Any]]] = {
+            "Plans tried by the search": [
+                {
+                    "plan": trial.name,
+                    "speed-up": f"{trial.speedup:.2f}x" if trial.speedup else "",
+                    self.budget.name: f"{trial.error:.4g}" if math.isfinite(trial.error) else "",
+                    "within": "yes" if trial.within else "no",
+                    "note": trial.note,
+                }
+                for trial in sorted(self.trials, key=lambda trial: -trial.speedup)
+            ]
+        }
+        if self._layers:
+            found["Layers by what they cost when they alone are int8"] = [
+                {"layer": layer.name, "error": f"{layer.error:.4g}", "share of MACs": f"{layer.macs_share:.1%}"}
+                for layer in self._layers[:15]
+            ]
+        return found
+
+    def _try(self, name: str, stages: StageList, note: str = "") -> Trial:
+        """Build a plan, time it against float32 and measure its error; failures are trials that say why."""
+        done = len(self.trials)
+        left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
+        told = f", about {left:.0f} s left" if done else ""
+        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{told}: {name}", done / self._planned)
+        quiet = replace(self.context, tell=lambda _what, _share: None)
+        try:
+            bundle = self.baseline
+            for stage in built(stages):
+                stage.check(bundle, self.profile)
+                bundle = cached_transform(stage, bundle, self.cache, quiet)
+            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, cold=False)
+            speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
+            error = self._error(bundle, quiet)
+            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "")
+        except VlatoolError as failure:
+            if failure.exit_code not in (3, 4):
+                raise
+            trial = Trial(name, stages, note=failure.message)
+        self.trials.append(trial)
+        return trial
+
+    def _error(self, bundle: Bundle, context: Context) -> float:
+        count = max(8, min(len(self._observations), 64))
+        recorded = Recorded(data=self.baseline.path / CALIBRATION, baseline=self.baseline.path, samples=count)
+        row = cached_measure(recorded, bundle, self.cache, context).rows[-1]
+        found = self.budget.of(row)
+        return math.inf if found is None or not found.known else found.value
+
+    def _repair(self) -> None:
+        """Leave sensitive layers in float where a plan is fast enough to be worth it, but outside the budget."""
+        for trial in sorted(self.trials, key=lambda trial: -trial.speedup):
+            best = max((other.speedup for other in self.trials if other.within), default=0.0)
+            if trial.within or trial.speedup <= 1.05 * best or not math.isfinite(trial.error):
+                continue
+            stage = built(trial.stages)[-1]
+            if isinstance(stage, StaticInt8) and not stage.elementwise and not stage.attention:
+                self._mix(trial, stage)
+
+    def _mix(self, trial: Trial, stage: StaticInt8) -> None:
+        """Grow the set of layers that stay in float until the budget is kept, then try to shrink it."""
+        layers = self._sensitivities(stage)
+        if not layers:
+            return
+        ranked = sorted(layers, key=lambda layer: -(layer.error**2) / max(layer.macs_share, 1e-4))
+        count = self._estimate(ranked, trial.error)
+        too_few, enough = 0, len(ranked)
+        for _ in range(ROUNDS):
+            if count <= too_few or count >= enough:
+                break
+            names = [layer.name for layer in ranked[:count]]
+            options = {**stage.options(), "exclude": [*stage.exclude, *names]}
+            stages = (*trial.stages[:-1], {stage.name(): options})
+            mixed = self._try(f"{trial.name}_mixed{count}", stages)
+            if mixed.within:
+                enough = count
+                count = (too_few + count) // 2
+            else:
+                too_few = count
+                count = min(2 * count, (count + enough) // 2) if enough < len(ranked) else 2 * count
+
+    def _estimate(self, ranked: list[LayerError], error: float) -> int:
+        """Return how many layers must go, were errors independent: their squares add up."""
+        total = sum(layer.error**2 for layer in ranked) or 1.0
+        allowed = (FINE * self.budget.value / error) ** 2 if error else 1.0
+        kept = 1.0
+        for count, layer in enumerate(ranked, 1):
+            kept -= layer.error**2 / total
+            if kept <= allowed:
+                return count
+        return len(ranked)
+
+    def _sensitivities(self, stage: StaticInt8) -> list[LayerError]:
+        from vlatool.quantize._sensitivity import sensitivities
+
+        if self._layers is None:
+            latency = cached_measure(
+                Latency(iterations=TIMED, threads=self.threads, cold=False), self.baseline, self.cache, self.context
+            ).rows[0].value("latency_p50")  # fmt: skip
+            count = stage.layer_count(self.baseline)
+            samples = int(SECONDS / max(1e-6, count * latency / 1e3))
+            chosen = self._observations[:: max(1, len(self._observations) // max(1, min(8, samples)))]
+            self._layers = sensitivities(self.baseline, stage, None, chosen[: max(1, min(8, samples))], self.context)
+        return self._layers
+
+    def _finalists(self) -> list[Trial]:
+        """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
+        made = [trial for trial in self.trials if trial.speedup > 0]
+        inside = sorted((trial for trial in made if trial.within), key=lambda trial: -trial.speedup)
+        if not inside:
+            return sorted(made, key=lambda trial: trial.error)[:1]
+        fast = [trial for trial in inside if trial.speedup >= 0.8 * inside[0].speedup][:FINALISTS]
+        accurate = min(inside, key=lambda trial: trial.error)
+        return fast if accurate in fast or accurate.speedup < 1.0 else [*fast, accurate]
+
+
+def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageList]:
+    """Return the plans that every search begins with: name -> stages.
+
+    Args:
+        profile: The board; None for this host.
+        calibrated: Whether there is calibration data.
+    """
+    engines = ("ort_cpu", "openvino") if profile is None else tuple(profile.engines)
+    found: dict[str, StageList] = {}
+    if "ort_cpu" in engines:
+        found["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
+        if calibrated:
+            found["static_int8"] = ({"quantize.static_int8": {}},)
+            found["static_int8_mse"] = ({"quantize.static_int8": {"method": "mse"}},)
+    if "openvino" in engines and importlib.util.find_spec("openvino") is not None:
+        found.update(_openvino_variants(has_bfloat16(profile), calibrated))
+    return found
+
+
+def _openvino_variants(bfloat16: bool, calibrated: bool) -> dict[str, StageList]:
+    found: dict[str, StageList] = {}
+    if bfloat16:
+        found["openvino_bf16"] = ({"quantize.bfloat16": {}},)
+    if not calibrated:
+        return found
+    rest = {"compute": "bfloat16"} if bfloat16 else {}
+    for name, options in (
+        ("int8", {}),
+        ("int8_mse", {"method": "mse"}),
+        ("int8_attention", {"attention": True}),
+        ("int8_elementwise", {"elementwise": True}),
+    ):
+        stage = {"layout": "openvino", **rest, **options}
+        found[f"openvino_{name}"] = ({"quantize.static_int8": stage},)
+    return found
+
+
+def has_bfloat16(profile: Profile | None) -> bool:
+    """Say whether the board's processor (this host's, for None) multiplies bfloat16 in hardware."""
+    if profile is not None:
+        return any(name in BF16 for unit in profile.units.values() for name in unit.isa)
+    try:
+        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return False
+    return any(name in flags for name in BF16)
+
+
+def built(stages: Iterable[dict[str, dict[str, Any]]]) -> list[Transform]:
+    """Return the stage objects of a list of entries."""
+    made = [build_stage(name, options or {}) for name, options in stage_entries(tuple(stages))]
+    return [stage for stage in made if isinstance(stage, Transform)]

@@ -1,0 +1,290 @@
+"""Weights in safetensors shards, read a part at a time: nothing is mapped, and the page cache is left alone."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import math
+import mmap
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import SourceError
+
+Array = NDArray[Any]
+ITEM_BYTES = {
+    "BOOL": 1, "U8": 1, "I8": 1, "F8_E4M3": 1, "F8_E5M2": 1, "I16": 2, "U16": 2, "F16": 2, "BF16": 2,
+    "I32": 4, "U32": 4, "F32": 4, "I64": 8, "U64": 8, "F64": 8,
+}  # fmt: skip
+FLOATS = ("F32", "F16", "BF16")
+"""Dtypes that a weight to quantize may have."""
+NUMPY_NAMES = {"bool": "BOOL", "float32": "F32", "float16": "F16", "bfloat16": "BF16", "float64": "F64"} | {
+    f"{kind}int{bits}": f"{letter}{bits}" for kind, letter in (("", "I"), ("u", "U")) for bits in (8, 16, 32, 64)
+}
+INDEX = ".safetensors.index.json"
+PAGE = 4096
+LARGEST_HEADER = 100_000_000
+DIRECT_FROM = 1 << 20
+"""Bytes from which a read goes past the page cache."""
+AGAIN = "download or copy the weights again"
+
+
+@dataclass(frozen=True)
+class StoredTensor:
+    """Where the bytes of one tensor are.
+
+    Args:
+        name: Name in the shard, or of the initializer.
+        file: File that holds it; for messages alone when ``array`` is given.
+        offset: First byte in the file.
+        dtype: As safetensors calls it: ``BF16``, ``F32`` ...
+        shape: Sizes of the axes.
+        array: The bytes themselves, (bytes,) uint8, for a tensor that is in memory anyway.
+    """
+
+    name: str
+    file: Path
+    offset: int
+    dtype: str
+    shape: tuple[int, ...]
+    array: Array | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def count(self) -> int:
+        """Number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def item_bytes(self) -> int:
+        """Bytes of one element."""
+        return ITEM_BYTES[self.dtype]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the tensor."""
+        return self.count * self.item_bytes
+
+
+def stored_array(name: str, array: Array, file: Path) -> StoredTensor:
+    """Return a tensor that is in memory already."""
+    raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+    return StoredTensor(name, file, 0, NUMPY_NAMES[str(array.dtype)], array.shape, raw)
+
+
+def shard_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files of a glob below the policy's folder, sorted.
+
+    Raises:
+        SourceError: when there is none.
+    """
+    files = sorted(path for path in folder.glob(pattern) if path.is_file())
+    if not files:
+        raise SourceError(f"No file in {folder} matches 'weights: {pattern}'.", AGAIN)
+    return files
+
+
+def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
+    """Read the headers of all shards: name -> where the tensor is, in the order of files and offsets.
+
+    Raises:
+        SourceError: when a shard is missing, cut off or no safetensors file, or a tensor is there twice.
+    """
+    files = shard_files(folder, pattern)
+    _check_indexes(files)
+    found: dict[str, StoredTensor] = {}
+    for file in files:
+        for tensor in sorted(read_header(file), key=lambda each: each.offset):
+            if tensor.name in found:
+                raise SourceError(
+                    f"The tensor '{tensor.name}' is in {found[tensor.name].file.name} and in {file.name}.",
+                    "keep one set of shards in the folder",
+                )
+            found[tensor.name] = tensor
+    return found
+
+
+def _check_indexes(files: list[Path]) -> None:
+    """Every shard that an index beside the shards names must be there and hold what the index says."""
+    for index in sorted({path for file in files for path in file.parent.glob(f"*{INDEX}")}):
+        try:
+            named = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
+            wanted = {str(tensor): str(file) for tensor, file in named.items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise SourceError(f"{index} is no index of safetensors shards: {error!r}.", AGAIN) from error
+        for name in sorted(set(wanted.values())):
+            if not (index.parent / name).is_file():
+                raise SourceError(f"{index} names the shard {name}, which is missing.", AGAIN)
+        held = {name: {each.name for each in read_header(index.parent / name)} for name in set(wanted.values())}
+        for tensor, name in wanted.items():
+            if tensor not in held[name]:
+                raise SourceError(f"{index} says that '{tensor}' is in {name}, which does not hold it.", AGAIN)
+
+
+def read_header(file: Path) -> list[StoredTensor]:
+    """Return what a safetensors file holds, reading its header alone.
+
+    Raises:
+        SourceError: naming what is wrong with the file.
+    """
+    header, start, size = _header_bytes(file)
+    try:
+        entries = json.loads(header)
+    except ValueError as error:
+        raise SourceError(f"{file} has a damaged safetensors header: {error}.", AGAIN) from error
+    if not isinstance(entries, Mapping):
+        raise SourceError(f"{file} has a damaged safetensors header: it is no mapping.", AGAIN)
+    return [_entry(file, str(name), entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
+
+
+def _header_bytes(file: Path) -> tuple[bytes, int, int]:
+    """Return the header, where the data starts, and the size of the file."""
+    try:
+        with file.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            length = struct.unpack("<Q", stream.read(8))[0] if size >= 8 else 0
+            if not 2 <= length <= min(size - 8, LARGEST_HEADER):
+                raise SourceError(
+                    f"{file} is no safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
+                    AGAIN,
+                )
+            return stream.read(length), 8 + length, size
+    except OSError as error:
+        raise SourceError(f"{file} cannot be read: {error.strerror}.") from error
+
+
+def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTensor:
+    try:
+        dtype, shape = str(entry["dtype"]), tuple(int(axis) for axis in entry["shape"])
+        begin, end = (int(offset) for offset in entry["data_offsets"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", AGAIN) from error
+    if dtype not in ITEM_BYTES:
+        raise SourceError(f"{file} holds '{name}' as {dtype}; known dtypes: {', '.join(ITEM_BYTES)}.")
+    tensor = StoredTensor(name, file, start + begin, dtype, shape)
+    if min((0, *shape)) < 0 or begin < 0 or end - begin != tensor.nbytes:
+        raise SourceError(
+            f"{file} has a damaged safetensors header: '{name}' {list(shape)} {dtype} cannot take {end - begin} bytes.",
+            AGAIN,
+        )
+    if start + end > size:
+        raise SourceError(f"{file} is cut off: it has {size} bytes, '{name}' ends at {start + end}.", AGAIN)
+    return tensor
+
+
+def fingerprint(files: list[Path]) -> str:
+    """Return a SHA-256 over name, size, time of change and header of files: it changes when the weights do."""
+    digest = hashlib.sha256()
+    for file in files:
+        state = file.stat()
+        digest.update(f"{file.name}:{state.st_size}:{state.st_mtime_ns}:".encode())
+        digest.update(_header_bytes(file)[0] if file.suffix == ".safetensors" else b"")
+    return digest.hexdigest()
+
+
+def sampled_hash(files: list[Path]) -> str:
+    """Return a SHA-256 over name, size, header and the first 4 KiB of every tensor of shards.
+
+    It is the same for a copy elsewhere, and other for retrained weights; a change of single numbers deep inside a
+    tensor can escape it, which hashing all of 13 GB would not, for ten times the time.
+    """
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(f"{file.name}:{file.stat().st_size}:".encode())
+        with file.open("rb") as stream:
+            for tensor in read_header(file):
+                digest.update(f"{tensor.name}:{tensor.dtype}:{tensor.shape}:".encode())
+                stream.seek(tensor.offset)
+                digest.update(stream.read(min(PAGE, tensor.nbytes)))
+    return digest.hexdigest()
+
+
+class Reader:
+    """Reads parts of tensors into one buffer; for one thread. Large reads go past the page cache where that works."""
+
+    def __init__(self) -> None:
+        self._files: dict[tuple[Path, bool], int] = {}
+        self._buffer: mmap.mmap | None = None
+
+    def read(self, tensor: StoredTensor, begin: int, size: int) -> Array:
+        """Return bytes ``begin`` to ``begin + size`` of a tensor as (size,) uint8, valid until the next call.
+
+        Raises:
+            SourceError: when the file is shorter than its header says, or cannot be read.
+        """
+        if tensor.array is not None:
+            return tensor.array[begin : begin + size]
+        start = tensor.offset + begin
+        aligned = start - start % PAGE
+        wanted = -(-(start + size - aligned) // PAGE) * PAGE
+        buffer = self._room(wanted)
+        try:
+            got = self._fill(tensor.file, memoryview(buffer)[:wanted], aligned, start + size - aligned)
+        except OSError as error:
+            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.") from error
+        if got < start + size - aligned:
+            raise SourceError(f"{tensor.file} is cut off: it ends within '{tensor.name}'.", AGAIN)
+        return np.frombuffer(buffer, np.uint8, size, start - aligned)
+
+    def _room(self, size: int) -> mmap.mmap:
+        if self._buffer is None or len(self._buffer) < size:
+            self._buffer = mmap.mmap(-1, size)
+        return self._buffer
+
+    def _fill(self, file: Path, view: memoryview, offset: int, needed: int) -> int:
+        direct = len(view) >= DIRECT_FROM
+        got = 0
+        while got < needed:
+            try:
+                step = os.preadv(self._open(file, direct), [view[got:]], offset + got)
+            except OSError as error:
+                if not direct or error.errno != errno.EINVAL:
+                    raise
+                direct = False
+                continue
+            if step <= 0:
+                break
+            got += step
+            direct = direct and got % PAGE == 0
+        return got
+
+    def _open(self, file: Path, direct: bool) -> int:
+        key = (file, direct)
+        if key not in self._files:
+            self._files[key] = open_direct(file, os.O_RDONLY) if direct else os.open(file, os.O_RDONLY)
+        return self._files[key]
+
+    def close(self) -> None:
+        """Close all files."""
+        for handle in self._files.values():
+            with contextlib.suppress(OSError):
+                os.close(handle)
+        self._files.clear()
+
+
+def open_direct(file: Path, flags: int) -> int:
+    """Open a file past the page cache, or, where the file system cannot, through it."""
+    try:
+        return os.open(file, flags | getattr(os, "O_DIRECT", 0), 0o666)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+        return os.open(file, flags, 0o666)
+
+
+@contextlib.contextmanager
+def reading() -> Iterator[Reader]:
+    """Yield a reader that is closed at the end."""
+    reader = Reader()
+    try:
+        yield reader
+    finally:
+        reader.close()
