@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from _interleave import CLOCKS, Contestant
+from _workload import Array
 
 from vlatool.statistics import quantile_interval
 
@@ -58,10 +59,20 @@ class Table:
 
     def relative(self, row: Contestant, other: Contestant) -> float:
         """Return the latency of a row over that of another, within rounds where both took turns."""
-        if row.group == other.group:
-            pairs = zip(row.rounds[self.clock], other.rounds[self.clock], strict=True)
-            return float(np.median([own / theirs for own, theirs in pairs]))
-        return self.speedup(other)[0] / self.speedup(row)[0]
+        ratios = self._ratios(row, other)
+        return self.speedup(other)[0] / self.speedup(row)[0] if ratios is None else float(np.median(ratios))
+
+    def _ratios(self, row: Contestant, other: Contestant) -> Array | None:
+        if row.group != other.group:
+            return None
+        return np.asarray(row.rounds[self.clock]) / np.asarray(other.rounds[self.clock])
+
+    def share(self, row: Contestant, other: Contestant) -> str:
+        """Return ``relative`` with its interval where there is one."""
+        ratios = self._ratios(row, other)
+        _, low, high = (0.0, None, None) if ratios is None else quantile_interval(ratios, 0.5)
+        bounds = f" ({low:.3f}-{high:.3f})" if low is not None and high is not None else ""
+        return f"{self.relative(row, other):.3f}{bounds}"
 
     def dominates(self, row: Contestant, other: Contestant) -> bool:
         """Say whether a row is faster by more than the tolerance and at most as wrong."""
@@ -111,7 +122,10 @@ class Table:
         names = ", ".join(f"'{row.name}'" for row in frontier)
         if not beaten:
             return Check(True, f"(a) no peer dominates a point of our frontier: {names}")
-        lines = [f"{self.told(row)} is dominated by {self.told(by)}" for row, by in beaten]
+        lines = [
+            f"{self.told(row)} is dominated by {self.told(by)}, which takes {self.share(by, row)} of its time"
+            for row, by in beaten
+        ]
         return Check(False, "(a) " + "; ".join(lines))
 
     def _check_budget(self, ours: Sequence[Contestant]) -> Check:
@@ -122,9 +136,8 @@ class Table:
         return Check(reached, f"(b) our fastest at error <= {BUDGET}: {self.told(inside[0])}; wanted {TARGET:g}x")
 
     def _check_fastest(self, own: Contestant, peer: Contestant) -> Check:
-        ratio = self.relative(own, peer)
-        text = f"(c) our fastest {self.told(own)} takes {ratio:.3f} of the time of the fastest peer {self.told(peer)}"
-        return Check(ratio <= 1 + TOLERANCE, text)
+        text = f"(c) our fastest {self.told(own)} takes {self.share(own, peer)} of the time of the fastest peer "
+        return Check(self.relative(own, peer) <= 1 + TOLERANCE, text + self.told(peer))
 
     def lines(self) -> list[str]:
         """Return the table in Markdown."""

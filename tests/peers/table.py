@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -177,7 +178,14 @@ def share(rows: Sequence[Contestant]) -> str:
     """Say how much of the core was ours: the less, the more the neighbours' use of the caches is in the figures."""
     reference = next(row for row in rows if row.name == REFERENCE)
     found = sum(reference.rounds["cpu"]) / sum(reference.rounds["wall"])
-    return f"Neighbours left {found:.0%} of the core to the run."
+    text = f"Neighbours left {found:.0%} of the core to the run."
+    for row in rows:
+        if row.name == f"{MARK}float32" and row.rounds["cpu"]:
+            ratios = [own / base for own, base in zip(row.rounds["cpu"], row.reference["cpu"], strict=True)]
+            text += (
+                f" Control: {row.name}, the same graph in another process, took {median(ratios):.3f} of {REFERENCE}."
+            )
+    return text
 
 
 def tell(line: str) -> None:
