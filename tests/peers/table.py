@@ -178,7 +178,8 @@ def share(rows: Sequence[Contestant]) -> str:
     """Say how much of the core was ours: the less, the more the neighbours' use of the caches is in the figures."""
     reference = next(row for row in rows if row.name == REFERENCE)
     found = sum(reference.rounds["cpu"]) / sum(reference.rounds["wall"])
-    text = f"Neighbours left {found:.0%} of the core to the run."
+    low, high = min(reference.rounds["cpu"]), max(reference.rounds["cpu"])
+    text = f"Neighbours left {found:.0%} of the core to the run; {REFERENCE} took {low:.0f}-{high:.0f} ms in a round."
     for row in rows:
         if row.name == f"{MARK}float32" and row.rounds["cpu"]:
             ratios = [own / base for own, base in zip(row.rounds["cpu"], row.reference["cpu"], strict=True)]
