@@ -13,6 +13,7 @@ import pytest
 from vlatool.bundle import Bundle, seal
 from vlatool.cli import main
 
+SMOOTH = "candidates: {smooth: [quantize.smooth_quant: {}]}\neffort: {episodes: 0, iterations: 20}\n"
 RECIPE = """\
 candidates:
   small:
@@ -147,7 +148,7 @@ def test_the_wrong_call_and_the_wrong_source_have_their_own_codes(vlatool, quant
     assert vlatool("rebuild", "--help")[1].startswith("Usage:")
 
 
-def test_what_optimize_hands_out_is_made_again_and_what_is_made_of_that(vlatool, source, tmp_path):
+def test_what_optimize_hands_out_is_made_again(vlatool, source, tmp_path):
     (tmp_path / "recipe.yaml").write_text(RECIPE)
     chosen = tmp_path / "chosen"
     line = ["optimize", source, "--profile", "raspberry-pi-5", "--recipe", tmp_path / "recipe.yaml", "-o", chosen]
@@ -161,6 +162,13 @@ def test_what_optimize_hands_out_is_made_again_and_what_is_made_of_that(vlatool,
     seal(chosen, replace(bundle.manifest, accuracy={"success": {"value": 0.5, "samples": 3}}))
     assert vlatool("rebuild", chosen, "--source", source, "--check")[0] == 0
 
+
+def test_what_is_made_of_what_optimize_hands_out_is_made_again(vlatool, source, tmp_path):
+    """The only candidate is a float32 one, so that whatever is chosen can be quantized."""
+    (tmp_path / "recipe.yaml").write_text(SMOOTH)
+    chosen = tmp_path / "chosen"
+    line = ["optimize", source, "--profile", "raspberry-pi-5", "--recipe", tmp_path / "recipe.yaml", "-o", chosen]
+    assert vlatool(*line, "--max-drop", "100%")[0] == 0
     derived = tmp_path / "derived"
     assert vlatool("quantize", "dynamic-int8", chosen, "-o", derived)[0] == 0
     assert [entry["stage"] for entry in Bundle.open(derived).manifest.build][-2:] == [

@@ -20,6 +20,7 @@ from onnx import numpy_helper
 
 from vlatool.bundle import Bundle, seal
 from vlatool.cli import main
+from vlatool.data._doubts import _of_channels
 from vlatool.errors import VlatoolError
 from vlatool.launch import run_transform
 from vlatool.quantize.bfloat16 import Bfloat16
@@ -27,6 +28,7 @@ from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.sources.onnx import OnnxFile
+from vlatool.spec import TensorSpec
 from vlatool.stage import Context, Transform
 
 Array = Any
@@ -313,3 +315,9 @@ def test_a_graph_whose_axes_are_free_is_calibrated(tmp_path: Path) -> None:
             observation = {"cloud": random.standard_normal((points, 3)).astype(np.float32)}
             got, wanted = (load(each.path, threads=1).infer(observation).chunk for each in (made, source))
             assert np.linalg.norm(got - wanted) <= 0.15 * np.linalg.norm(wanted), (layout, points, got, wanted)
+
+
+def test_a_scalar_input_that_changes_from_sample_to_sample_is_no_constant_channel() -> None:
+    tensor = TensorSpec("time", (1,), "float32")
+    assert list(_of_channels("'time'", tensor, np.linspace(0, 1, 8, dtype=np.float32))) == []
+    assert len(list(_of_channels("'time'", tensor, np.full(8, 0.5, np.float32)))) == 1

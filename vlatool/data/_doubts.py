@@ -94,7 +94,7 @@ def _of_channels(where: str, tensor: TensorSpec, values: Array) -> Iterator[str]
     """Find channels (entries of the last axis) that never change."""
     if len(values) < 2 or not values.size:
         return
-    rows = values.reshape(-1, values.shape[-1])
+    rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values.reshape(-1, 1)
     constant = np.flatnonzero(rows.min(0) == rows.max(0)).tolist()
     if constant:
         named = ", ".join(
