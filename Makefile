@@ -49,7 +49,7 @@ robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnx
 
 peers:  ## measure other tools and our bundles on six workloads, interleaved (about an hour)
 	@test -x $(OUT)/peers/venv/bin/python || $(PYTHON) -m venv $(OUT)/peers/venv
-	$(OUT)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check -r tests/peers/requirements.txt -e '.[ort,build]'
+	$(OUT)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/peers/requirements.txt -e '.[ort,build]'
 	PYTHONPATH=. $(OUT)/peers/venv/bin/python tests/peers/table.py
 
 docs: $(VENV)/.dev  ## write docs/reference from the code

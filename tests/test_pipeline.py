@@ -202,6 +202,28 @@ def test_progress_goes_to_stderr(from_torch):
         assert step in from_torch.stderr
 
 
+def test_a_metric_that_is_not_measured_is_refused_before_the_search(run):
+    wrong = run("--max-drop", "relative_eror=0.1")
+    assert wrong.code == 3
+    assert "did you mean 'relative_error'" in wrong.stderr
+    assert "quantize" not in wrong.stderr
+    assert not wrong.out.exists()
+
+
+def test_a_metric_without_observations_is_refused_before_the_search(model, tmp_path):
+    (model.parent / "evaluation.npz").unlink()
+    wrong = optimize(model, tmp_path / "out", tmp_path / "cache", "--max-drop", "relative_error=0.1")
+    assert wrong.code == 3
+    assert "needs recorded observations" in wrong.stderr
+    assert "quantize" not in wrong.stderr
+
+
+def test_the_summary_says_which_engine_the_robot_needs(run, recipe):
+    mine = recipe("candidates: {mine: [quantize.static_int8: {samples: 8, layout: openvino}]}")
+    needs = "It runs on the engine openvino: pip install 'vlatool[openvino]' on the robot."
+    assert needs in run(*NEAREST, *mine).report.summary
+
+
 # ---- repeat
 
 

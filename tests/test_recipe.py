@@ -33,6 +33,13 @@ def test_a_short_recipe_has_defaults(tmp_path: Path):
     assert recipe.effort == Effort()
 
 
+@pytest.mark.parametrize("limits", [{"metric": "relative_error"}, {"max_metric": 0.1}])
+def test_a_metric_and_its_bound_belong_together(tmp_path: Path, limits):
+    data = {"schema": 1, "candidates": {"a": [{"quantize.dynamic_int8": {}}]}, "limits": limits}
+    with pytest.raises(RecipeError, match="metric and max_metric belong together"):
+        read_recipe(write(tmp_path, data))
+
+
 def test_stage_entries_are_names_with_options():
     stages = ({"export.onnx": {"opset": 20}}, {"quantize.static_int8": {}})
     assert stage_entries(stages) == [("export.onnx", {"opset": 20}), ("quantize.static_int8", {})]

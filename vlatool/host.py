@@ -6,6 +6,7 @@ is None, never 0. Nothing here names the host, a user or a path: reports are sha
 
 from __future__ import annotations
 
+import os
 import platform
 import re
 from collections.abc import Iterable, Mapping
@@ -267,3 +268,11 @@ def versions(distributions: Iterable[str] = DISTRIBUTIONS) -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def cache_directory() -> Path:
+    """Return where finished stages are kept: ``$VLATOOL_CACHE``, or ``vlatool`` in the user's cache directory."""
+    named = os.environ.get("VLATOOL_CACHE")
+    if named:
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vlatool"

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from vlatool.errors import RecipeError, nearest
 from vlatool.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -45,6 +46,22 @@ class Budget:
             alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
             return max(alike, key=lambda m: m.value, default=None)
         return row.get(self.name) or row.get(f"error_baseline.{self.name}")
+
+    def found(self, row: Row) -> Measurement:
+        """Return the measurement of a row that the budget is about.
+
+        Raises:
+            RecipeError: when the row has none of that name; names those that it has.
+        """
+        found = self.of(row)
+        if found is not None:
+            return found
+        known = [each.name.removeprefix("error_baseline.") for each in row.measurements if each.origin == "measured"]
+        units = {f"unit:{each.unit}" for each in row.measurements if each.name.startswith("error_baseline.")}
+        raise RecipeError(
+            f"--max-drop names '{self.name}', which is not measured on this policy; "
+            f"{nearest(self.name, [*known, *sorted(units)])}."
+        )
 
 
 def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:

@@ -10,7 +10,7 @@ from typing import Any
 
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle import Bundle, writing
-from vlatool.errors import RecipeError, SourceError, VlatoolError
+from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate._paired import compare_success
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
@@ -18,13 +18,14 @@ from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
 from vlatool.host import fingerprint, matches
-from vlatool.judge import Judged, choose, judge
+from vlatool.judge import Judged, budget_of, choose, judge
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.predict import predictions
 from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
 from vlatool.report import Measurement, Report, Row
+from vlatool.runtime.policy import DEFAULT_ENGINE
 from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
 from vlatool.sources.onnx import OnnxFile
@@ -149,6 +150,7 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
     with writing(out, force=force) as draft:
         source = cached_transform(plan.source, None, plan.cache, context)
         baseline = _chain(plan.export, source, plan, context)
+        _check_metric(plan, baseline, context)
         plan, searched = _searched(plan, baseline, context)
         bundles, failures = _candidates(plan, baseline, context)
         rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
@@ -158,12 +160,36 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
         tables = {**searched, **_explained(judged, bundles, baseline, context)}
         judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
-        report = _report(plan, baseline, judged, failures, warnings, context)
         chosen = next(item.row for item in judged if item.row.role == "chosen")
         chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
+        report = _report(plan, baseline, judged, failures, warnings, context)
+        report = replace(report, summary=(*report.summary, *_needs(chosen_bundle)))
         _write_bundle(plan, chosen, chosen_bundle, draft)
         write_reports(report, draft / "reports")
     return report
+
+
+def _needs(bundle: Bundle) -> tuple[str, ...]:
+    """Say what the robot must have installed beside the default engine."""
+    engine = bundle.manifest.engine
+    if engine in ("", DEFAULT_ENGINE):
+        return ()
+    return (f"It runs on the engine {engine}: pip install 'vlatool[{engine}]' on the robot.",)
+
+
+def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
+    """Say before the work, not after it, that a budget names what is not measured."""
+    limits = plan.recipe.limits
+    if not limits.metric:
+        return
+    if EVALUATION not in baseline.manifest.files:
+        raise DataError(
+            f"--max-drop names '{limits.metric}', which needs recorded observations; the policy brings none to be "
+            "evaluated on.",
+            "name evaluation.npz in policy.yaml, or give a drop in points such as 1%",
+        )
+    recorded = Recorded(baseline=baseline.path, samples=1)
+    budget_of(limits, baseline.manifest.spec).found(cached_measure(recorded, baseline, plan.cache, context).rows[-1])
 
 
 def _with_tables(item: Judged, tables: dict[str, list[dict[str, Any]]]) -> Judged:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vlatool.errors import RecipeError, require
 
@@ -24,6 +24,12 @@ class Limits(BaseModel):
     hz: float | None = Field(None, gt=0, description="inferences per second")
     max_latency_ms: float | None = Field(None, gt=0, description="largest latency of one inference")
     max_memory_mb: float | None = Field(None, gt=0, description="largest memory of the process, 10^6 bytes")
+
+    @model_validator(mode="after")
+    def _metric_has_a_bound(self) -> Limits:
+        if bool(self.metric) != (self.max_metric is not None):
+            raise ValueError("metric and max_metric belong together")
+        return self
 
     @property
     def latency_ms(self) -> float | None:

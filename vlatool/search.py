@@ -12,6 +12,7 @@ Each trial is a cached stage: an interrupted search goes on where it was.
 
 from __future__ import annotations
 
+import glob
 import importlib.util
 import math
 import time
@@ -43,6 +44,8 @@ ROUNDS = 5
 """Plans that are tried for one variant, at most."""
 SECONDS = 120.0
 """What the sensitivity of all layers may take; fewer samples are used for slow policies."""
+SAMPLES = 8
+"""Observations on which it is measured, at most."""
 TIMED = 20
 BF16 = ("amx_bf16", "avx512_bf16")
 
@@ -57,7 +60,7 @@ class Trial:
         speedup: Against float32 in ONNX Runtime, from a few inferences; 0 when it could not be made.
         error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
         within: Whether ``error`` keeps to the budget.
-        note: What it is, or why it failed.
+        note: Why it could not be made.
     """
 
     name: str
@@ -101,7 +104,7 @@ class Search:
         variants = {**given, **variants_for(self.profile, calibrated=bool(self._observations))}
         self._planned = len(variants) + 2 * ROUNDS
         for name, stages in variants.items():
-            self._try(name, stages, str(stages[-1]))
+            self._try(name, stages)
         self._repair()
         chosen = self._finalists()
         return {trial.name: trial.stages for trial in chosen if trial.name not in given}
@@ -127,7 +130,7 @@ class Search:
             ]
         return found
 
-    def _try(self, name: str, stages: StageList, note: str = "") -> Trial:
+    def _try(self, name: str, stages: StageList) -> Trial:
         """Build a plan, time it against float32 and measure its error; failures are trials that say why."""
         done = len(self.trials)
         left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
@@ -142,7 +145,7 @@ class Search:
             timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, cold=False)
             speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
             error = self._error(bundle, quiet)
-            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "")
+            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value)
         except VlatoolError as failure:
             if failure.exit_code not in (3, 4):
                 raise
@@ -178,7 +181,7 @@ class Search:
         for _ in range(ROUNDS):
             if count <= too_few or count >= enough:
                 break
-            names = [layer.name for layer in ranked[:count]]
+            names = [glob.escape(layer.name) for layer in ranked[:count]]
             options = {**stage.options(), "exclude": [*stage.exclude, *names]}
             stages = (*trial.stages[:-1], {stage.name(): options})
             mixed = self._try(f"{trial.name}_mixed{count}", stages)
@@ -204,13 +207,8 @@ class Search:
         from vlatool.quantize._sensitivity import sensitivities
 
         if self._layers is None:
-            latency = cached_measure(
-                Latency(iterations=TIMED, threads=self.threads, cold=False), self.baseline, self.cache, self.context
-            ).rows[0].value("latency_p50")  # fmt: skip
-            count = stage.layer_count(self.baseline)
-            samples = int(SECONDS / max(1e-6, count * latency / 1e3))
-            chosen = self._observations[:: max(1, len(self._observations) // max(1, min(8, samples)))]
-            self._layers = sensitivities(self.baseline, stage, None, chosen[: max(1, min(8, samples))], self.context)
+            chosen = self._observations[:: max(1, len(self._observations) // SAMPLES)][:SAMPLES]
+            self._layers = sensitivities(self.baseline, stage, None, chosen, self.context, seconds=SECONDS)
         return self._layers
 
     def _finalists(self) -> list[Trial]:

@@ -129,6 +129,13 @@ class Stage(BaseModel):
 class Transform(Stage):
     """A stage that makes a bundle."""
 
+    streams: ClassVar[bool] = False
+    """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Return what else a person wants to know about the new bundle, a sentence for each line."""
+        return ()
+
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the new bundle into the empty directory ``out`` and return it."""
         raise NotImplementedError(self.name())

@@ -27,20 +27,6 @@ from vlatool.stage import Context
 FAST = ["--iterations", "20", "--no-cold"]
 
 
-@pytest.fixture
-def vlatool(capsys):
-    """Run a command line in this process; return status, stdout and stderr."""
-
-    def run(*line: Any) -> tuple[int, str, str]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as left:
-            main([str(part) for part in line])
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return run
-
-
 def process(*line: Any, **settings: Any) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, *map(str, line)]
     return subprocess.run(command, capture_output=True, text=True, check=False, **settings)

@@ -6,12 +6,10 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from vlatool.bundle import Bundle, seal
-from vlatool.cli import main
 
 SMOOTH = "candidates: {smooth: [quantize.smooth_quant: {}]}\neffort: {episodes: 0, iterations: 20}\n"
 RECIPE = """\
@@ -21,20 +19,6 @@ candidates:
 limits: {max_drop: 1.0}
 effort: {episodes: 0, iterations: 20}
 """
-
-
-@pytest.fixture
-def vlatool(capsys):
-    """Run a command line in this process; return status, stdout and stderr."""
-
-    def run(*line: Any) -> tuple[int, str, str]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as left:
-            main([str(part) for part in line])
-        told = capsys.readouterr()
-        return left.value.code or 0, told.out, told.err
-
-    return run
 
 
 @pytest.fixture

@@ -10,8 +10,9 @@ import onnx.parser
 import onnxruntime
 from onnx import numpy_helper
 
+from vlatool.quantize._layers import Layer, Style, find_layers, hoisted, wanted_values
 from vlatool.quantize._nodes import name_nodes
-from vlatool.quantize._qdq import Layer, Style, find_layers, hoisted, insert_qdq, wanted_values
+from vlatool.quantize._qdq import insert_qdq
 
 Array = np.ndarray[Any, Any]
 OPS = ("MatMul", "Gemm", "Conv")

@@ -10,8 +10,8 @@ import pytest
 from _qdq_reference import IMAGE, OPS, STYLES, X, close, conv, graph, quantized, rounded, rounded_weight, run, weight
 
 from vlatool.errors import GraphError
+from vlatool.quantize._layers import find_layers, hoisted, split_gemm
 from vlatool.quantize._nodes import name_nodes
-from vlatool.quantize._qdq import find_layers, hoisted, split_gemm
 from vlatool.quantize._reductions import keep_axes
 from vlatool.runtime.engines.openvino import OpenvinoSession
 

@@ -24,8 +24,9 @@ from _qdq_reference import (
 )
 
 from vlatool.errors import GraphError
+from vlatool.quantize._layers import Layer, Style, check_weights, find_layers
 from vlatool.quantize._nodes import read_names
-from vlatool.quantize._qdq import Layer, Style, check_weights, find_layers, quantize_weight
+from vlatool.quantize._qdq import quantize_weight
 
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES)

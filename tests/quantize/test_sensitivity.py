@@ -8,7 +8,7 @@ from vlatool.errors import DataError, GraphError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.launch import run_transform
 from vlatool.quantize._graphs import load as load_graph
-from vlatool.quantize._qdq import find_layers
+from vlatool.quantize._layers import find_layers
 from vlatool.quantize._sensitivity import Switchboard, group_sensitivities, ranges_of, sensitivities
 from vlatool.quantize._switches import add_switches
 from vlatool.quantize.static_int8 import StaticInt8
@@ -124,7 +124,7 @@ def test_the_graph_with_switches_is_valid_onnx(float_bundle):
 
 def test_without_an_observation_nothing_is_said(float_bundle):
     with pytest.raises(DataError, match="no observation"):
-        sensitivities(float_bundle, StaticInt8(samples=4), None, [], Context())
+        sensitivities(float_bundle, StaticInt8(samples=8), None, [], Context())
 
 
 FLOW_YAML = """\

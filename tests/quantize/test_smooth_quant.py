@@ -11,7 +11,7 @@ from vlatool.bundle import Bundle, seal
 from vlatool.errors import BundleError, DataError, GraphError, RecipeError
 from vlatool.manifest import Graph
 from vlatool.quantize._graphs import load, save
-from vlatool.quantize._qdq import find_layers
+from vlatool.quantize._layers import find_layers
 from vlatool.quantize._smooth_groups import find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.quantize.smooth_quant import SmoothQuant, _Writer
@@ -251,20 +251,20 @@ def test_int8_of_a_policy_with_outliers_gains(quantized, drift, float_bundle, co
 
 
 def test_only_chosen_layers_are_smoothed(quantized, drift):
-    bundle = quantized(SmoothQuant(samples=4, include=("blocks.0.mlp*",)))
+    bundle = quantized(SmoothQuant(samples=8, include=("blocks.0.mlp*",)))
     assert {name.split("/")[0] for note in report(bundle) for name in note["layers"]} <= {
         "blocks.0.mlp.1",
         "blocks.0.mlp.3",
     }
     assert drift(bundle) < 1e-5
-    calm = quantized(SmoothQuant(samples=4, outliers=1000))
+    calm = quantized(SmoothQuant(samples=8, outliers=1000))
     assert {note["why"] for note in report(calm)} == {"it has no outlier channels"}
     with pytest.raises(RecipeError, match="No node matches"):
-        quantized(SmoothQuant(samples=4, exclude=("nothing",)))
+        quantized(SmoothQuant(samples=8, exclude=("nothing",)))
 
 
 def test_equal_inputs_give_equal_bytes(quantized):
-    first, second = (quantized(SmoothQuant(samples=4, alpha="auto")) for _ in range(2))
+    first, second = (quantized(SmoothQuant(samples=8, alpha="auto")) for _ in range(2))
     assert first.hash == second.hash
 
 
@@ -296,4 +296,4 @@ def test_a_changed_action_is_refused(quantized, monkeypatch):
     monkeypatch.setattr(_Writer, "_multiply", lambda *_: None)
     monkeypatch.setattr("vlatool.quantize.smooth_quant.SAME", -1.0)
     with pytest.raises(GraphError, match="changed the golden action"):
-        quantized(SmoothQuant(samples=4))
+        quantized(SmoothQuant(samples=8))

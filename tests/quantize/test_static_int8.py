@@ -114,9 +114,10 @@ def test_only_gemm_is_quantized_when_only_gemm_is_asked_for(quantized, operators
     assert operators(quantized(StaticInt8(samples=8, ops=("Gemm",))))["MatMulIntegerToFloat"] == 2  # state and head
 
 
-def test_layers_are_counted_before_the_work(float_bundle):
-    assert StaticInt8().layer_count(float_bundle) == 8
-    assert StaticInt8(attention=True).layer_count(float_bundle) == 10
+def test_the_plan_knows_its_layers_before_the_work(float_bundle):
+    for stage, count in ((StaticInt8(), 8), (StaticInt8(attention=True), 10)):
+        layers, _ = stage.plan(float_bundle)
+        assert sum(map(len, layers.values())) == count
 
 
 def test_a_glob_that_matches_no_node_is_a_typing_error(quantized):

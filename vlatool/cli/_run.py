@@ -83,7 +83,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         typer.echo(json.dumps({**summary, "precision": precision}))
         return
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
-    for line in stage.lines(made) if hasattr(stage, "lines") else ():
+    for line in stage.lines(made):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
@@ -93,7 +93,7 @@ def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
     """Return the bundle of a policy whose weights the stage reads from their shards itself, None for any other."""
     from vlatool.pipeline import sourced
 
-    if not getattr(stage, "streams", False):
+    if not stage.streams:
         return None
     bundle = sourced(source, cache_directory(), context)
     try:

@@ -49,13 +49,14 @@ def optimize(
     from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
 
     board = load_profile(profile) if profile else None
-    if hz is not None and not math.isfinite(hz):
-        raise UsageError(f"--hz is {hz}; allowed: a rate in Hz above 0.")
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
     asked: dict[str, Any] = {} if max_drop is None else budget(max_drop)
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
-    asked |= {name: value for name, value in limits.items() if value is not None}
+    for name, value in limits.items():
+        if value is not None and not math.isfinite(value):
+            raise UsageError(f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.")
+        asked |= {} if value is None else {name: value}
     if recipe is None:
         calibrated = pipeline.brings_calibration(source)
         chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine if board else "ort_cpu")
@@ -91,7 +92,7 @@ def budget(text: str) -> dict[str, Any]:
     physical = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*([A-Za-z][A-Za-z/]*)\s*", text)
     if physical:
         return {"metric": f"unit:{physical[2]}", "max_metric": float(physical[1])}
-    return {"max_drop": share(text)}
+    return {"max_drop": share(text), "metric": "", "max_metric": None}
 
 
 def share(text: str) -> float:

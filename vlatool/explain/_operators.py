@@ -15,7 +15,7 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, require
-from vlatool.runtime.engines.openvino import DEVICE, HINTS
+from vlatool.runtime.engines.openvino import DEVICE, settings_for
 from vlatool.runtime.policy import DEFAULT_ENGINE, Policy
 from vlatool.runtime.program import Program
 
@@ -182,14 +182,7 @@ class _OpenvinoProfiled:
 
     def __init__(self, path: Path, threads: int, compute: str, _scratch: Path) -> None:
         openvino = require("openvino", "openvino")
-        settings = {
-            "INFERENCE_PRECISION_HINT": HINTS[compute],
-            "INFERENCE_NUM_THREADS": threads,
-            "NUM_STREAMS": 1,
-            "PERFORMANCE_HINT": "LATENCY",
-            "ENABLE_CPU_PINNING": False,
-            "PERF_COUNT": True,
-        }
+        settings = {**settings_for(threads, compute), "PERF_COUNT": True}
         try:
             core = openvino.Core()
             self._compiled = core.compile_model(core.read_model(str(path)), DEVICE, settings)

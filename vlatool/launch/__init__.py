@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vlatool.bundle import Bundle, writing
 from vlatool.errors import BundleError, DataError, OutputError
+from vlatool.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
 from vlatool.stage import Context, Measure, Stage, Transform
 
@@ -27,14 +28,6 @@ def run_transform(
     with writing(out, force=force) as draft:
         stage.run(source, draft, context)
     return Bundle.open(out, verify=False)
-
-
-def cache_directory() -> Path:
-    """Return where finished stages are kept: ``$VLATOOL_CACHE``, or ``vlatool`` in the user's cache directory."""
-    named = os.environ.get("VLATOOL_CACHE")
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vlatool"
 
 
 def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 from vlatool import errors
 from vlatool.quantize._records import Record, Tools, compute
@@ -90,6 +90,7 @@ class Worker:
             stdout=subprocess.PIPE,
             text=True,
         )
+        self._requests, self._answers = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
 
     def compute(self, record: Record, file: Path, offset: int) -> dict[str, Any]:
         """Let the process compute and write a record; return its figures.
@@ -98,14 +99,12 @@ class Worker:
             OSError: when the disk is full.
             VlatoolError: what the record raises, or GraphError when the process died.
         """
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         request = {"job": record.fill.to_json(), "size": record.size, "file": str(file), "offset": offset}
         line = ""
         with contextlib.suppress(BrokenPipeError, ValueError):
-            self._process.stdin.write(json.dumps(request) + "\n")
-            self._process.stdin.flush()
-            line = self._process.stdout.readline()
+            self._requests.write(json.dumps(request) + "\n")
+            self._requests.flush()
+            line = self._answers.readline()
         if not line:
             raise errors.GraphError(
                 f"The process that quantized '{record.name}' died (exit {self._process.poll()}).",
@@ -125,6 +124,6 @@ class Worker:
         """End the process; what it was computing is lost."""
         self._process.kill()
         self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
+        for pipe in (self._requests, self._answers):
             with contextlib.suppress(OSError):
-                pipe.close()  # type: ignore[union-attr]
+                pipe.close()

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.errors import DataError, GraphError, require
-from vlatool.quantize._calibrate import _link
+from vlatool.quantize._graphs import write_beside
 from vlatool.quantize._value_types import float_values
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import Policy
@@ -111,8 +111,4 @@ def _with_peaks(path: Path, scratch: Path, graph: str) -> tuple[Path, list[str]]
     model.graph.initializer.append(onnx.numpy_helper.from_array(np.zeros((), np.float32), ZERO))
     model.graph.initializer.append(onnx.numpy_helper.from_array(np.ones(1, np.int64), ONE))
     model.graph.output.append(onnx.ValueInfoProto(name=PEAKS))
-    target = scratch / f"{graph}.onnx"
-    target.write_bytes(model.SerializeToString())
-    for beside in path.parent.glob("*.data"):
-        _link(beside, scratch / beside.name)
-    return target, names
+    return write_beside(model, path, scratch / f"{graph}.onnx"), names

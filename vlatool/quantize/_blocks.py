@@ -180,21 +180,17 @@ def searched(planes: Array, form: Format, scratch: Scratch) -> Chosen:
     win.
     """
     spanned, low = _range(planes, form)
-    best: Chosen | None = None
-    gained: Array | None = None
+    best = Chosen(spanned, low)
+    gained = np.full_like(spanned, -np.inf)
     for factor in FACTORS:
         scale = spanned * np.float32(factor)
         zero = _zero(scale, low, form)
         along, power = _fit(planes, encode(planes, Chosen(scale, zero), form, scratch))
         fitted = along / power
         gain = along * fitted
-        if best is None or gained is None:
-            best, gained = Chosen(fitted, zero), gain
-        else:
-            better = gain > gained
-            best = Chosen(np.where(better, fitted, best.scale), np.where(better, zero, best.zero))
-            np.maximum(gained, gain, out=gained)
-    assert best is not None
+        better = gain > gained
+        best = Chosen(np.where(better, fitted, best.scale), np.where(better, zero, best.zero))
+        np.maximum(gained, gain, out=gained)
     flat = np.abs(best.scale) < TINY
     return Chosen(np.where(flat, spanned, best.scale), best.zero) if flat.any() else best
 

@@ -5,8 +5,6 @@ Nothing of a sample is kept: peak memory is one session, one sample's activation
 
 from __future__ import annotations
 
-import os
-import shutil
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.errors import DataError, GraphError, require
+from vlatool.quantize._graphs import write_beside
 from vlatool.quantize._ranges import Statistics
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import Policy
@@ -128,18 +127,4 @@ def _with_outputs(path: Path, names: list[str], scratch: Path, graph: str) -> tu
     for name in names:
         if name not in have:
             model.graph.output.append(onnx.ValueInfoProto(name=name))
-    target = scratch / f"{graph}.onnx"
-    target.write_bytes(model.SerializeToString())
-    for beside in path.parent.glob("*.data"):
-        _link(beside, scratch / beside.name)
-    return target, outputs
-
-
-def _link(original: Path, copy: Path) -> None:
-    """Hard link where the file system can; ONNX Runtime follows no symbolic link out of the model's directory."""
-    if copy.exists():
-        return
-    try:
-        os.link(original, copy)
-    except OSError:
-        shutil.copyfile(original, copy)
+    return write_beside(model, path, scratch / f"{graph}.onnx"), outputs

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle import Bundle
 from vlatool.data import recorded_observations
+from vlatool.errors import DataError
 from vlatool.manifest import ProgramStep
 from vlatool.quantize._blocks import METHODS
 from vlatool.quantize._compute import figures, piece, records_of, store, stored_meaning, whole_weight
@@ -63,21 +64,20 @@ class _Walk:
         for layer, number in self._shared.items():
             owners.setdefault(number, layer)
         self._numbers = {layer: number for number, layer in owners.items()}
-        self._target: Array | None = None
+        self._target: Array = np.empty(0, np.uint8)
         self._note: dict[str, Any] | None = None
         self._steps: Iterator[None] | None = None
-        self._tools: Tools | None = None
 
     def fill(self, number: int, tools: Tools, data: Array) -> dict[str, Any]:
         """Go on to the layer of a task, quantize it into its record, and return its figures."""
-        self._wanted, self._target, self._note, self._tools = number, data, None, tools
+        self._wanted, self._target, self._note = number, data, None
         if self._steps is None:
-            self._steps = self._walk()
+            self._steps = self._walk(tools)
         while self._note is None:
             next(self._steps)
         return self._note
 
-    def _walk(self) -> Iterator[None]:
+    def _walk(self, tools: Tools) -> Iterator[None]:
         manifest = self._bundle.manifest
         encode = ObservationEncoder(manifest.spec, self._bundle.path / "assets")
         random = np.random.default_rng(0)
@@ -88,8 +88,7 @@ class _Walk:
             graph = self._plan.graphs[step.graph]
             layers = [layer for layer, _ in graph.layers]
             local = [{name: values[value] for name, value in step.feeds.items()} for values in samples]
-            assert self._tools is not None
-            yield from Layerwise(graph.skeleton, layers, self._product).run(local, self._tools)
+            yield from Layerwise(graph.skeleton, layers, self._product).run(local, tools)
             for values, given in zip(samples, local, strict=True):
                 values.update({value: given[name] for name, value in step.gives.items()})
                 values.update({target: values[source] for source, target in step.carry.items()})
@@ -102,10 +101,13 @@ class _Walk:
         if number < self._wanted:
             return rows @ self._finished(task, number).T
         weight = whole_weight(task, tools)
+        if not np.isfinite(rows).all():
+            raise DataError(
+                f"The calibration samples make what the layer '{layer.node.name}' reads not finite.",
+                "look at the samples and at the float32 policy: vlatool explain names where it begins",
+            )
         made = self._round(weight, rows)
-        data = self._target
-        assert data is not None
-        self._store(task, made, data)
+        self._store(task, made, self._target)
         self._note = _note(task, weight, made, rows, SLACK * self._stage.form.largest_error)
         return rows @ made.meant.T
 

@@ -12,8 +12,7 @@ import numpy as np
 from vlatool.errors import require
 from vlatool.quantize._nodes import read_names, reads
 from vlatool.quantize._phase import HEAVY, PERIODIC
-from vlatool.quantize._qdq import FLOAT
-from vlatool.quantize._value_types import inferred_values
+from vlatool.quantize._value_types import FLOAT, inferred_values
 
 LARGEST = 65504.0
 """Largest finite float16."""

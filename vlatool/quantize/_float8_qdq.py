@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
-from vlatool.quantize._qdq import Layer
+from vlatool.quantize._layers import Layer
 
 Array = NDArray[Any]
 

@@ -133,15 +133,18 @@ def awq(weight: Array, activations: Array, form: Format, choose: Choose) -> Roun
     magnitude = np.maximum(np.mean(np.abs(activations), axis=0, dtype=np.float64), 1e-6)
     step = max(1, len(activations) // SEARCH_ROWS)
     rows = activations[::step][:SEARCH_ROWS]
-    best: Rounded | None = None
-    least = np.inf
-    for exponent in EXPONENTS:
-        factors = magnitude**exponent
-        factors = (factors / np.sqrt(factors.max() * factors.min())).astype(np.float32)
-        made = nearest_codes(weight * factors, form, choose)
-        meant = made.meant / factors
-        lost = float(np.linalg.norm(rows @ (meant - weight).T))
+    best, least = _enlarged(weight, magnitude ** EXPONENTS[0], rows, form, choose)
+    for exponent in EXPONENTS[1:]:
+        made, lost = _enlarged(weight, magnitude**exponent, rows, form, choose)
         if lost < least:
-            least, best = lost, made._replace(meant=meant, inputs=np.float32(1) / factors)
-    assert best is not None
+            best, least = made, lost
     return best
+
+
+def _enlarged(weight: Array, factors: Array, rows: Array, form: Format, choose: Choose) -> tuple[Rounded, float]:
+    """Return the weight rounded after its inputs were multiplied by factors, and the norm of what the product loses."""
+    factors = (factors / np.sqrt(factors.max() * factors.min())).astype(np.float32)
+    made = nearest_codes(weight * factors, form, choose)
+    meant = made.meant / factors
+    lost = float(np.linalg.norm(rows @ (meant - weight).T))
+    return made._replace(meant=meant, inputs=np.float32(1) / factors), lost

@@ -6,6 +6,8 @@ import contextlib
 import fnmatch
 import io
 import logging
+import os
+import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -224,6 +226,26 @@ def save(model: Any, path: Path) -> None:
     data = path.with_name(path.name + ".data")
     data.unlink(missing_ok=True)
     onnx.save(model, str(path), save_as_external_data=large, location=data.name)
+
+
+def write_beside(model: Any, original: Path, target: Path) -> Path:
+    """Write a model that was read without its weights to another directory; the files of weights are linked there."""
+    target.write_bytes(model.SerializeToString())
+    for beside in original.parent.glob("*.data"):
+        if not (target.parent / beside.name).exists():
+            link(beside, target.parent / beside.name)
+    return target
+
+
+def link(original: Path, copy: Path) -> None:
+    """Give a file a second name; copy it where the file system cannot.
+
+    ONNX Runtime follows no symbolic link out of the model's directory.
+    """
+    try:
+        os.link(original, copy)
+    except OSError:
+        shutil.copyfile(original, copy)
 
 
 @contextlib.contextmanager

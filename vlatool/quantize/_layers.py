@@ -10,8 +10,8 @@ import numpy as np
 
 from vlatool.errors import GraphError, require
 from vlatool.quantize._nodes import reads
+from vlatool.quantize._value_types import FLOAT, float_names
 
-FLOAT = 1  # onnx.TensorProto.FLOAT
 LOWEST_OPSET = 13
 """Per-channel scales came with opset 13."""
 SHAPES = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "MaxPool")
@@ -79,7 +79,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
         if entry.domain in ("", "ai.onnx") and entry.version < LOWEST_OPSET:
             raise GraphError(f"The graph has opset {entry.version}; int8 needs opset {LOWEST_OPSET} or later.")
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
-    floats = _float_values(model) if elementwise else set()
+    floats = float_names(model) if elementwise else set()
     readers = _readers(model)
     found = []
     for node in model.graph.node:
@@ -220,13 +220,3 @@ def _readers(model: Any) -> dict[str, list[Any]]:
         for name in reads(node):
             found.setdefault(name, []).append(node)
     return found
-
-
-def _float_values(model: Any) -> set[str]:
-    """Return the names of the float32 values of a graph, from what it notes or from shape inference."""
-    onnx = require("onnx", "build")
-    noted = list(model.graph.value_info)
-    if not noted:
-        noted = list(onnx.shape_inference.infer_shapes(model).graph.value_info)
-    values = [*noted, *model.graph.input, *model.graph.output]
-    return {value.name for value in values if value.type.tensor_type.elem_type == FLOAT}

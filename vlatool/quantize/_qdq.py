@@ -11,32 +11,11 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
 from vlatool.quantize._layers import (
-    FLOAT,
-    SHAPES,
     Layer,
     Style,
-    check_weights,
-    find_layers,
     hoisted,
-    split_gemm,
-    wanted_values,
 )
 from vlatool.quantize._nodes import read_names
-
-__all__ = [
-    "FLOAT",
-    "SHAPES",
-    "Layer",
-    "Range",
-    "Style",
-    "check_weights",
-    "find_layers",
-    "hoisted",
-    "insert_qdq",
-    "quantize_weight",
-    "split_gemm",
-    "wanted_values",
-]
 
 Range = tuple[float, float]
 ACTIVATION = {"uint8": (0, 255, np.uint8), "int8": (-127, 127, np.int8)}

@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 
 from vlatool.bundle import Bundle
 from vlatool.errors import DataError, require
-from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._graphs import foreign_errors, save
-from vlatool.quantize._qdq import Layer, Range
-from vlatool.quantize._ranges import choose_range
+from vlatool.quantize._layers import Layer
+from vlatool.quantize._qdq import Range
 from vlatool.quantize._switches import add_switches
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import Action, Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.spec import TensorSpec
-from vlatool.stage import Context
+from vlatool.stage import Context, SampleSet
 
 Array = NDArray[Any]
 Place = tuple[str, str]
@@ -110,19 +109,10 @@ def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, 
     Raises:
         DataError: when the bundle has no calibration data, or a sample does not fit.
     """
-    from vlatool.data import recorded_observations
-
     stage.check(bundle, None)
-    _, wanted = stage._plan(bundle)
-    statistics = calibrate(bundle, wanted, recorded_observations(bundle, stage.samples, stage.calibration), context)
-    kind = stage.style.activations
-    return {
-        graph: {
-            name: choose_range(each, stage.method, stage.percentile, kind != "uint8", kind == "symmetric")
-            for name, each in values.items()
-        }
-        for graph, values in statistics.items()
-    }
+    _, wanted = stage.plan(bundle)
+    statistics = stage.statistics(bundle, wanted, SampleSet(), context)
+    return {graph: stage.ranges(values) for graph, values in statistics.items()}
 
 
 class _Tape:
@@ -189,7 +179,7 @@ class Switchboard:
         self._sessions: dict[str, _Switchable] = {}
         self.shares: dict[Place, float] = {}
         with foreign_errors("main"):
-            layers, _ = stage._plan(bundle)
+            layers, _ = stage.plan(bundle)
         for name, graph in bundle.manifest.graphs.items():
             path = bundle.file(graph.file)
             flags: dict[str, str] = {}

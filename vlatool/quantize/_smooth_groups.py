@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.quantize._qdq import FLOAT, Layer
-from vlatool.quantize._value_types import static_shapes
+from vlatool.quantize._layers import Layer
+from vlatool.quantize._value_types import FLOAT, static_shapes
 
 NORMS = ("LayerNormalization", "RMSNormalization")
 HOMOGENEOUS = ("Relu", "LeakyRelu", "Identity", "Dropout")

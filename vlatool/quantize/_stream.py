@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import OutputError
+from vlatool.host import cache_directory
 from vlatool.quantize._ahead import Ahead
 from vlatool.quantize._journal import DATA, Journal, hash_part
 from vlatool.quantize._records import Record
@@ -60,9 +61,7 @@ class Written:
 
 def work_root() -> Path:
     """Return where unfinished work is kept: ``streams`` in vlatool's cache directory."""
-    named = os.environ.get("VLATOOL_CACHE")
-    cache = Path(named) if named else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vlatool"
-    return cache / "streams"
+    return cache_directory() / "streams"
 
 
 @contextlib.contextmanager

@@ -14,7 +14,8 @@ from typing import Any
 
 from vlatool.errors import GraphError, require
 from vlatool.quantize._graphs import load
-from vlatool.quantize._qdq import Layer, Range, Style, hoisted, insert_qdq, wanted_values
+from vlatool.quantize._layers import Layer, Style, hoisted, wanted_values
+from vlatool.quantize._qdq import Range, insert_qdq
 
 FLAG = "int8."
 """Prefix of the name of the input that switches a layer."""

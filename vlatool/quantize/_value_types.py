@@ -6,6 +6,7 @@ from typing import Any
 
 from vlatool.errors import require
 
+FLOAT = 1  # onnx.TensorProto.FLOAT
 LARGE = 4096
 """Bytes from which a constant is a weight; what shapes are computed from is smaller."""
 
@@ -39,7 +40,12 @@ def static_shapes(model: Any) -> dict[str, tuple[int, ...]]:
     return found
 
 
+def float_names(model: Any) -> set[str]:
+    """Return the names of the float32 values of a graph, its inputs among them."""
+    return {value.name for value in inferred_values(model) if value.type.tensor_type.elem_type == FLOAT}
+
+
 def float_values(model: Any) -> list[str]:
     """Return the float32 values that nodes of a graph give, in order."""
-    floats = {value.name for value in inferred_values(model) if value.type.tensor_type.elem_type == 1}
+    floats = float_names(model)
     return [name for node in model.graph.node for name in node.output if name in floats]

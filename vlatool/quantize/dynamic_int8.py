@@ -17,7 +17,7 @@ from vlatool.quantize._graphs import (
     read,
     save,
 )
-from vlatool.quantize._qdq import check_weights, find_layers
+from vlatool.quantize._layers import check_weights, find_layers
 from vlatool.stage import Context, source_of
 
 OPS = ("MatMul", "Gemm")

@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from vlatool.bundle import Bundle
-from vlatool.data import recorded_observations
-from vlatool.errors import DataError, RecipeError, nearest, require
-from vlatool.quantize._calibrate import calibrate
+from vlatool.errors import RecipeError, nearest, require
+from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._float8_qdq import Float8Writer
-from vlatool.quantize._graphs import QUANTIZED_OPS, Quantization, foreign_errors, load, save
-from vlatool.quantize._qdq import Layer, Style, find_layers, wanted_values
+from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, save
+from vlatool.quantize._layers import Layer, Style, find_layers, wanted_values
 from vlatool.stage import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 
-class Float8(Quantization):
+class Float8(Calibrated):
     """Quantize MatMul, Gemm and Conv to float8 (E4M3) in QDQ form, for TensorRT on Jetson Thor and newer GPUs.
 
     Weights have one scale for each output channel, activations one for all, from the largest magnitude on calibration
@@ -30,28 +29,18 @@ class Float8(Quantization):
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "ml_dtypes", "numpy")
+    without: ClassVar[str] = ", or use quantize.float16, which needs none"
 
-    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
-    samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
     per_channel: bool = Field(True, description="one weight scale for each output channel")
     attention: bool = Field(False, description="also quantize the products inside attention (of two activations)")
     ops: tuple[str, ...] = Field(QUANTIZED_OPS, description="operator types to quantize")
 
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
-
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The operators are ones that can be quantized, and there is calibration data."""
-        super().check(source, profile)
         for name in self.ops:
             if name not in QUANTIZED_OPS:
                 raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
-        if source is not None and not recorded_observations(source, 1, self.calibration):
-            raise DataError(
-                f"{source.path} carries no calibration data, which {self.name()} needs.",
-                "pass --calibration FILE.npz, or use quantize.float16, which needs none",
-            )
+        super().check(source, profile)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Calibrate and quantize every selected graph."""
@@ -62,8 +51,7 @@ class Float8(Quantization):
             layers = self._layers(bundle)
         wanted = {name: wanted_values(found, Style(), {}) for name, found in layers.items()}
         samples = SampleSet()
-        seen = samples.watch(recorded_observations(bundle, self.samples, self.calibration))
-        statistics = calibrate(bundle, wanted, seen, context)
+        statistics = self.statistics(bundle, wanted, samples, context)
 
         def quantize(name: str, original: Path, target: Path) -> None:
             model = load(original)

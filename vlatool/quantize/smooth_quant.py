@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from itertools import islice
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from vlatool.bundle import Bundle
-from vlatool.data import recorded_observations
-from vlatool.errors import DataError, GraphError, require
+from vlatool.errors import GraphError, require
 from vlatool.quantize._calibrate import calibrate
-from vlatool.quantize._graphs import Quantization, foreign_errors, load, save
-from vlatool.quantize._qdq import find_layers
+from vlatool.quantize._calibration import Calibrated
+from vlatool.quantize._graphs import foreign_errors, load, save
+from vlatool.quantize._layers import find_layers
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._smooth_groups import Edit, Group, find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.runtime.policy import load_golden, relative_error
 from vlatool.stage import Context, SampleSet, source_of
 
-if TYPE_CHECKING:
-    from vlatool.profile import Profile
-
 Array = NDArray[Any]
 
+Sample = tuple[int, Mapping[str, Any]]
+"""Number and observation."""
 OPS = ("MatMul", "Gemm")
 REPORT = "reports/smooth_quant.json"
 SAME = 1e-4
@@ -49,7 +47,7 @@ def _alpha(value: Any) -> str:
     return repr(number)
 
 
-class SmoothQuant(Quantization):
+class SmoothQuant(Calibrated):
     """Move outlier channels of activations into the weights that read them; the result computes the same in float32.
 
     Run a quantization after it. Each input channel of a MatMul or Gemm is divided by a scale and its row of the weight
@@ -60,8 +58,6 @@ class SmoothQuant(Quantization):
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
 
-    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
-    samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
     alpha: Annotated[str, BeforeValidator(_alpha)] = Field(
         "0.5", description="0 to 1: how much moves into the weights; auto: by the estimated int8 error of each layer"
     )
@@ -69,18 +65,6 @@ class SmoothQuant(Quantization):
         1.0, ge=1, description="smooth activations whose largest channel is this many times the median one"
     )
     insert: bool = Field(False, description="insert a Mul where the division cannot be folded into constants")
-
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
-
-    def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """There is calibration data."""
-        super().check(source, profile)
-        if source is not None and not recorded_observations(source, 1, self.calibration):
-            raise DataError(
-                f"{source.path} carries no calibration data, which {self.name()} needs.", "pass --calibration FILE.npz"
-            )
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Calibrate, smooth every selected graph, and compare the golden action with the source's."""
@@ -90,9 +74,11 @@ class SmoothQuant(Quantization):
             groups = self._plan(bundle)
         wanted = {name: [value for group in found for value in group.activations] for name, found in groups.items()}
         samples = SampleSet()
-        halves = self._halves(recorded_observations(bundle, self.samples, self.calibration))
-        seen = samples.watch([each for half in halves for each in half])
-        peaks = [_peaks(calibrate(bundle, wanted, islice(seen, len(half)), context, channels=True)) for half in halves]
+        halves = self._halves(list(zip(*self.observed(bundle, samples), strict=True)))
+        peaks = []
+        for half in halves:
+            numbers, observations = zip(*half, strict=True)
+            peaks.append(_peaks(calibrate(bundle, wanted, observations, context, channels=True, numbers=numbers)))
         notes: list[dict[str, Any]] = []
 
         def smooth(name: str, original: Path, target: Path) -> None:
@@ -128,7 +114,7 @@ class SmoothQuant(Quantization):
             for name, model in models.items()
         }
 
-    def _halves(self, observations: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    def _halves(self, observations: list[Sample]) -> list[list[Sample]]:
         """Return all observations, or for ``auto`` every other one and the rest, whose peaks are compared."""
         if self.alpha != "auto" or len(observations) < 2:
             return [observations]

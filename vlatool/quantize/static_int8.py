@@ -10,21 +10,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from vlatool.bundle import Bundle
-from vlatool.data import calibration_recording, doubts, recorded_observations
-from vlatool.errors import DataError, RecipeError, nearest, require
-from vlatool.quantize._calibrate import calibrate
-from vlatool.quantize._graphs import QUANTIZED_OPS, Quantization, foreign_errors, load, read, save
+from vlatool.data import recorded_observations
+from vlatool.errors import RecipeError, nearest, require
+from vlatool.quantize._calibration import Calibrated
+from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, read, save
 from vlatool.quantize._integer_matmul import use_integer_matmul
-from vlatool.quantize._qdq import (
-    Layer,
-    Style,
-    check_weights,
-    find_layers,
-    hoisted,
-    insert_qdq,
-    split_gemm,
-    wanted_values,
-)
+from vlatool.quantize._layers import Layer, Style, check_weights, find_layers, hoisted, split_gemm, wanted_values
+from vlatool.quantize._qdq import Range, insert_qdq
 from vlatool.quantize._ranges import Statistics, choose_range
 from vlatool.quantize._reductions import keep_axes
 from vlatool.quantize._trial_compile import compile_apart
@@ -39,7 +31,7 @@ DIFFERENCE = 0.25
 ENGINES = {"ort": "", "qdq": "", "openvino": "openvino"}
 
 
-class StaticInt8(Quantization):
+class StaticInt8(Calibrated):
     """Quantize MatMul, Gemm and Conv to int8 with activation ranges from calibration data.
 
     The default is what ONNX Runtime computes fastest on an x86 processor: uint8 activations, symmetric int8 weights,
@@ -48,9 +40,8 @@ class StaticInt8(Quantization):
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
+    without: ClassVar[str] = ", or use quantize.dynamic_int8, which needs none"
 
-    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
-    samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
     method: Literal["minmax", "entropy", "percentile", "mse"] = Field(
         "minmax", description="how activation ranges are chosen"
     )
@@ -86,13 +77,8 @@ class StaticInt8(Quantization):
         """OpenVINO too, where it runs the graphs."""
         return (*self.packages, "openvino") if self.layout == "openvino" else self.packages
 
-    def inputs(self) -> tuple[Path, ...]:
-        """The calibration file."""
-        return (self.calibration,) if self.calibration else ()
-
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The operators are ones that can be quantized, the layout can compute so, and there is calibration data."""
-        super().check(source, profile)
         for name in self.ops:
             if name not in QUANTIZED_OPS:
                 raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
@@ -100,30 +86,21 @@ class StaticInt8(Quantization):
             raise RecipeError(f"The layout {self.layout} does not compute in {self.compute}.", "use layout openvino")
         if self.layout == "openvino":
             require("openvino", "openvino")
-        if source is not None and calibration_recording(source, self.calibration) is None:
-            raise DataError(
-                f"{source.path} carries no calibration data, which {self.name()} needs.",
-                "pass --calibration FILE.npz, or use quantize.dynamic_int8, which needs none",
-            )
+        super().check(source, profile)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Calibrate and quantize every selected graph."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
-        layers, wanted = self._plan(bundle)
+        layers, wanted = self.plan(bundle)
         samples = SampleSet()
-        found = self._calibrated(bundle, wanted, samples, context)
-        kind = self.style.activations
+        found = self.statistics(bundle, wanted, samples, context)
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
             if self.layout == "ort":
                 split_gemm(model)
-            ranges = {
-                value: choose_range(statistics, self.method, self.percentile, kind != "uint8", kind == "symmetric")
-                for value, statistics in found[name].items()
-            }
-            insert_qdq(model, self._rewritten(model, layers[name]), ranges, self.style)
+            insert_qdq(model, self._rewritten(model, layers[name]), self.ranges(found[name]), self.style)
             if self.layout == "ort":
                 use_integer_matmul(model)
             if self.layout == "openvino":
@@ -146,24 +123,15 @@ class StaticInt8(Quantization):
                 )
         return made
 
-    def _calibrated(
-        self, bundle: Bundle, wanted: dict[str, list[str]], samples: SampleSet, context: Context
-    ) -> dict[str, dict[str, Statistics]]:
-        """Run the calibration samples; warn of what makes their ranges unreliable."""
-        recording = calibration_recording(bundle, self.calibration)
-        assert recording is not None, "check() has seen it"
-        numbers = recording.spread(self.samples)
-        asked = self.samples if self.samples != StaticInt8.model_fields["samples"].default else 0
-        for doubt in doubts(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
-            warnings.warn(doubt, stacklevel=3)
-        observations = samples.watch(recording.observation(number) for number in numbers)
-        return calibrate(bundle, wanted, observations, context, numbers=numbers)
+    def ranges(self, statistics: Mapping[str, Statistics]) -> dict[str, Range]:
+        """Return value -> (low, high) that activations are quantized over."""
+        kind = self.style.activations
+        return {
+            name: choose_range(each, self.method, self.percentile, kind != "uint8", kind == "symmetric")
+            for name, each in statistics.items()
+        }
 
-    def layer_count(self, bundle: Bundle) -> int:
-        """Return how many layers of a float32 bundle would be int8."""
-        return sum(len(found) for found in self._plan(bundle)[0].values())
-
-    def _plan(self, bundle: Bundle) -> tuple[dict[str, list[Layer]], dict[str, list[str]]]:
+    def plan(self, bundle: Bundle) -> tuple[dict[str, list[Layer]], dict[str, list[str]]]:
         """Return graph -> layers that are quantized, and graph -> values whose ranges that needs."""
         layers: dict[str, list[Layer]] = {}
         wanted: dict[str, list[str]] = {}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -19,7 +18,7 @@ from vlatool.finish import SEED, carry_over, finish, history
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.quantize._blocks import Format
 from vlatool.quantize._compute import records_of
-from vlatool.quantize._graphs import Quantization
+from vlatool.quantize._graphs import Quantization, link
 from vlatool.quantize._precision import precision_shares
 from vlatool.quantize._records import Record
 from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shards, weights_fingerprint
@@ -101,7 +100,7 @@ class WeightOnly(Quantization):
         with work_directory(self.work(bundle)) as place:
             records = self._records(plan, bundle, place, samples)
             written = write_records(records, self._identity(plan, bundle), place, _processes(records), context.tell)
-            _link(written.path, out / WEIGHTS)
+            link(written.path, out / WEIGHTS)
             made = self._finish(plan, bundle, out, written, samples, context)
             forget(place)
         return made
@@ -174,14 +173,6 @@ def _processes(records: list[Record]) -> int:
     """Return how many processes compute: one more than cores, since each waits for the disk at times."""
     work = sum(record.weights for record in records if record.portable)
     return min(len(os.sched_getaffinity(0)), 8) + 1 if work >= WORTH_PROCESSES else 0
-
-
-def _link(data: Path, target: Path) -> None:
-    """Give the finished file a second name in the bundle; copy it where the file system is another one."""
-    try:
-        os.link(data, target)
-    except OSError:
-        shutil.copyfile(data, target)
 
 
 def _told(written: Written, file: Path) -> dict[str, Any]:

@@ -32,17 +32,7 @@ class OpenvinoSession:
 
     def __init__(self, path: Path, threads: int | None = None, compute: str = "") -> None:
         openvino = require("openvino", "openvino")
-        if compute not in HINTS:
-            raise GraphError(
-                f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}."
-            )
-        settings = {
-            "INFERENCE_PRECISION_HINT": HINTS[compute],
-            "INFERENCE_NUM_THREADS": threads or len(os.sched_getaffinity(0)),
-            "NUM_STREAMS": 1,
-            "PERFORMANCE_HINT": "LATENCY",
-            "ENABLE_CPU_PINNING": False,
-        }
+        settings = settings_for(threads, compute)
         try:
             core = openvino.Core()
             model = core.read_model(str(path))
@@ -131,6 +121,23 @@ class OpenvinoSession:
             MissingExtra: when openvino is not installed.
         """
         return version_of(require("openvino", "openvino"))
+
+
+def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
+    """Return what a model is compiled with.
+
+    Raises:
+        GraphError: when OpenVINO does not compute in that dtype.
+    """
+    if compute not in HINTS:
+        raise GraphError(f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}.")
+    return {
+        "INFERENCE_PRECISION_HINT": HINTS[compute],
+        "INFERENCE_NUM_THREADS": threads or len(os.sched_getaffinity(0)),
+        "NUM_STREAMS": 1,
+        "PERFORMANCE_HINT": "LATENCY",
+        "ENABLE_CPU_PINNING": False,
+    }
 
 
 def version_of(openvino: Any) -> str:

@@ -1,0 +1,71 @@
+"""What the methods share that take ranges of activations from recorded observations."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
+
+from vlatool.bundle import Bundle
+from vlatool.data import calibration_recording, doubts
+from vlatool.errors import DataError
+from vlatool.quantize._calibrate import Wanted, calibrate
+from vlatool.quantize._graphs import Quantization
+from vlatool.quantize._ranges import Statistics
+from vlatool.stage import Context, SampleSet
+
+if TYPE_CHECKING:
+    from vlatool.profile import Profile
+
+
+class Calibrated(Quantization):
+    """A method that needs calibration data."""
+
+    without: ClassVar[str] = ""
+    """What a user without calibration data can do instead."""
+
+    calibration: Path | None = Field(None, description="recorded observations; the bundle's own when not given")
+    samples: int = Field(64, ge=1, description="calibration samples, spread over the recording")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The calibration file."""
+        return (self.calibration,) if self.calibration else ()
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """There is calibration data."""
+        super().check(source, profile)
+        if source is not None and calibration_recording(source, self.calibration) is None:
+            raise self._missing(source)
+
+    def observed(self, bundle: Bundle, seen: SampleSet) -> tuple[list[int], Iterator[Mapping[str, Any]]]:
+        """Return the numbers of the calibration samples and an iterator over them; warn of what makes them unreliable.
+
+        Args:
+            bundle: Whose own recording is used when no other is given.
+            seen: Takes the hash of each sample that goes by.
+
+        Raises:
+            DataError: when there is none.
+        """
+        recording = calibration_recording(bundle, self.calibration)
+        if recording is None:
+            raise self._missing(bundle)
+        numbers = recording.spread(self.samples)
+        asked = self.samples if self.samples != type(self).model_fields["samples"].default else 0
+        for doubt in doubts(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
+            warnings.warn(doubt, stacklevel=3)
+        return numbers, seen.watch(recording.observation(number) for number in numbers)
+
+    def statistics(
+        self, bundle: Bundle, wanted: Wanted, seen: SampleSet, context: Context
+    ) -> dict[str, dict[str, Statistics]]:
+        """Run the calibration samples; return graph -> value -> statistics. See ``calibrate`` for the errors."""
+        numbers, observations = self.observed(bundle, seen)
+        return calibrate(bundle, wanted, observations, context, numbers=numbers)
+
+    def _missing(self, bundle: Bundle) -> DataError:
+        fix = f"pass --calibration FILE.npz{self.without}"
+        return DataError(f"{bundle.path} carries no calibration data, which {self.name()} needs.", fix)
