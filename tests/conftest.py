@@ -5,6 +5,7 @@ The bundles are made once in a session and must not be changed; copy one (``copi
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -192,11 +193,57 @@ def write_weights(path: Path) -> None:
     save_file(weights, str(path))
 
 
+COLUMNS = (
+    "device", "power_mode", "runtime", "model", "params_m", "gflops_or_gmacs", "input", "precision", "batch", "metric",
+    "value", "macts_m", "n_layers", "device_class",
+)  # fmt: skip
+PUBLISHED = {
+    "resnet18": (1.8, 11.7, 2.5, 21),
+    "resnet50": (4.1, 25.6, 11.1, 54),
+    "mobilenet_v2": (0.3, 3.5, 6.7, 53),
+    "vit_small": (4.6, 22.0, 11.9, 74),
+    "densenet121": (2.9, 8.0, 6.9, 121),
+    "yolov8n": (4.4, 3.2, 12.0, 64),
+}
+"""Model -> 10^9 multiply-accumulates, 10^6 weights, 10^6 activations, layers."""
+MEASURED_ON = (
+    ("raspberry-pi-4", "cpu", "ncnn", "fp32", 0.02), ("raspberry-pi-5", "cpu", "onnxruntime", "fp32", 0.06),
+    ("rk3588", "cpu", "ncnn", "fp32", 0.07), ("i7-1360P", "cpu", "openvino", "int8", 1.5),
+    ("jetson-orin-nano-8gb", "gpu", "tensorrt", "fp16", 3.6), ("jetson-agx-orin-64gb", "gpu", "tensorrt", "fp16", 15.0),
+    ("rtx-4060", "gpu", "tensorrt", "fp16", 21.0), ("hailo-8", "npu", "hailort", "int8", 7.0),
+    ("hailo-8l", "npu", "hailort", "int8", 3.5), ("core-ultra-7-155H", "npu", "openvino-npu", "int8", 3.0),
+)  # fmt: skip
+"""Device, class, runtime, precision, and 10^12 operations that it does in a second."""
+
+
+def published_rows() -> list[dict[str, str]]:
+    """Sixty made-up latencies in the columns of the collection: compute and layers, within 4 % of noise."""
+    random = np.random.default_rng(0)
+    found = []
+    for device, kind, runtime, precision, speed in MEASURED_ON:
+        for model, (gmacs, params, activations, layers) in PUBLISHED.items():
+            ms = (2 * gmacs / speed + 0.01 * layers) * random.uniform(0.96, 1.04)
+            values = (device, "", runtime, model, params, gmacs, "224", precision, "1", "latency_ms", f"{ms:.4f}",
+                      activations, layers, kind)  # fmt: skip
+            found.append(dict(zip(COLUMNS, map(str, values), strict=True)))
+    return found
+
+
+def write_points(path: Path, rows: list[dict[str, str]]) -> Path:
+    """Write published latencies as a CSV file."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _cache_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the tests away from the user's cache, and child processes too."""
+    """Keep the tests away from the user's cache and measurements, and child processes too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VLATOOL_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("VLATOOL_CALIBRATIONS", str(tmp_path_factory.mktemp("calibrations")))
         yield
 
 
@@ -266,6 +313,30 @@ def observation() -> dict[str, Any]:
     """One observation that fits the tiny policy, without the batch axis."""
     recorded = observations(1, seed=3)
     return {name: recorded[name][0] for name in ("image", "proprio")} | {"instruction": "go to the red"}
+
+
+@pytest.fixture
+def published() -> list[dict[str, str]]:
+    """Rows of published latencies that the test may change."""
+    return published_rows()
+
+
+@pytest.fixture
+def points_at(tmp_path: Path) -> Callable[[list[dict[str, str]]], Path]:
+    """A function that writes rows of published latencies to a CSV file."""
+    return lambda rows: write_points(tmp_path / "points.csv", rows)
+
+
+@pytest.fixture(scope="session")
+def points_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sixty published latencies, made up; read only."""
+    return write_points(tmp_path_factory.mktemp("points") / "points.csv", published_rows())
+
+
+@pytest.fixture
+def points_file(points_template: Path, tmp_path: Path) -> Path:
+    """Sixty published latencies that the test may change."""
+    return Path(shutil.copyfile(points_template, tmp_path / "points.csv"))
 
 
 @pytest.fixture

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from vlatool.bundle import Bundle
-from vlatool.hwselect._roofline import predict, predict_memory
+from vlatool.hwselect._board import Candidate, outcomes
+from vlatool.hwselect._boards_report import numbers
+from vlatool.hwselect._latency import shipped
+from vlatool.hwselect._measured import measured_questions
 from vlatool.hwselect._workload import workload
 from vlatool.profile import Profile
 from vlatool.report import Measurement
 
+SHOWN = ("latency_p50", "memory", "energy")
+
 
 def predictions(profile: Profile, bundle: Bundle) -> list[Measurement]:
-    """Return predicted latency and memory of a bundle on a board; NaN with a note where there is no ground for one."""
-    load = workload(bundle)
-    engine = bundle.manifest.engine if bundle.manifest.engine in profile.engines else None
-    return [predict(profile, load, engine), predict_memory(profile, load, engine)]
+    """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where there is no ground."""
+    engine = bundle.manifest.engine if bundle.manifest.engine in profile.engines else profile.engine
+    model = shipped().conditioned(measured_questions())
+    outcome = outcomes([Candidate(profile, profile.default_mode, engine)], workload(bundle), model)[0]
+    return [found for found in numbers(outcome) if found.name in SHOWN]

@@ -7,19 +7,22 @@ Every figure says where it comes from. ``kind`` is ``vendor`` (a data sheet), ``
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
-from pydantic_core import ErrorDetails
 
-from vlatool.errors import ProfileError, nearest
+from vlatool._profile_problems import problem, wrong_names, wrong_sources
+from vlatool.errors import OutputError, ProfileError, nearest
 
 SEARCH_PATH = "VLATOOL_PROFILES"
 SUFFIXES = (".yaml", ".yml")
+NAME = r"^[a-z0-9][a-z0-9-]*$"
 
 Kind = Literal["vendor", "measured", "derived", "estimate", "unverified"]
+COMPUTED = ("float32", "float16", "bfloat16", "float8", "int8", "w8", "w4")
+"""Precisions of a candidate: a dtype of weights and activations, or of weights alone."""
 DTYPES = ("float32", "tf32", "float16", "bfloat16", "float8", "int8", "int4", "float4")
 GROUNDED: tuple[Kind, ...] = ("vendor", "measured", "derived")
 """The kinds that rest on something that was seen."""
@@ -31,7 +34,14 @@ def _known_dtype(name: str) -> str:
     return name
 
 
+def _known_computed(name: str) -> str:
+    if name not in COMPUTED:
+        raise ValueError(f"is not what an engine computes in; {nearest(name, COMPUTED)}")
+    return name
+
+
 Dtype = Annotated[str, AfterValidator(_known_dtype)]
+Computed = Annotated[str, AfterValidator(_known_computed)]
 
 
 class _Strict(BaseModel):
@@ -66,6 +76,8 @@ class Unit(_Strict):
     Args:
         cores: Processor cores, or streaming multiprocessors / execution units of a GPU.
         clock_mhz: The highest clock; the peaks hold at it.
+        bandwidth_gb_s: Of its way to memory where that is less than the board's: a processor beside a graphics card,
+            a module behind PCI Express.
         peak_tops: dtype -> 10^12 operations per second, dense, where a multiply-accumulate is two operations.
         isa: Instruction set features that inference libraries use.
         absent: Features that a reader might expect and that are not there.
@@ -74,24 +86,10 @@ class Unit(_Strict):
     title: str
     cores: Figure
     clock_mhz: Figure
+    bandwidth_gb_s: Figure | None = None
     peak_tops: dict[Dtype, Figure]
     isa: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
-
-
-class Efficiency(_Strict):
-    """What an engine reaches in one dtype: shares of dense peak and bandwidth (0-1), microseconds for each layer.
-
-    ``peak`` names the dtype whose peak ``compute`` is a share of, where it is another one (TF32 for float32).
-    """
-
-    peak: Dtype | None = None
-    compute: float = Field(gt=0, le=1)
-    bandwidth: float = Field(gt=0, le=1)
-    layer_us: float = Field(ge=0)
-    kind: Kind
-    source: str
-    note: str = ""
 
 
 class EngineFigures(_Strict):
@@ -103,14 +101,17 @@ class EngineFigures(_Strict):
         integer_ops: Whether the int8 figures also hold for integer operators (MatMulInteger and its kin), not for QDQ
             alone.
         base_mb: Memory of a process that holds the engine and no model.
-        efficiency: dtype -> what the engine reaches; a dtype without published figures is left out.
+        runtime: Whose published latencies the predictions for it rest on (a runtime of the predictor's data); empty
+            where there are none, and then latency is unknown.
+        dtypes: What it computes in here, the fastest first; int4 and int8 weights alone are written ``w4`` and ``w8``.
     """
 
     unit: str
     int8_layout: Literal["u8s8", "s8s8", ""]
     integer_ops: bool
     base_mb: Figure
-    efficiency: dict[Dtype, Efficiency] = Field(default_factory=dict)
+    runtime: str = ""
+    dtypes: tuple[Computed, ...] = Field(min_length=1)
     note: str = ""
 
 
@@ -130,13 +131,14 @@ class PowerMode(_Strict):
 
 
 class Software(_Strict):
-    """What comes with one release of the board's system."""
+    """What comes with one release of the board's system; ``engines``: engine -> the version that runs on it."""
 
     release: str
     os: str
     python: str
     cuda: str | None = None
     tensorrt: str | None = None
+    engines: dict[str, str] = Field(default_factory=dict)
     kind: Kind
     source: str
 
@@ -151,6 +153,11 @@ class Profile(_Strict):
         usable_memory_gb: What is left for a policy beside system, desktop and drivers.
         bandwidth_gb_s: Peak memory bandwidth.
         power_w: The most that the board draws.
+        idle_w: What it draws when it does nothing.
+        price_usd: What the board costs, or what it costs to have one of its kind installed (see the note).
+        price_usd_per_hour: What an hour of it costs where it is rented: it then is a cloud machine, no board.
+        storage: Storage that was tested to boot and to hold a policy.
+        platforms: Robot platforms (see ``vlatool.platforms``) that commonly carry it.
         units: Name -> what computes (``cpu``, ``gpu``).
         engines: Engine -> how well it does here, the preferred one first.
         modes: Name -> power mode.
@@ -159,7 +166,7 @@ class Profile(_Strict):
         sources: Key -> public reference.
     """
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    name: str = Field(pattern=NAME)
     title: str
     architecture: Literal["aarch64", "x86_64"]
     model_strings: tuple[str, ...] = Field(min_length=1)
@@ -169,7 +176,11 @@ class Profile(_Strict):
     unified: bool = True
     bandwidth_gb_s: Figure
     power_w: Figure
+    idle_w: Figure | None = None
     price_usd: Price
+    price_usd_per_hour: Price | None = None
+    storage: tuple[str, ...] = ()
+    platforms: tuple[str, ...] = ()
     units: dict[str, Unit] = Field(min_length=1)
     engines: dict[str, EngineFigures] = Field(min_length=1)
     modes: dict[str, PowerMode] = Field(min_length=1)
@@ -180,7 +191,7 @@ class Profile(_Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> Profile:
-        problems = [*_wrong_sources(self, self.sources), *_wrong_names(self)]
+        problems = [*wrong_sources(self, self.sources), *wrong_names(self)]
         if self.usable_memory_gb.value > self.memory_gb.value:
             problems.append("usable_memory_gb.value: is more than memory_gb")
         if problems:
@@ -221,11 +232,7 @@ class Profile(_Strict):
         return part.peak_tops[dtype].value * cores * clock
 
 
-KEYS = {
-    key
-    for model in (Profile, Unit, EngineFigures, Efficiency, PowerMode, Software, Price)
-    for key in model.model_fields
-}
+KEYS = {key for model in (Profile, Unit, EngineFigures, PowerMode, Software, Price) for key in model.model_fields}
 
 
 def names() -> list[str]:
@@ -257,11 +264,31 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
     try:
         return Profile.model_validate(data)
     except ValidationError as error:
-        problems = [_problem(item) for item in error.errors(include_url=False)]
+        problems = [problem(item, KEYS) for item in error.errors(include_url=False)]
     except ProfileError as error:  # from the checks between fields; pydantic lets foreign exceptions through
         problems = error.message.splitlines()
     listed = "\n".join(f"  {problem}" for problem in problems)
     raise ProfileError(f"The profile {path} is malformed:\n{listed}", "correct these lines of the file")
+
+
+def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> None:
+    """Write another profile's text under a new name.
+
+    Raises:
+        ProfileError: when there is no such profile, or the name is not one.
+        OutputError: when the file exists and ``force`` is not given, or cannot be written.
+    """
+    load_profile(like)
+    path = Path(like) if like.endswith(SUFFIXES) or os.sep in like else _found()[like]
+    if not re.fullmatch(NAME, name):
+        raise ProfileError(f"'{name}' is no name of a profile; allowed: lower-case letters, digits and hyphens.")
+    if target.exists() and not force:
+        raise OutputError(f"{target} exists.", "choose another file, or pass --force")
+    text = re.sub(r"(?m)^name: .*$", f"name: {name}", path.read_text(encoding="utf-8"), count=1)
+    try:
+        target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
 
 
 def _found() -> dict[str, Path]:
@@ -285,55 +312,3 @@ def _read(path: Path) -> Any:
     if not isinstance(data, dict):
         raise ProfileError(f"The profile {path} must be a mapping; got {type(data).__name__}.")
     return data
-
-
-WORDS = {
-    "missing": "is missing",
-    "model_type": "must be a mapping",
-    "dict_type": "must be a mapping",
-    "too_short": "needs at least one entry",
-    "float_parsing": "must be a number",
-    "string_pattern_mismatch": "must be lower-case letters, digits and hyphens",
-}
-
-
-def _problem(error: ErrorDetails) -> str:
-    """Return ``field: what is wrong`` for one finding of pydantic."""
-    kind, got = error["type"], f"; got {error['input']!r}"
-    where = ".".join(str(part) for part in error["loc"] if part != "[key]")
-    if kind == "extra_forbidden":
-        hint, _, _ = nearest(str(error["loc"][-1]), KEYS).rpartition(" known: ")
-        return f"{where}: is not a known key; {hint}".removesuffix("; ")
-    if kind == "value_error":
-        return f"{where}: {error['msg'].removeprefix('Value error, ')}"
-    words = error["msg"].replace("Input should be", "must be").replace("greater than 0", "above 0")
-    return f"{where}: {WORDS.get(kind, words)}{'' if kind == 'missing' else got}"
-
-
-def _wrong_sources(value: Any, sources: Mapping[str, str], where: str = "") -> Iterator[str]:
-    """Yield a problem for each figure below ``value`` whose source is not listed."""
-    if isinstance(value, BaseModel):
-        source = getattr(value, "source", None)
-        if source is not None and source not in sources:
-            yield f"{where}source: '{source}' is not in sources; {nearest(source, sources)}"
-        value = dict(value)
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, tuple) else ()
-    for key, item in items:
-        yield from _wrong_sources(item, sources, f"{where}{key}.")
-
-
-def _wrong_names(profile: Profile) -> Iterator[str]:
-    """Yield a problem for each reference to a unit or mode that does not exist."""
-    if profile.default_mode not in profile.modes:
-        yield f"default_mode: '{profile.default_mode}' is not in modes; {nearest(profile.default_mode, profile.modes)}"
-    for name, engine in profile.engines.items():
-        if engine.unit not in profile.units:
-            yield f"engines.{name}.unit: '{engine.unit}' is not in units; {nearest(engine.unit, profile.units)}"
-            continue
-        peaks = profile.units[engine.unit].peak_tops
-        for dtype, efficiency in engine.efficiency.items():
-            if (efficiency.peak or dtype) not in peaks:
-                yield f"engines.{name}.efficiency.{dtype}: {engine.unit} has no peak_tops.{efficiency.peak or dtype}"
-    for name, mode in profile.modes.items():
-        for unit in {*mode.cores, *mode.clock_mhz} - {*profile.units}:
-            yield f"modes.{name}: '{unit}' is not in units; {nearest(unit, profile.units)}"

@@ -12,6 +12,7 @@ from vlatool.benchmark._probe import cold_start, main, peak_rss_mb
 from vlatool.benchmark.latency import Latency, busy_warning
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, GraphError, UsageError
+from vlatool.hwselect._workload import workload
 from vlatool.stage import Context
 
 PROBED = {"import_ms", "load_ms", "first_ms", "peak_rss_mb"}
@@ -54,6 +55,19 @@ def test_percentiles_that_twenty_samples_cannot_bound_are_left_out(report):
 def test_the_size_is_that_of_the_graphs(report, float_bundle):
     graph = float_bundle.path / "graphs/main.onnx"
     assert report.rows[0].value("size") == graph.stat().st_size / 1e6
+
+
+def test_each_row_says_what_an_inference_computes(report, float_bundle, int8_bundle):
+    for row, bundle, precision in zip(report.rows, (float_bundle, int8_bundle), ("float32", "int8"), strict=True):
+        (table,) = row.details["workload"]
+        load = workload(bundle)
+        assert table["macs"] == sum(load.macs.values())
+        assert table["layers"] == load.layers
+        assert (table["precision"], table["engine"]) == (precision, "ort_cpu")
+        assert set(table["traits"]) == load.graphs["main"].traits
+        assert json.loads(json.dumps(table)) == table
+    one, other = (row.details["workload"][0] for row in report.rows)
+    assert one["weights"] == other["weights"], "however they are stored"
 
 
 def test_the_baseline_is_as_fast_as_itself(report):

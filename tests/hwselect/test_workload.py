@@ -11,6 +11,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle import Bundle
 from vlatool.errors import GraphError
+from vlatool.hwselect._shapes import open_graph
 from vlatool.hwselect._workload import GraphWorkload, Workload, graph_workload, workload
 from vlatool.manifest import FileRecord, Graph, Manifest, ProgramStep
 from vlatool.spec import PolicySpec, TensorSpec
@@ -321,7 +322,72 @@ def test_a_bundle_counts_the_repeats_of_its_program(tmp_path: Path) -> None:
 
 
 def test_totals() -> None:
-    one = GraphWorkload({"int8": 100, "float32": 10}, 3, 1000, 50, 70)
-    found = Workload({"a": one, "b": GraphWorkload({"int8": 1}, 1, 10, 5, 7), "unused": one}, {"a": 2, "b": 5})
+    one = GraphWorkload({"int8": 100, "float32": 10}, 3, weight_bytes=1000, peak_bytes=70)
+    other = GraphWorkload({"int8": 1}, 1, weight_bytes=10, peak_bytes=7)
+    found = Workload({"a": one, "b": other, "unused": one}, {"a": 2, "b": 5})
     assert found.macs == {"int8": 205, "float32": 20}
     assert (found.layers, found.weight_bytes, found.peak_bytes) == (11, 2010, 147)
+
+
+def test_numbers_are_counted_however_they_are_stored(count: Build) -> None:
+    nodes = [
+        *qdq("xd", "x"),
+        helper.make_node("DequantizeLinear", ["w", "s", "zw"], ["wd"]),
+        helper.make_node("Transpose", ["wd"], ["wt"], perm=[1, 0]),
+        helper.make_node("MatMul", ["xd", "wt"], ["y"]),
+    ]
+    weights = [weight("w", (7, 5), np.int8), weight("s", ()), weight("z", (), np.uint8), weight("zw", (), np.int8)]
+    found = count(nodes, [3, 5], weights)
+    assert (found.weights, found.activations) == (7 * 5, 3 * 7)
+
+
+def test_a_product_of_activations_has_no_weights(count: Build) -> None:
+    nodes = [helper.make_node("Transpose", ["x"], ["t"], perm=[1, 0]), helper.make_node("MatMul", ["x", "t"], ["y"])]
+    found = count(nodes, [4, 6], [])
+    assert (found.weights, found.activations) == (0, 16)
+    assert found.traits == {"attention"}
+
+
+@pytest.mark.parametrize(
+    ("attributes", "shape", "trait"),
+    [
+        ({"group": 8}, (8, 1, 3, 3), "depthwise"),
+        ({"group": 2}, (32, 128, 3, 3), "grouped"),
+        ({}, (8, 8, 3, 3), ""),
+    ],
+    ids=["depthwise", "grouped", "plain"],
+)
+def test_traits_of_convolutions(count: Build, attributes: dict[str, int], shape: tuple[int, ...], trait: str) -> None:
+    node = helper.make_node("Conv", ["x", "w"], ["y"], pads=[1, 1, 1, 1], **attributes)
+    found = count([node], [1, shape[1] * attributes.get("group", 1), 8, 8], [weight("w", shape)])
+    assert found.traits == ({trait} if trait else set())
+    assert found.weights == int(np.prod(shape))
+
+
+def test_traits_of_branches_and_of_one_row(count: Build) -> None:
+    nodes = [
+        helper.make_node("MatMul", ["x", "w"], ["a"]),
+        helper.make_node("Concat", ["a", "x"], ["y"], axis=1),
+    ]
+    assert count(nodes, [1, 5], [weight("w", (5, 5))]).traits == {"branches", "dense"}
+    assert count(nodes[:1], [9, 5], [weight("w", (5, 5))]).traits == set()
+
+
+def test_weights_packed_in_four_bits_are_counted_as_numbers(count: Build) -> None:
+    node = helper.make_node(
+        "MatMulNBits", ["x", "w", "s"], ["y"], domain="com.microsoft", K=32, N=8, bits=4, block_size=32
+    )
+    found = count([node], [3, 32], [weight("w", (8, 1, 16), np.uint8), weight("s", (8,))])
+    assert found.weights == 32 * 8
+
+
+def test_what_a_shape_leads_to_is_no_weight(tmp_path: Path) -> None:
+    nodes = [
+        helper.make_node("Constant", [], ["c"], value=helper.make_tensor("c", FLOAT, [2], [1.0, 2.0])),
+        helper.make_node("Cast", ["w"], ["wc"], to=FLOAT),
+        helper.make_node("Relu", ["w"], ["r"]),
+        helper.make_node("Mul", ["x", "w"], ["y"]),
+    ]
+    path = save(tmp_path / "m.onnx", nodes, [2], [weight("w", (2,))])
+    tensors = open_graph(onnx, path)
+    assert [tensors.is_constant(name) for name in ("w", "wc", "c", "r", "x", "y", "")] == [True] * 3 + [False] * 4

@@ -110,6 +110,56 @@ def hostile() -> Report:
                   HOSTILE, HOSTILE, {HOSTILE: {"a": HOSTILE}}, (HOSTILE,))  # fmt: skip
 
 
+def board(
+    name: str, state: str, ms: float, price: float, reason: str = "", *, chosen: bool = False, cost: bool = True
+) -> Row:
+    """A row as ``hwselect`` makes it."""
+    role = "chosen" if chosen else {"fits": "within", "no": "outside"}.get(state, "subject")
+    way = {"state": state, "power mode": "15W", "engine": "ort_cpu", "precision": "int8"}
+    known = not math.isnan(ms)
+    ends = (ms / 2, ms * 2) if known else (None, None)
+    items = [
+        Measurement("price", price, "USD", "predicted", name),
+        Measurement("latency_p50", ms, "ms", "predicted", name, 0, *ends, 0.8, "unseen: from other devices"),
+        Measurement("memory", 512.0, "MB", "predicted", name, 0, 300.0, 900.0, 0.8, "a judgement"),
+        Measurement("usable_memory", 7000.0, "MB", "predicted", name),
+        Measurement("watts", 9.75, "W", "predicted", name, 0, 6.75, 14.25, 0.8),
+    ]
+    if cost and known:
+        items += [
+            Measurement(which, value, unit, "predicted", name)
+            for which, value, unit in (
+                ("energy", 0.2, "J"),
+                ("average_watts", 5.5, "W"),
+                ("owned_cost", 12345.0, "USD"),
+            )
+        ]
+    return Row(name, role, reason or f"{name} is {state}", tuple(items), details={"way": [way]})
+
+
+def hwselect() -> Report:
+    rows = (
+        board("raspberry-pi-5", "fits", 20.0, 80, chosen=True),
+        board("jetson-orin-nano", "fits", 4.0, 399),
+        board("jetson-nano", "may fit", 90.0, 99),
+        board("raspberry-pi-5-hailo8", "unknown", math.nan, 190, "a transformer's latency there is unknown"),
+        board("raspberry-pi-4", "no", 160.0, 55, "about 160 ms > 100 ms even at int8"),
+        Row("jetson-agx-thor", "outside", "costs 3,499 dollars, more than 500",
+            (Measurement("price", 3499, "USD", "predicted"),), details={"way": [{"state": "no"}]}),
+    )  # fmt: skip
+    told = "raspberry-pi-5 is the cheapest of 2 boards that fit."
+    return Report("hwselect", "Boards for tiny", "pass", (told,), rows,
+                  {"hz": 10.0, "max_price_usd": 500.0}, "vlatool hwselect tiny", "2026-11-21T12:00:00Z",
+                  warnings=("everything here is predicted; measure before you buy many",))  # fmt: skip
+
+
+def hostile_boards() -> Report:
+    rows = tuple(board(f"{n}{HOSTILE}", state, 10.0 + n, 50 + n, HOSTILE, chosen=n == 0)
+                 for n, state in enumerate(("fits", "may fit", "unknown", "no")))  # fmt: skip
+    return Report("hwselect", HOSTILE, "pass", (HOSTILE,), rows, {HOSTILE: HOSTILE, "hz": 5.0}, HOSTILE, HOSTILE,
+                  {}, (HOSTILE,))  # fmt: skip
+
+
 EMPTY = Report("benchmark", "Nothing")
 KINDS = {
     "optimize": optimize,
@@ -117,6 +167,9 @@ KINDS = {
     "evaluate": evaluate,
     "compare": compare,
     "hostile": hostile,
+    "hwselect": hwselect,
+    "hostile-boards": hostile_boards,
+    "no-boards": lambda: Report("hwselect", "Boards for nothing", "fail"),
     "empty": lambda: EMPTY,
     "bare": lambda: Report("compare", "", rows=(Row(""), Row("b", "failed"))),
 }

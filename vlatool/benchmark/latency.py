@@ -13,9 +13,11 @@ from vlatool.benchmark._contest import Contestant, latency_measurements, run_int
 from vlatool.benchmark._probe import cold_start
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.data import observations_for
-from vlatool.errors import BundleError
+from vlatool.errors import BundleError, GraphError, MissingExtra
 from vlatool.export._torch_policy import torch_policy
 from vlatool.host import fingerprint
+from vlatool.hwselect._measured import WORK, whole_work
+from vlatool.hwselect._workload import workload
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import Policy
 from vlatool.stage import Context, Measure
@@ -98,7 +100,8 @@ class Latency(Measure):
             if self.cold:
                 measurements += self._cold(contestant)
         role = "baseline" if contestant is reference else "subject"
-        return Row(contestant.name, role, measurements=tuple(measurements), raw={"latency_ms": samples})
+        tables = _work(contestant.bundle, contestant.policy.engine)
+        return Row(contestant.name, role, measurements=tuple(measurements), raw={"latency_ms": samples}, details=tables)
 
     def _cold(self, contestant: Contestant) -> list[Measurement]:
         found = [cold_start(contestant.bundle.path, self.engine, self.threads) for _ in range(COLD_STARTS)]
@@ -109,6 +112,16 @@ class Latency(Measure):
             Measurement("peak_rss", float(np.median(peaks)), "MB", samples=COLD_STARTS, note=note),
             Measurement("cold_start", float(np.median(totals)), "ms", samples=COLD_STARTS, note=note),
         ]
+
+
+def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:
+    """Return what one inference computes, from which predictions for the board can learn; nothing without onnx."""
+    if not bundle.manifest.graphs:
+        return {}
+    try:
+        return {WORK: [{**whole_work(workload(bundle)), "engine": engine}]}
+    except (MissingExtra, GraphError):
+        return {}
 
 
 def busy_warning(host: Mapping[str, Any]) -> tuple[str, ...]:

@@ -14,11 +14,13 @@ from vlatool.cli._stages import StageGroup
 from vlatool.cli.compare import compare
 from vlatool.cli.doctor import doctor
 from vlatool.cli.explain import explain
+from vlatool.cli.hwselect import app as hwselect
 from vlatool.cli.inspect import inspect
 from vlatool.cli.optimize import optimize
 from vlatool.cli.profiles import app as profiles
 from vlatool.cli.rebuild import rebuild
 from vlatool.cli.samples import app as samples
+from vlatool.cli.simulate import simulate
 from vlatool.errors import VlatoolError
 
 INTERRUPTED = 130
@@ -64,6 +66,8 @@ app.command("inspect")(inspect)
 app.command("explain")(explain)
 app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
+app.command("simulate")(simulate)
+app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")
 app.add_typer(samples, name="samples")
 

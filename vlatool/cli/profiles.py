@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -44,6 +45,112 @@ def show_profile(
     typer.echo("  sources")
     for key, text in profile.sources.items():
         typer.echo(f"    [{key}] {text}")
+
+
+@app.command("diff")
+def diff_profiles(
+    first: Annotated[str, typer.Argument(help="name of a profile, or a YAML file", show_default=False)],
+    second: Annotated[str, typer.Argument(help="another one", show_default=False)],
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """Print where two profiles differ: field, first, second."""
+    from vlatool.profile import load_profile
+
+    pair = [dict(_leaves(load_profile(name).model_dump(mode="json", exclude={"sources"}))) for name in (first, second)]
+    found = [
+        {"field": field, first: pair[0].get(field), second: pair[1].get(field)}
+        for field in dict.fromkeys([*pair[0], *pair[1]])
+        if pair[0].get(field) != pair[1].get(field)
+    ]
+    if as_json:
+        typer.echo(json.dumps(found))
+        return
+    for each in found:
+        typer.echo(f"{each['field']:44} {_told(each[first]):>24} {_told(each[second]):>24}")
+    if not found:
+        typer.echo("no difference")
+
+
+@app.command("validate")
+def validate_profiles(
+    files: Annotated[list[str], typer.Argument(help="YAML files, directories of them, or names", show_default=False)],
+) -> None:
+    """Check profiles against the schema; exit 3 when one is wrong, naming every line of it."""
+    from vlatool.errors import ProfileError
+    from vlatool.profile import SUFFIXES, load_profile
+
+    wrong = []
+    for name in files:
+        path = Path(name)
+        inside = sorted(each for each in path.iterdir() if each.suffix in SUFFIXES) if path.is_dir() else [name]
+        if not inside:
+            raise ProfileError(f"There is no profile in {path}.", "its files end in .yaml")
+        for each in inside:
+            try:
+                found = load_profile(each)
+            except ProfileError as error:
+                wrong.append(error.message)
+            else:
+                typer.echo(f"ok  {found.name}")
+    if wrong:
+        raise ProfileError("\n".join(wrong), "correct these lines")
+
+
+@app.command("new")
+def new_profile(
+    name: Annotated[str, typer.Argument(help="name of the new profile", show_default=False)],
+    like: Annotated[str, typer.Option("--from", help="profile to begin with")] = "raspberry-pi-5",
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="file; NAME.yaml when not given")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace a file that exists")] = False,
+) -> None:
+    """Write a profile of your own to begin with: another one's figures under a new name."""
+    from vlatool.profile import copy_profile
+
+    target = output or Path(f"{name}.yaml")
+    copy_profile(like, name, target, force=force)
+    typer.echo(f"{target}: correct its figures, then: vlatool profiles validate {target}")
+    typer.echo("put it into a directory named in VLATOOL_PROFILES to find it by name")
+
+
+@app.command("calibrate")
+def calibrate_profile(
+    name: Annotated[str, typer.Argument(help="the board's profile", show_default=False)],
+    report: Annotated[
+        Path, typer.Option("--from", help="report of `vlatool benchmark` on the board", show_default=False)
+    ],
+    mode: Annotated[str | None, typer.Option(help="power mode that it ran in; the default one when not given")] = None,
+    bundle: Annotated[Path | None, typer.Option(help="what was measured, when the report does not say")] = None,
+) -> None:
+    """Tell the latency model what was measured on a board: predictions for it rest on that from now on."""
+    from vlatool.bundle import Bundle
+    from vlatool.hwselect._measured import calibrations, measured_in, store
+    from vlatool.hwselect._workload import workload
+    from vlatool.profile import load_profile
+
+    load = workload(Bundle.open(bundle)) if bundle else None
+    found = measured_in(report, load_profile(name), mode, load)
+    file = store(found)
+    for each in found:
+        typer.echo(f"{each.profile}, {each.mode}, {each.engine}, {each.precision}: {each.ms:.4g} ms measured")
+    typer.echo(f"kept in {file}; remove the file to forget it, or set VLATOOL_CALIBRATIONS (now {calibrations()})")
+
+
+def _leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield (dotted path, value); a figure counts as its value."""
+    if isinstance(values, dict) and {"value", "kind", "source"} <= set(values):
+        yield where, values["value"]
+    elif isinstance(values, dict):
+        for key, value in values.items():
+            yield from _leaves(value, f"{where}.{key}" if where else key)
+    elif isinstance(values, list) and not any(isinstance(item, dict) for item in values):
+        yield where, ", ".join(map(str, values))
+    elif not isinstance(values, list):
+        yield where, values
+
+
+def _told(value: Any) -> str:
+    text = "–" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 24 else text[:23] + "…"
 
 
 def _lines(values: dict[str, Any], indent: str) -> Iterator[str]:

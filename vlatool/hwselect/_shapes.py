@@ -19,6 +19,8 @@ SAME_SHAPE_AS = {
     "QGemm": "Gemm",
 }
 """Contributed operator -> the standard one with the same output shape; ONNX infers shapes of standard ones only."""
+UNCHANGED = {"DequantizeLinear", "QuantizeLinear", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Cast", "Identity"}
+"""Operators whose output holds the numbers of their first input, in another type or order."""
 LARGE = 4096
 """Bytes from which an initializer is taken for a weight; shapes that nodes read are smaller."""
 
@@ -61,6 +63,15 @@ class Tensors:
     def producer(self, name: str) -> Any | None:
         """Return the node that gives a tensor."""
         return self._producers.get(name)
+
+    def is_constant(self, name: str) -> bool:
+        """Say whether a tensor is a weight, or computed from weights alone (dequantized, transposed)."""
+        while name not in self._stored:
+            node = self._producers.get(name)
+            if node is None or node.op_type not in UNCHANGED:
+                return node is not None and node.op_type == "Constant"
+            name = node.input[0]
+        return True
 
     def attribute(self, node: Any, name: str, default: Any) -> Any:
         """Return an attribute of a node, strings decoded."""

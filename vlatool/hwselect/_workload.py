@@ -6,15 +6,25 @@ counted, as in the published tables that the predictions rest on.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, require
-from vlatool.hwselect._macs import COMPUTE, INTEGER_OPS, node_macs, precision_of
+from vlatool.hwselect._macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_AT, node_macs, precision_of
 from vlatool.hwselect._shapes import Tensors, open_graph
+
+DEPTHWISE = 121
+"""Products for each number that a depthwise convolution writes, at most (11 x 11)."""
+ONE_ROW = 2
+"""Times that a weight is used, at most, in a product of one row."""
+TRAITS = ("depthwise", "attention", "grouped", "branches", "dense")
+"""Depthwise convolutions; products of activations (attention); grouped convolutions; concatenated branches; most
+weights in matrix products of one row (the dense head of an early network, or the decoding of a language model)."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +34,9 @@ class GraphWorkload:
     Args:
         macs: Precision (``float32``, ``int8``, ``int4`` ...) -> multiply-accumulates.
         layers: Compute layers (matrix products and convolutions).
+        weights: Numbers that the compute layers read from weights, however they are stored.
+        activations: Numbers that the compute layers write.
+        traits: What the published latencies of its kind depend on, of ``TRAITS``.
         weight_bytes: Bytes of all initializers as they are stored.
         activation_bytes: Bytes that the compute layers write.
         peak_bytes: The most bytes of tensors, weights apart, that are alive at one node.
@@ -33,6 +46,9 @@ class GraphWorkload:
 
     macs: Mapping[str, int] = field(default_factory=dict)
     layers: int = 0
+    weights: int = 0
+    activations: int = 0
+    traits: frozenset[str] = frozenset()
     weight_bytes: int = 0
     activation_bytes: int = 0
     peak_bytes: int = 0
@@ -113,20 +129,73 @@ def graph_workload(path: Path) -> GraphWorkload:
 
 def _count(tensors: Tensors) -> GraphWorkload:
     macs: Counter[str] = Counter()
-    layers = activation_bytes = 0
+    tally = Tally()
+    activation_bytes = 0
     unknown = [*tensors.hidden(COMPUTE)]
     for node in tensors.nodes:
+        tally.concat(node.op_type == "Concat")
         if node.op_type not in COMPUTE:
             continue
-        layers += 1
         count = node_macs(node, tensors)
         written = [tensors.bytes_of(name) for name in node.output if name]
         if count is None or written[0] is None:
+            tally.layers += 1
             unknown.append(node.name or node.output[0])
             continue
         macs[precision_of(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
+        tally.layer(count, math.prod(tensors.shape(node.output[0]) or ()), *_operands(node, tensors))
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
-        dict(macs), layers, tensors.weight_bytes, activation_bytes, tensors.peak_bytes(), integer, tuple(unknown)
-    )
+        dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
+        activation_bytes, tensors.peak_bytes(), integer, tuple(unknown),
+    )  # fmt: skip
+
+
+def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
+    """Return the numbers in a layer's weight (0 for a product of activations) and the groups of a convolution."""
+    if node.op_type == "MatMulNBits":
+        return int(tensors.attribute(node, "K", 0)) * int(tensors.attribute(node, "N", 0)), 1
+    second = node.input[WEIGHT_AT.get(node.op_type, 1)] if len(node.input) > WEIGHT_AT.get(node.op_type, 1) else ""
+    shape = tensors.shape(second) or ()
+    groups = int(tensors.attribute(node, "group", 1)) if node.op_type in CONVOLUTIONS else 1
+    return (math.prod(shape) if tensors.is_constant(second) else 0), groups
+
+
+@dataclass
+class Tally:
+    """Sums over the compute layers of a graph, however they were found."""
+
+    layers: int = 0
+    weights: int = 0
+    activations: int = 0
+    _concats: int = 0
+    _macs: int = 0
+    _depthwise: int = 0
+    _grouped: int = 0
+    _products: int = 0
+    _rows: int = 0
+
+    def layer(self, macs: int, written: int, weights: int, groups: int = 1) -> None:
+        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights and its groups."""
+        self.layers += 1
+        self.weights += weights
+        self.activations += written
+        self._macs += macs
+        self._depthwise += groups > 1 and macs <= DEPTHWISE * written
+        self._grouped += macs if groups > 1 and macs > DEPTHWISE * written else 0
+        self._products += macs if not weights else 0
+        self._rows += weights if macs <= ONE_ROW * weights else 0
+
+    def concat(self, found: bool) -> None:
+        """Take in a node that may be a concatenation."""
+        self._concats += found
+
+    def traits(self) -> frozenset[str]:
+        """Return which of ``TRAITS`` the graph has."""
+        layers, macs, weights = max(1, self.layers), max(1, self._macs), max(1, self.weights)
+        has = (
+            self._depthwise >= 0.15 * layers, self._products >= 0.005 * macs, self._grouped >= 0.2 * macs,
+            self._concats >= 0.1 * layers, self._rows >= 0.6 * weights,
+        )  # fmt: skip
+        return frozenset(trait for trait, present in zip(TRAITS, has, strict=True) if present)

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from vlatool.bundle import Bundle, hash_file
-from vlatool.data import observations_for
+from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, nearest, require
 from vlatool.export.onnx import _quiet, name_by_module, strip_notes
 from vlatool.manifest import ProgramStep
-from vlatool.runtime.observation import ObservationEncoder
 from vlatool.sources._description import read_description, read_location
-from vlatool.sources._factory import call_factory, factory_file
+from vlatool.sources._faked import faked_modules, run_faked
 from vlatool.sources._shards import StoredTensor, read_shards, stored_array
 
 FOLDED = 1 << 16
@@ -61,74 +57,22 @@ def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
         require(package, "build")
     folder, pattern = policy_weights(bundle)
     shards = read_shards(folder, pattern)
-    modules = _modules(torch, bundle, folder)
-    encode = ObservationEncoder(bundle.manifest.spec, bundle.path / "assets")
-    values = {name: (np.shape(array), array.dtype) for name, array in encode(observations_for(bundle, 1)[0]).items()}
-    found: dict[str, Skeleton] = {}
-    for step in bundle.manifest.program:
-        _declare(step, values)
-        module = modules[step.graph]
-        weights = _locate(torch, step.graph, module, shards, len(modules) > 1, folder / "policy.yaml")
-        with _fake(module) as (mode, real):
-            feeds = [_fake_tensor(torch, mode, *values[value]) for value in step.feeds.values()]
-            model = None if step.graph in found else _export(torch, step, module, feeds, opset)
-            outputs = _outputs(torch, step, module, feeds)
-        if model is not None:
-            found[step.graph] = _skeleton(model, weights, real, opset, folder / "policy.yaml")
-        for value, tensor in zip(step.gives.values(), outputs, strict=True):
-            values[value] = (tuple(tensor.shape), np.dtype(str(tensor.dtype).removeprefix("torch.")))
-        for source, target in step.carry.items():
-            values[target] = values[source]
-    return found
+    modules = faked_modules(bundle)
+    places = {
+        name: _locate(torch, name, module, shards, len(modules) > 1, folder / "policy.yaml")
+        for name, module in modules.items()
+    }
+    exported: dict[str, tuple[Any, dict[str, Any]]] = {}
 
+    def visit(step: ProgramStep, module: Any, feeds: list[Any], real: dict[str, Any]) -> None:
+        if step.graph not in exported:
+            exported[step.graph] = (_export(torch, step, module, feeds, opset), real)
 
-def _declare(step: ProgramStep, values: dict[str, Any]) -> None:
-    """Add shape and dtype of what a step brings into being."""
-    for name, wanted in step.noise.items():
-        values[name] = (tuple(wanted["shape"]), np.dtype(np.float32))
-    for name, numbers in step.schedule.items():
-        whole = all(isinstance(number, int) for number in numbers)
-        values[name] = ((1,), np.dtype(np.int64 if whole else np.float32))
-    for name, kept in step.keep.items():
-        values[name] = (tuple(kept["shape"]), np.dtype(kept.get("dtype", "float32")))
-
-
-def _modules(torch: Any, bundle: Bundle, folder: Path) -> dict[str, Any]:
-    origin = bundle.manifest.source
-    path = factory_file(origin["factory"], folder)
-    for name, digest in origin.get("code", {}).items():
-        file = (path.parent if path else folder) / name
-        if file.suffix == ".py" and (not file.is_file() or hash_file(file) != digest):
-            raise SourceError(f"{file} has changed since the source bundle was made.", "start again from the source")
-    with _parameters_on_meta(torch):
-        made = call_factory(origin["factory"], folder, dict(origin.get("arguments", {})))
-    modules = made if isinstance(made, Mapping) else {"main": made}
-    for step in bundle.manifest.program:
-        given = modules.get(step.graph)
-        if given is None:
-            known = nearest(step.graph, modules)
-            raise SourceError(f"The program runs '{step.graph}', which the factory does not give; {known}.")
-        if not isinstance(given, torch.nn.Module):
-            raise SourceError(f"The factory gave a {type(given).__name__} for '{step.graph}'; wanted a torch module.")
-    return {step.graph: modules[step.graph].eval().float() for step in bundle.manifest.program}
-
-
-@contextlib.contextmanager
-def _parameters_on_meta(torch: Any) -> Iterator[None]:
-    """Move every parameter to the meta device when a module registers it; its memory was never touched."""
-    kind = torch.nn.Module
-    original = kind.register_parameter
-
-    def register(module: Any, name: str, parameter: Any) -> None:
-        if parameter is not None and not parameter.is_meta:
-            parameter = torch.nn.Parameter(parameter.detach().to("meta"), requires_grad=False)
-        original(module, name, parameter)
-
-    kind.register_parameter = register
-    try:
-        yield
-    finally:
-        kind.register_parameter = original
+    run_faked(bundle, modules, visit)
+    return {
+        name: _skeleton(model, places[name], real, opset, folder / "policy.yaml")
+        for name, (model, real) in exported.items()
+    }
 
 
 def _locate(
@@ -169,54 +113,6 @@ def _missing(graph: str, name: str, shards: dict[str, StoredTensor], file: Path)
         f"No shard holds '{name}', which the module '{graph}' needs; {nearest(name, shards)}.",
         f"names are those of state_dict(); check the weights and the arguments in {file}",
     )
-
-
-@contextlib.contextmanager
-def _fake(module: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Put fake tensors in the place of parameters and buffers; yield the mode and the real buffers by name."""
-    from torch._subclasses import FakeTensorMode
-
-    real = {name: buffer for name, buffer in module.named_buffers() if not buffer.is_meta}
-    places = [
-        (held, key, value)
-        for part in module.modules()
-        for held in (part._parameters, part._buffers)
-        for key, value in held.items()
-        if value is not None
-    ]
-    made: dict[int, Any] = {}
-    mode = FakeTensorMode(allow_non_fake_inputs=True)
-    try:
-        for held, key, value in places:
-            if id(value) not in made:
-                made[id(value)] = _like(mode, value)
-            held[key] = made[id(value)]
-        with mode:
-            yield mode, real
-    finally:
-        for held, key, value in places:
-            held[key] = value
-
-
-def _like(mode: Any, value: Any) -> Any:
-    import torch
-
-    with mode:
-        fake = torch.empty(value.shape, dtype=value.dtype, device="cpu")
-        return torch.nn.Parameter(fake, requires_grad=False) if isinstance(value, torch.nn.Parameter) else fake
-
-
-def _fake_tensor(torch: Any, mode: Any, shape: tuple[int, ...], dtype: Any) -> Any:
-    return torch.empty(shape, dtype=getattr(torch, str(np.dtype(dtype))), device="cpu")
-
-
-def _outputs(torch: Any, step: ProgramStep, module: Any, feeds: list[Any]) -> list[Any]:
-    with torch.inference_mode(False), torch.no_grad():
-        given = module(*feeds)
-    outputs = list(given) if isinstance(given, tuple | list) else [given]
-    if len(outputs) != len(step.gives):
-        raise SourceError(f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.")
-    return outputs
 
 
 def _export(torch: Any, step: ProgramStep, module: Any, feeds: list[Any], opset: int) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from vlatool.render import _sections as part
+from vlatool.render._boards import KIND, by_state, chart
+from vlatool.render._boards_html import boards_section, cost_section
 from vlatool.render._css import stylesheet
 from vlatool.render._distribution import beyond, distribution, left_out, over_time, sampled
 from vlatool.render._format import label
@@ -20,6 +22,8 @@ class HtmlRenderer:
 
     def render(self, report: Report) -> str:
         """Return the page."""
+        if report.kind == KIND:
+            return self._page(report, part.head(report) + self._boards(report) + part.circumstances(report))
         body = "".join(
             (
                 part.head(report),
@@ -34,6 +38,19 @@ class HtmlRenderer:
                 part.circumstances(report),
             )
         )
+        return self._page(report, body)
+
+    def _boards(self, report: Report) -> str:
+        found = "".join(boards_section(heading, rows) for heading, rows in by_state(report))
+        known = [item for row in report.rows if (item := row.get("latency_p50", "predicted")) and item.known]
+        if len(known) > 1:
+            sub = "Down and to the left is better. Lines through the points are 80 % intervals; the dotted line joins "
+            sub += "the boards that no other beats in both. Filled: fits or may fit. Hollow: ruled out."
+            drawing = self._both(lambda width: chart(report, width))
+            found += part.section("Price against latency", drawing, sub, "predicted")
+        return found + cost_section(report)
+
+    def _page(self, report: Report, body: str) -> str:
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width,initial-scale=1">'

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
+from vlatool.render._boards import HEADS, KIND, by_state, cells, costs, reasons
 from vlatool.render._format import full, label, limit, plain
 from vlatool.render._view import (
     brackets,
@@ -34,6 +35,8 @@ class MarkdownRenderer:
 
     def render(self, report: Report) -> str:
         """Return the Markdown text."""
+        if report.kind == KIND:
+            return "\n\n".join([*_head(report), *_boards(report), *_circumstances(report)]) + "\n"
         blocks = [
             *_head(report),
             *_variants(report),
@@ -43,6 +46,18 @@ class MarkdownRenderer:
             *_circumstances(report),
         ]
         return "\n\n".join(blocks) + "\n"
+
+
+def _boards(report: Report) -> list[str]:
+    blocks = []
+    for heading, rows in by_state(report):
+        blocks.append(f"**{inline(heading)}** (predicted, not measured)")
+        if any(row.get("latency_p50", "predicted") for row in rows):
+            numeric = [False, False, False, *[True] * (len(HEADS) - 3)]
+            blocks.append(_table(HEADS, [cells(row) for row in rows], numeric))
+        blocks.append("\n".join(f"- {inline(told)}" for told in reasons(rows)))
+    titles, body = costs(report)
+    return blocks + ([f"**Power and cost** (predicted)\n\n{_table(titles, body)}"] if body else [])
 
 
 def inline(text: object) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from rich.console import Console
 from rich.text import Text
 
+from vlatool.render._boards import HEADS as BOARD_HEADS
+from vlatool.render._boards import KIND, by_state, cells, costs, reasons
 from vlatool.render._format import UNMEASURED, aside, count, label, limit, plain, quantity, span
 from vlatool.render._grid import grid
 from vlatool.render._samples import finite, sparkline
@@ -65,6 +67,8 @@ class TerminalRenderer:
 
     def render(self, report: Report) -> str:
         """Return the text, with a line break at the end."""
+        if report.kind == KIND:
+            return self._printed([*self._verdict(report), *self._boards(report), *self._warnings(report)])
         lines = [
             *self._verdict(report),
             *self._variants(report),
@@ -74,6 +78,21 @@ class TerminalRenderer:
             *self._warnings(report),
             *([] if self.brief else self._command(report)),
         ]
+        return self._printed(lines)
+
+    def _boards(self, report: Report) -> list[Text]:
+        lines = []
+        for heading, rows in by_state(report):
+            lines += self._heading(f"{heading} (predicted, not measured)")
+            if any(row.get("latency_p50", "predicted") for row in rows):
+                styles = {place: "bold green" for place, row in enumerate(rows) if row.role == "chosen"}
+                numeric = [False, False, False, *[True] * (len(BOARD_HEADS) - 3)]
+                lines += self._table(BOARD_HEADS, [cells(row) for row in rows], styles=styles, numeric=numeric)
+            lines += [line for told in reasons(rows) for line in self._wrapped(told, indent="  ")]
+        titles, body = costs(report)
+        return lines + ([*self._heading("Power and cost (predicted)"), *self._table(titles, body)] if body else [])
+
+    def _printed(self, lines: Iterable[Text]) -> str:
         self._stream.seek(0)
         self._stream.truncate()
         for line in lines:

@@ -67,7 +67,7 @@ def fill(module: nn.Module, seed: int, prefix: str = "") -> None:
     own random stream, which depends only on ``seed`` and its full name: a part of a large policy can be built alone.
 
     Args:
-        module: Any module; parameters on any device but meta.
+        module: Any module; parameters on the meta device stay as they are.
         seed: Seed of the weights.
         prefix: As for ``build``.
     """
@@ -87,6 +87,8 @@ def _fill_buffers(part: nn.Module) -> None:
 
 
 def _draw(parameter: Tensor, seed: int, name: str, centre: float) -> None:
+    if parameter.is_meta:  # the module is built for its shapes alone
+        return
     digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
     stream = torch.Generator().manual_seed(int.from_bytes(digest[:7], "big"))
     deviation = SMALL if parameter.ndim == 1 else 1 / math.sqrt(parameter[0].numel())

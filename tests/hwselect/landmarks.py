@@ -1,0 +1,66 @@
+"""Well-known policies and models on well-known boards: predicted beside published, each model left out of the fit.
+
+    python tests/hwselect/landmarks.py POINTS.csv     # points as `vlatool hwselect score` takes them
+
+Also predicts tests/hwselect/unseen.csv, a device and two models that no point of the fit is about.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from vlatool.hwselect._fit import fitted
+from vlatool.hwselect._latency import shipped
+from vlatool.hwselect._points import Point, merged, read_points
+from vlatool.hwselect._score import lines, score_points
+
+UNSEEN = Path(__file__).with_name("unseen.csv")
+LANDMARKS = (
+    ("OpenVLA-7B, whole inference", "OpenVLA", "jetson-agx-orin-64gb", ""),
+    ("GR00T N1.7, backbone and action head", "GR00T-N1.7-3B [ba]", "jetson-agx-orin-64gb", ""),
+    ("Llama-2-7B, one token", "llama-2-7b", "core-ultra-7-165h", ""),
+    ("Llama-3.2-3B, one token", "Llama-3.2-3B", "jetson-orin-nano", ""),
+    ("YOLO11n", "yolo11n", "raspberry-pi-5", "unseen"),
+    ("YOLO11s", "yolo11s", "jetson-orin-nano-8gb-super", "unseen"),
+)
+"""Title, beginning of the model's name (a regular expression), beginning of the device's name, file."""
+
+
+def main() -> int:
+    """Print the tables."""
+    import re
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("points", type=Path, help="published latencies")
+    known = read_points(parser.parse_args().points)
+    fresh = read_points(UNSEEN)
+    print(f"{'':38}{'device':27}{'runtime':17}{'dtype':9}{'published':>10}{'predicted':>11}  80 % interval")
+    for title, name, device, file in LANDMARKS:
+        rest = merged([point for point in known if not re.match(name, point.model)])
+        model = fitted(rest, shipped())
+        asked = [
+            point for point in (fresh if file else known)
+            if point.question and re.match(name, point.model) and point.group.startswith(device)
+        ]  # fmt: skip
+        answers = model.predict([point.question for point in asked if point.question])
+        for point, answer in zip(asked, answers, strict=True):
+            print(line(title, point, answer.ms, answer.low, answer.high, answer.why))
+    print()
+    for text in lines(score_points(UNSEEN)):
+        print(text)
+    return 0
+
+
+def line(title: str, point: Point, ms: float, low: float, high: float, why: str) -> str:
+    """Return one line of the table."""
+    published = math.exp(point.log_ms)
+    question = point.question
+    runtime, dtype = (question.runtime, question.precision) if question else ("", "")
+    told = why or f"{low:.3g}-{high:.3g} {'inside' if low <= published <= high else 'OUTSIDE'}"
+    return f"{title:38}{point.group:27}{runtime:17}{dtype:9}{published:>10.4g}{ms:>11.4g}  {told}"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

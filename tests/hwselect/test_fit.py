@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlatool.hwselect import _fit, _latency
+from vlatool.hwselect._features import Question, Shares, rows_of
+from vlatool.hwselect._fit import Folds, Sample, assess, conformal, fit_files, fitted, loss, tune
+from vlatool.hwselect._latency import LEVEL, LatencyModel
+from vlatool.hwselect._points import Point, read_points
+from vlatool.hwselect._process import Process, Scales
+
+SCALES, SHARES = Scales(), Shares()
+
+
+def some(sample: Sample, which: np.ndarray) -> list[Question]:
+    """The questions of some rows."""
+    return [question for question, kept in zip(sample.questions, which, strict=True) if kept]
+
+
+def refitted(sample: Sample, known: np.ndarray, asked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Error and deviation of the rows that are asked, of a process that knows the others."""
+    process = Process(rows_of(some(sample, known), SHARES), sample.logs[known], SCALES)
+    mean, deviation = process.predict(rows_of(some(sample, asked), SHARES))
+    return mean - sample.logs[asked], deviation
+
+
+@pytest.fixture
+def folds(sample: Sample) -> Folds:
+    return Folds(rows_of(sample.questions, SHARES), sample, SCALES)
+
+
+@pytest.mark.parametrize("name", ["models", "devices"])
+def test_leaving_a_group_out_is_fitting_without_it(folds: Folds, sample: Sample, name: str) -> None:
+    groups = getattr(sample, name)
+    error, deviation = folds.without(groups)
+    for code in np.unique(groups):
+        wanted = refitted(sample, groups != code, groups == code)
+        np.testing.assert_allclose(error[groups == code], wanted[0], atol=1e-8)
+        np.testing.assert_allclose(deviation[groups == code], wanted[1], atol=1e-8)
+
+
+def test_telling_one_model_of_a_device_is_fitting_with_it(folds: Folds, sample: Sample) -> None:
+    error, deviation, places = folds.calibrated(sample.devices)
+    at = 0
+    for device in np.unique(sample.devices):
+        mine = sample.devices == device
+        for model in np.unique(sample.models[mine]):
+            asked = mine & (sample.models != model)
+            part = slice(at, at := at + int(asked.sum()))
+            np.testing.assert_array_equal(places[part], np.flatnonzero(asked))
+            wanted = refitted(sample, ~asked, asked)
+            np.testing.assert_allclose(error[part], wanted[0], atol=1e-8)
+            np.testing.assert_allclose(deviation[part], wanted[1], atol=1e-8)
+    assert at == len(error)
+
+
+def test_once_tells_one_model_of_each_device(folds: Folds, sample: Sample) -> None:
+    error, deviation, told = folds.once(sample.devices, np.random.default_rng(0))
+    for device in np.unique(sample.devices):
+        mine = sample.devices == device
+        (model,) = np.unique(sample.models[mine & told])
+        assert (told[mine] == (sample.models[mine] == model)).all()
+        asked = mine & ~told
+        wanted = refitted(sample, ~asked, asked)
+        np.testing.assert_allclose(error[asked], wanted[0], atol=1e-8)
+        np.testing.assert_allclose(deviation[asked], wanted[1], atol=1e-8)
+
+
+def test_no_more_models_are_told_than_asked_for(folds: Folds, sample: Sample) -> None:
+    few, all_of_them = (len(folds.calibrated(sample.devices, most)[0]) for most in (2, 32))
+    assert few == all_of_them / 3, "two of six models each"
+
+
+def test_devices_with_one_model_each_can_be_assessed(points: list[Point]) -> None:
+    """Nothing is left to predict once the one model is told; that is no reason to fail."""
+    single = Sample.of([point for point in points if point.model == "resnet50" and point.kind != "npu"])
+    assert math.isfinite(assess(single, SCALES, SHARES))
+
+
+def test_the_loss_is_relative_and_weighs_the_tail() -> None:
+    assert loss(np.log([1.1, 1.1, 1.1])) == pytest.approx(0.1 + 0.3 * 0.1)
+    assert loss(np.zeros(5)) == 0
+    assert loss(np.log([1.0] * 8 + [2.0, 2.0])) > 0.2
+
+
+def test_intervals_hold_their_share_of_what_was_left_out(sample: Sample, folds: Folds) -> None:
+    found = conformal(sample, SCALES, SHARES)
+    assert set(found) == {"known", "unseen", "calibrated"}
+    error, deviation = folds.without(sample.models)
+    inside = np.abs(error) / deviation <= found["known"]["npu"] + 1e-9
+    assert LEVEL <= inside.mean() <= LEVEL + 2 / len(error), "all of them speak for a unit that has none"
+    error, deviation, places = folds.calibrated(sample.devices)
+    cpu = sample.units[places] == 0
+    inside = (np.abs(error) / deviation)[cpu] <= found["calibrated"]["cpu"] + 1e-9
+    assert LEVEL <= inside.mean() <= LEVEL + 2 / cpu.sum(), "a unit with enough rows speaks for itself"
+
+
+def test_the_search_lowers_what_it_assesses(sample: Sample) -> None:
+    told: list[str] = []
+    before = assess(sample, SCALES, SHARES)
+    scales, shares = tune(sample, SCALES, SHARES, 3.0, tell=told.append)
+    assert assess(sample, scales, shares) < before
+    assert told
+    assert all(0 < getattr(shares, name.name) <= 1 for name in dataclasses.fields(shares) if name.name != "layers")
+    assert scales.constant == SCALES.constant, "the constant is not searched"
+
+
+def test_without_time_nothing_is_searched(sample: Sample) -> None:
+    assert tune(sample, SCALES, SHARES, 0) == (SCALES, SHARES)
+
+
+def test_points_without_a_question_are_left_out(points: list[Point]) -> None:
+    broken = dataclasses.replace(points[0], question=None, why="no ground")
+    found = Sample.of([broken, *points[:6]])
+    assert len(found.logs) == 6
+    assert found.logs.tolist() == [point.log_ms for point in points[:6]]
+
+
+def test_a_model_of_other_figures_keeps_the_scales(points: list[Point], model: LatencyModel) -> None:
+    found = fitted(points[:30], model)
+    assert set(found.parts) == {"processors"}
+    assert found.parts["processors"].scales == model.parts["processors"].scales
+    assert len(found.parts["processors"].rows) == 30
+    assert found.conformal == model.conformal
+
+
+@pytest.fixture
+def no_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for the model's data, empty; the fit begins from the built-in scales then."""
+    folder = tmp_path / "data"
+    folder.mkdir()
+    monkeypatch.setattr(_fit, "DATA", folder)
+    monkeypatch.setattr(_latency, "DATA", folder)
+    _latency.shipped.cache_clear()
+    yield folder
+    _latency.shipped.cache_clear()
+
+
+def test_a_fit_writes_what_is_then_read(points_file: Path, no_data: Path) -> None:
+    told = list(fit_files(points_file, no_data, seconds=0, seed=3))
+    assert told[0] == "processors: 42 figures of 7 devices and 6 models"
+    assert told[-1].startswith("written: ")
+    assert json.loads((no_data / "latency.json").read_text())["about"] == {"figures": 60, "seed": 3, "level": LEVEL}
+    questions = [point.question for point in read_points(points_file) if point.question]
+    found = _latency.shipped().predict(questions)
+    for answer, point in zip(found, read_points(points_file), strict=True):
+        assert not answer.known or abs(answer.ms / math.exp(point.log_ms) - 1) < 0.15, "what it was fitted on, it knows"
+    assert sum(answer.known for answer in found) == 58, "all but a transformer on two Hailos"
+    again = list(fit_files(points_file, no_data, seconds=0, seed=3))
+    assert again == told, "from its own data, the same"
+
+
+def test_a_fit_is_repeated_to_the_byte(points_file: Path, no_data: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        list(fit_files(points_file, tmp_path / name, seconds=0, seed=0))
+    assert (tmp_path / "one/latency.json").read_bytes() == (tmp_path / "two/latency.json").read_bytes()
+    with np.load(tmp_path / "one/latency.npz") as first, np.load(tmp_path / "two/latency.npz") as second:
+        for name in first.files:
+            np.testing.assert_array_equal(first[name], second[name])
+
+
+def test_a_file_without_an_npu_can_be_fitted(
+    published: list[dict[str, str]], points_at: Callable[..., Path], no_data: Path
+) -> None:
+    path = points_at([row for row in published if row["device_class"] != "npu"])
+    assert list(fit_files(path, no_data, seconds=0, seed=0))[-1].startswith("written: ")

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.errors import SourceError
+from vlatool.hwselect._torch_workload import torch_workload
+from vlatool.hwselect._workload import workload
+from vlatool.samples._write import write_sample
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage import Context
+
+
+def test_a_source_counts_as_the_bundle_that_is_exported_from_it(source_bundle: Bundle, float_bundle: Bundle) -> None:
+    found, wanted = torch_workload(source_bundle), workload(float_bundle)
+    assert found.runs == wanted.runs
+    assert set(found.graphs) == set(wanted.graphs) == {"main"}
+    for name in ("macs", "layers", "activations", "weights", "traits", "activation_bytes"):
+        assert getattr(found.graphs["main"], name) == getattr(wanted.graphs["main"], name), name
+    assert wanted.graphs["main"].traits == {"attention", "branches"}
+
+
+def test_nothing_is_unknown_and_memory_is_near_that_of_the_bundle(source_bundle: Bundle, float_bundle: Bundle) -> None:
+    found, wanted = torch_workload(source_bundle).graphs["main"], workload(float_bundle).graphs["main"]
+    assert found.unknown == ()
+    assert not found.integer_ops
+    assert found.weight_bytes == pytest.approx(wanted.weight_bytes, rel=0.1)
+    assert 0.3 < found.peak_bytes / wanted.peak_bytes < 3
+
+
+def test_counting_twice_gives_the_same(source_bundle: Bundle) -> None:
+    assert torch_workload(source_bundle) == torch_workload(source_bundle)
+
+
+def remade(policy: Path, out: Path) -> Bundle:
+    out.mkdir()
+    return TorchModule(policy=policy).run(None, out, Context())
+
+
+def test_code_that_changed_since_is_refused(policy_dir: Path, tmp_path: Path) -> None:
+    bundle = remade(policy_dir, tmp_path / "source")
+    (policy_dir / "policy.py").write_text((policy_dir / "policy.py").read_text() + "\n# edited\n")
+    with pytest.raises(SourceError, match=r"policy.py has changed since the source bundle was made"):
+        torch_workload(bundle)
+
+
+def test_a_policy_that_looks_at_values_says_what_to_do(policy_dir: Path, tmp_path: Path) -> None:
+    text = (policy_dir / "policy.py").read_text()
+    looks = "        if float(image.sum()) < 0:\n            raise ValueError\n"
+    text = text.replace("        pixels =", f"{looks}        pixels =")
+    (policy_dir / "policy.py").write_text(text)
+    bundle = remade(policy_dir, tmp_path / "source")
+    with pytest.raises(SourceError, match="cannot be run without its weights") as caught:
+        torch_workload(bundle)
+    assert "export it first" in caught.value.fix
+
+
+def test_attention_of_torch_counts_as_its_two_products(policy_dir: Path, tmp_path: Path, float_bundle: Bundle) -> None:
+    text = (policy_dir / "policy.py").read_text()
+    old = "torch.softmax(scores, -1) @ self.value(normed)"
+    projected = "(m(normed)[:, None] for m in (self.query, self.key, self.value))"
+    new = f"nn.functional.scaled_dot_product_attention(*{projected})[:, 0]"
+    assert old in text
+    scores = next(line for line in text.splitlines() if "scores =" in line)
+    (policy_dir / "policy.py").write_text(text.replace(old, new).replace(scores + "\n", ""))
+    found = torch_workload(remade(policy_dir, tmp_path / "source")).graphs["main"]
+    wanted = workload(float_bundle).graphs["main"]
+    assert (found.macs, found.layers, found.traits) == (wanted.macs, wanted.layers, wanted.traits)
+
+
+def test_a_large_policy_is_counted_without_its_memory(tmp_path: Path) -> None:
+    folder = tmp_path / "large"
+    folder.mkdir()
+    (folder / "policy.py").write_text(
+        "from torch import nn\n"
+        "class Policy(nn.Module):\n"
+        "    def __init__(self):\n"
+        "        super().__init__()\n"
+        "        self.layers = nn.Sequential(*(nn.Linear(16384, 16384) for _ in range(4)))\n"
+        "    def forward(self, state):\n"
+        "        return self.layers(state)[:, None, :2]\n"
+        "def make():\n    return Policy()\n"
+    )
+    (folder / "policy.yaml").write_text(
+        "schema: 1\nname: large\nversion: 1.0.0\nsource: policy.py:make\nspec:\n"
+        "  inputs: [{name: state, shape: [1, 16384]}]\n"
+        "  outputs: [{name: action, shape: [1, 1, 2]}]\n"
+        "  control_hz: 10\n"
+    )
+    bundle = remade(folder, tmp_path / "source")
+    code = (
+        "import json, resource, sys\nfrom pathlib import Path\nimport torch\n"
+        "from vlatool.bundle import Bundle\nfrom vlatool.hwselect._torch_workload import torch_workload\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "found = torch_workload(Bundle.open(Path(sys.argv[1]))).graphs['main']\n"
+        "grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before\n"
+        "print(json.dumps([found.macs, found.weights, found.weight_bytes, grown]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(bundle.path)], capture_output=True, text=True, check=True)
+    macs, weights, stored, grown = json.loads(done.stdout)
+    assert macs == {"float32": 4 * 16384**2}
+    assert weights == 4 * 16384**2
+    assert stored == 4 * 4 * (16384**2 + 16384)
+    assert grown < 600_000, "kB; the weights would be 4.3 GB"
+
+
+def test_a_sample_is_counted_with_its_attention(tmp_path: Path) -> None:
+    (tmp_path / "sample").mkdir()
+    write_sample("action_expert", tmp_path / "sample", 0)
+    found = torch_workload(remade(tmp_path / "sample", tmp_path / "source"))
+    graph = found.graphs["main"]
+    assert found.runs == {"main": 1}
+    assert 120e6 < graph.weights < 128e6, "127 M parameters, says its description"
+    assert "attention" in graph.traits

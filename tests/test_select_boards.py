@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.errors import DataError, UsageError
+from vlatool.host import cache_directory
+from vlatool.hwselect._board import Candidate, outcomes
+from vlatool.hwselect._latency import shipped
+from vlatool.hwselect._simulate import Change
+from vlatool.hwselect._workload import workload
+from vlatool.profile import load_profile, names
+from vlatool.select_boards import Asked, _change, counted, opened, select_boards, simulated, simulation_lines
+from vlatool.stage import Context
+
+ENGINES = [(name, engine) for name in names() for engine in load_profile(name).engines]
+
+
+@pytest.fixture(autouse=True)
+def _apart(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("VLATOOL_CALIBRATIONS", str(tmp_path / "kept"))
+
+
+def kept() -> list[Path]:
+    return list((cache_directory() / "workloads").glob("*"))
+
+
+def test_a_count_is_kept_and_read_again(float_bundle: Bundle) -> None:
+    first = counted(float_bundle, Context())
+    assert first == workload(float_bundle)
+    (file,) = kept()
+    assert file.suffix == ".json"
+    file.write_text(file.read_text().replace('"layers": ', '"layers": 1'))
+    assert counted(float_bundle, Context()).layers > first.layers, "it was read, not counted"
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 1}', b'{"layout": 1, "graphs": 3, "runs": {}}',
+                b'{"layout": 1, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
+)  # fmt: skip
+def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> None:
+    wanted = counted(float_bundle, Context())
+    kept()[0].write_bytes(content)
+    assert counted(float_bundle, Context()) == wanted
+    assert json.loads(kept()[0].read_text())["layout"] == 1
+
+
+def test_a_cache_that_cannot_be_written_costs_time_alone(float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLATOOL_CACHE", "/proc/none")
+    assert counted(float_bundle, Context()) == workload(float_bundle)
+
+
+def test_a_policy_and_an_onnx_file_are_opened_as_sources(policy_template: Path, float_bundle: Bundle) -> None:
+    assert opened(str(float_bundle.path), Context()).hash == float_bundle.hash
+    source = opened(str(policy_template), Context())
+    assert not source.manifest.graphs
+    assert "factory" in source.manifest.source
+
+
+def test_an_unknown_precision_is_refused_before_anything_is_read() -> None:
+    with pytest.raises(UsageError, match="did you mean 'int8'"):
+        select_boards("nothing", Asked(precisions=("itn8",)), Context())
+
+
+def test_the_report_names_the_work_and_what_to_run_next(float_bundle: Bundle) -> None:
+    told: list[str] = []
+    report = select_boards(
+        str(float_bundle.path), Asked(boards=("raspberry-pi-5",), hz=5.0), Context(lambda what, _: told.append(what))
+    )
+    macs = sum(workload(float_bundle).macs.values())
+    assert any(f"main {macs / 1e3:.3g} k multiply-accumulates" in sentence for sentence in report.summary)
+    assert not any(sentence.startswith("Next: vlatool optimize ") for sentence in report.summary), "it is a bundle"
+    assert any("measure before you buy many" in warning for warning in report.warnings)
+    assert told == ["predicting"]
+
+
+@pytest.mark.parametrize(("platform", "has"), [("arm", False), ("quadcopter", True)])
+def test_a_platform_on_mains_power_has_no_battery_life(platform: str, has: bool, float_bundle: Bundle) -> None:
+    asked = Asked(boards=("raspberry-pi-5",), platform=platform, hz=1.0)
+    (row,) = select_boards(str(float_bundle.path), asked, Context()).rows
+    assert row.get("average_watts", "predicted") is not None
+    assert (row.get("battery_life", "predicted") is not None) == has
+
+
+def tried(board: str, engine: str, precision: str, source: str) -> dict[str, Any] | None:
+    """Simulate; None where there is no ground."""
+    try:
+        return simulated(source, board, None, engine, precision, Context())
+    except DataError as error:
+        if board in error.message and error.fix:
+            return None
+        raise
+
+
+@pytest.mark.parametrize(("board", "engine"), ENGINES)
+def test_a_simulation_is_json_without_nan_or_a_reason(board: str, engine: str, float_bundle: Bundle) -> None:
+    for precision in load_profile(board).engines[engine].dtypes:
+        found = tried(board, engine, precision, str(float_bundle.path))
+        if found is not None:
+            json.dumps(found, allow_nan=False)
+            assert (found["profile"], found["engine"], found["precision"]) == (board, engine, precision)
+            assert len(simulation_lines(found)) > 5
+
+
+def test_a_change_that_cannot_be_predicted_is_json_without_nan(float_bundle: Bundle) -> None:
+    load = counted(float_bundle, Context())
+    way = Candidate(load_profile("raspberry-pi-5-hailo8"), "default", "hailort", "int8")
+    outcome = outcomes([way], load, shipped())[0]
+    assert not outcome.latency.known
+    found = _change(Change("int8 in the place of float32", outcome))
+    assert (found["latency_ms"], found["why"]) == (None, outcome.latency.why)
+    json.dumps(found, allow_nan=False)

@@ -1,0 +1,127 @@
+"""``vlatool hwselect``."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.errors import UsageError
+
+
+class _Group(TyperGroup):
+    """A group whose first word is a policy when it is no command."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the command ``select``."""
+        if args and args[0] not in ("--help", *self.list_commands(ctx)):
+            args = ["select", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_Group, no_args_is_help=True, rich_markup_mode=None,
+    help="Say which board runs a policy, and in which precision: vlatool hwselect SOURCE --hz 20.",
+)  # fmt: skip
+Positive = typer.Option(min=0, show_default=False)
+
+
+@app.command("select")
+def select(
+    source: Annotated[str, typer.Argument(help="a bundle or a policy source", show_default=False)],
+    hz: Annotated[
+        float | None,
+        typer.Option(
+            help="inferences in a second; the policy's control rate when neither it nor --latency-ms is given"
+        ),
+    ] = None,
+    latency_ms: Annotated[float | None, typer.Option(help="what one inference may take")] = None,
+    max_watts: Annotated[float | None, typer.Option(help="limit of the board's power mode")] = None,
+    max_price: Annotated[float | None, typer.Option(help="US dollars")] = None,
+    memory: Annotated[float | None, typer.Option(help="what the policy may take of the memory, GB")] = None,
+    battery_wh: Annotated[
+        float | None, typer.Option(help="the robot's battery, to say how long it drives the board")
+    ] = None,
+    robots: Annotated[int, typer.Option(min=1, help="robots that are bought for")] = 1,
+    years: Annotated[float, typer.Option(help="years that they run")] = 3.0,
+    hours: Annotated[float, typer.Option(help="hours a day that they run")] = 8.0,
+    kwh_price: Annotated[float, typer.Option(help="US dollars for a kWh")] = 0.3,
+    cloud: Annotated[bool, typer.Option(help="compare with a rented machine")] = False,
+    network_ms: Annotated[float, typer.Option(help="way to the rented machine and back")] = 40.0,
+    precision: Annotated[list[str] | None, typer.Option(help="allow this precision only; may be repeated")] = None,
+    platform: Annotated[str | None, typer.Option(help="start from a robot platform's rate, power and battery")] = None,
+    boards: Annotated[list[str] | None, typer.Option(help="look at this profile only; may be repeated")] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given"),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Rank the boards that can run a policy at a rate, within power, price and memory. Everything is predicted."""
+    from vlatool.select_boards import Asked, select_boards
+
+    numbers = {
+        "hz": hz, "latency_ms": latency_ms, "max_watts": max_watts, "max_price": max_price, "memory": memory,
+        "battery_wh": battery_wh, "years": years, "hours": hours, "kwh_price": kwh_price,
+    }  # fmt: skip
+    for name, value in numbers.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}; allowed: a number above 0.")
+    if not (math.isfinite(network_ms) and network_ms >= 0):
+        raise UsageError(f"--network-ms is {network_ms:g}; allowed: 0 or more.")
+    if hours > 24:
+        raise UsageError(f"--hours is {hours:g}; a day has 24.")
+    refuse_existing(output, force)
+    with progress() as context:
+        asked = Asked(
+            hz=hz, latency_ms=latency_ms, watts=max_watts, price=max_price, memory_gb=memory, battery_wh=battery_wh,
+            robots=robots, years=years, hours_a_day=hours, kwh_price=kwh_price, network_ms=network_ms,
+            precisions=tuple(precision or ()), platform=platform, boards=tuple(boards or ()), cloud=cloud,
+        )  # fmt: skip
+        report = select_boards(source, asked, context, calibration)
+    show(report, as_json=as_json, out=output, force=force)
+
+
+@app.command("score")
+def score(
+    points: Annotated[Path, typer.Argument(help="published latencies, a CSV file", show_default=False)],
+    held_out: Annotated[
+        str | None, typer.Option("--held-out", help="models, devices or calibrated: fit on the rest of this file first")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="of the split")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Predict every row of a file of published latencies, and print error and interval coverage."""
+    from vlatool.hwselect._score import lines, score_points
+
+    found = score_points(points, held_out, seed)
+    if as_json:
+        typer.echo(json.dumps(found))
+        return
+    for line in lines(found):
+        typer.echo(line)
+
+
+@app.command("fit")
+def fit(
+    points: Annotated[Path, typer.Argument(help="published latencies, a CSV file", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="directory for latency.npz and latency.json", show_default=False)
+    ],
+    seconds: Annotated[
+        float, typer.Option(min=0, help="for the search of the scales; 0 keeps those that are shipped")
+    ] = 900.0,
+    seed: Annotated[int, typer.Option(min=0, help="of the search")] = 0,
+) -> None:
+    """Fit the latency model on published latencies, and write its data files."""
+    from vlatool.hwselect._fit import fit_files
+
+    for line in fit_files(points, output, seconds, seed):
+        typer.echo(line, err=True)

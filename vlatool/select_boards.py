@@ -1,0 +1,211 @@
+"""Which board for a policy: from a source or bundle to a report (``vlatool hwselect``)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle import MANIFEST, Bundle
+from vlatool.errors import DataError, UsageError, nearest
+from vlatool.export.onnx import ExportOnnx
+from vlatool.host import cache_directory
+from vlatool.hwselect._board import Candidate, outcomes, quantized_as
+from vlatool.hwselect._boards_report import boards_report
+from vlatool.hwselect._features import PRECISIONS
+from vlatool.hwselect._latency import LatencyModel, shipped
+from vlatool.hwselect._measured import measured_questions
+from vlatool.hwselect._select import Choice, Wants, choose, in_the_cloud
+from vlatool.hwselect._simulate import Change, bounds, changes, timeline
+from vlatool.hwselect._torch_workload import torch_workload
+from vlatool.hwselect._workload import GraphWorkload, Workload, workload
+from vlatool.launch import cached_transform
+from vlatool.pipeline import sourced
+from vlatool.platforms import load_platform
+from vlatool.profile import Profile, load_profile, names
+from vlatool.report import Report
+from vlatool.stage import Context
+
+LAYOUT = 1
+"""Version of a cached workload."""
+
+
+@dataclass(frozen=True)
+class Asked(Wants):
+    """What a user asks for, and where to look.
+
+    Args:
+        platform: Robot platform that gives rate, watts and battery where they are not given.
+        boards: Profiles to look at; all when empty.
+        cloud: Whether to compare with rented machines.
+    """
+
+    platform: str | None = None
+    boards: tuple[str, ...] = ()
+    cloud: bool = False
+
+
+def select_boards(source: str, asked: Asked, context: Context, calibration: Path | None = None) -> Report:
+    """Return the report of ``vlatool hwselect``.
+
+    Raises:
+        UsageError: when a precision is unknown.
+        ProfileError: when a board or platform is unknown.
+        VlatoolError: when the policy cannot be counted.
+    """
+    for precision in asked.precisions:
+        if precision not in PRECISIONS:
+            raise UsageError(f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.")
+    if asked.platform:
+        sheet = load_platform(asked.platform)
+        asked = replace(
+            asked,
+            hz=asked.hz or (None if asked.latency_ms else sheet.control_hz),
+            watts=asked.watts or sheet.compute_watts,
+            battery_wh=asked.battery_wh or sheet.battery_wh,
+        )
+    boards = [load_profile(name) for name in (asked.boards or names())]
+    bundle = opened(source, context)
+    load = counted(bundle, context)
+    if asked.hz is None and asked.latency_ms is None:
+        asked = replace(asked, hz=bundle.manifest.spec.control_hz)
+    model = shipped().conditioned(measured_questions(calibration))
+    owned = [board for board in boards if board.price_usd_per_hour is None]
+    rented = [board for board in boards if board.price_usd_per_hour is not None]
+    context.tell("predicting", None)
+    cloud = _cheapest(rented, load, model, asked) if asked.cloud else None
+    choices = choose(owned or rented, load, model, asked)
+    return boards_report(source, load, choices, asked, cloud, context.command)
+
+
+def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wants: Wants) -> Choice | None:
+    """Return the cheapest rented machine that answers in time, network included."""
+    if not rented:
+        return None
+    found = [choice for choice in choose(rented, load, model, in_the_cloud(wants)) if choice.state == "fits"]
+    prices = {choice.profile.name: choice.profile.price_usd_per_hour for choice in found}
+    return min(found, key=lambda choice: prices[choice.profile.name].value, default=None)  # type: ignore[union-attr]
+
+
+def opened(source: str, context: Context) -> Bundle:
+    """Return the bundle that is named, or the source bundle of a policy."""
+    if (Path(source) / MANIFEST).is_file():
+        return Bundle.open(Path(source), verify=False)
+    return sourced(source, cache_directory(), context)
+
+
+def counted(bundle: Bundle, context: Context) -> Workload:
+    """Return the work of one inference of a bundle or source; kept in the cache by the bundle's hash."""
+    file = cache_directory() / "workloads" / f"{bundle.hash.removeprefix('sha256:')[:32]}.json"
+    if (found := _kept(file)) is not None:
+        return found
+    if bundle.manifest.graphs:
+        found = workload(bundle)
+    elif "factory" in bundle.manifest.source:
+        context.tell("counting the policy's work, without its weights", None)
+        found = torch_workload(bundle)
+    else:
+        found = workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
+    _keep(file, found)
+    return found
+
+
+def _kept(file: Path) -> Workload | None:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(data, dict) or data.get("layout") != LAYOUT:
+        return None
+    graphs = {}
+    try:
+        for name, fields in data["graphs"].items():
+            fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
+            graphs[name] = GraphWorkload(**fields)
+        return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+
+
+def _keep(file: Path, found: Workload) -> None:
+    graphs: dict[str, Any] = {}
+    for name, graph in found.graphs.items():
+        fields = dataclasses.asdict(graph)
+        graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        draft = file.with_suffix(f".{os.getpid()}.tmp")
+        draft.write_text(json.dumps({"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)}), encoding="utf-8")
+        draft.replace(file)
+    except OSError:
+        return  # a cache that cannot be written costs time, nothing else
+
+
+def simulated(
+    source: str, board: str, mode: str | None, engine: str | None, precision: str, context: Context
+) -> dict[str, Any]:
+    """Return what ``vlatool simulate`` prints, as JSON values.
+
+    Raises:
+        ProfileError: when the board, its mode or its engine is unknown.
+        UsageError: when the engine does not compute in the precision.
+        DataError: when nothing can be predicted; says why.
+    """
+    profile = load_profile(board)
+    name = mode or profile.default_mode
+    profile.mode(name)
+    candidate = Candidate(profile, name, engine or profile.engine, precision)
+    if precision and precision not in candidate.figures.dtypes:
+        raise UsageError(f"--precision is '{precision}'; {nearest(precision, candidate.figures.dtypes)}.")
+    load = counted(opened(source, context), context)
+    model = shipped().conditioned(measured_questions())
+    outcome = outcomes([candidate], load, model)[0]
+    if not outcome.latency.known:
+        raise DataError(f"{source} on {board}: {outcome.latency.why}.", "try another --engine or --precision")
+    phases = bounds(outcome, model.shares)
+    return {
+        "source": source, "profile": board, "mode": name, "engine": candidate.engine,
+        "precision": precision or quantized_as(load) or "float32", "origin": "predicted",
+        "latency_ms": [outcome.latency.ms, outcome.latency.low, outcome.latency.high],
+        "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
+        "joules": outcome.joules,
+        "phases": [
+            {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares)}
+            for bound in phases
+        ],
+        "timeline": [*timeline(phases)],
+        "changes": [_change(change) for change in changes(candidate, load, model)],
+    }  # fmt: skip
+
+
+def _change(change: Change) -> dict[str, Any]:
+    latency = change.outcome.latency
+    return {
+        "name": change.name, "latency_ms": latency.ms if latency.known else None, "why": latency.why,
+        "memory_mb": change.outcome.memory_mb[0], "joules": change.outcome.joules if latency.known else None,
+    }  # fmt: skip
+
+
+def simulation_lines(found: dict[str, Any]) -> list[str]:
+    """Return the text of a simulation."""
+    ms, low, high = found["latency_ms"]
+    where = ", ".join(found[name] for name in ("profile", "mode", "engine", "precision"))
+    costs = f"{found['memory_mb'][0]:.0f} MB, {found['watts'][0]:.0f} W, {found['joules']:.3g} J"
+    lines = [
+        f"PREDICTED for {where}; nothing was run there",
+        f"{ms:.4g} ms an inference (80 %: {low:.4g}-{high:.4g}), {costs}",
+        "", *found["timeline"], "", "what a change would give",
+    ]  # fmt: skip
+    for change in found["changes"]:
+        if change["latency_ms"] is None:
+            lines.append(f"  {change['name']}: unknown ({change['why']})")
+            continue
+        ratio = ms / change["latency_ms"]
+        word = f"{ratio:.2f}x as fast" if ratio >= 1 else f"{1 / ratio:.2f}x slower"
+        costs = f"{change['memory_mb']:.0f} MB, {change['joules']:.3g} J"
+        lines.append(f"  {change['name']}: {change['latency_ms']:.3g} ms ({word}), {costs}")
+    return lines
