@@ -117,7 +117,8 @@ def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) ->
 def numbers(outcome: Outcome) -> list[Measurement]:
     """Return latency, memory, power and energy of an inference as predictions."""
     where, latency = outcome.candidate.profile.name, outcome.latency
-    note = latency.why or f"{latency.regime}: {EVIDENCE[latency.regime]}"
+    way = f"{outcome.candidate.engine}, power mode {outcome.candidate.mode}"
+    note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
     low, high = (latency.low, latency.high) if latency.known else (None, None)
     memory, power = outcome.memory_mb, outcome.watts
     found = [
