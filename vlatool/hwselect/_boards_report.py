@@ -66,7 +66,7 @@ def _summary(name: str, choices: Sequence[Choice], first: Choice | None, wants: 
         told = f"No board is certain to run {name} as asked"
         if near:
             return [f"{told}; {len(near)} may: {', '.join(choice.profile.name for choice in near[:4])}."]
-        return [f"{told}. What rules each one out is said below."]
+        return [f"{told}. The reasons stand beside the boards."]
     found, way = first.outcome, first.outcome.candidate
     fit = f"{count} boards that fit" if count > 1 else "1 board that fits"
     text = (
