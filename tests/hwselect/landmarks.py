@@ -22,8 +22,9 @@ LANDMARKS = (
     ("GR00T N1.7, backbone and action head", "GR00T-N1.7-3B [ba]", "jetson-agx-orin-64gb", ""),
     ("Llama-2-7B, one token", "llama-2-7b", "core-ultra-7-165h", ""),
     ("Llama-3.2-3B, one token", "Llama-3.2-3B", "jetson-orin-nano", ""),
+    ("Llama-3.1-8B, Qwen2.5-7B, one token", "Llama-3.1-8B|Qwen2.5-7B", "jetson-orin-nano", "unseen"),
     ("YOLO11n", "yolo11n", "raspberry-pi-5", "unseen"),
-    ("YOLO11s", "yolo11s", "jetson-orin-nano-8gb-super", "unseen"),
+    ("YOLO11n", "yolo11n", "jetson-orin-nano-8gb-super", "unseen"),
 )
 """Title, beginning of the model's name (a regular expression), beginning of the device's name, file."""
 
