@@ -64,14 +64,9 @@ class Known:
     logs: Array
     scales: Scales
 
-    def process(self, runtimes: Iterable[int]) -> Process:
-        """Return the process for questions about these runtimes (codes of ``KEYS``).
-
-        A runtime with very many figures that nobody asks about is left out: it says next to nothing of the others, and
-        the work grows with the third power of the figures.
-        """
-        unasked = sorted(crowds(self.rows) - set(runtimes))
-        kept = ~np.isin(self.rows.keys["runtime"], unasked)
+    def without(self, runtimes: Iterable[int]) -> Process:
+        """Return the process that is not given the figures of some runtimes (codes of ``KEYS``)."""
+        kept = ~np.isin(self.rows.keys["runtime"], sorted(runtimes))
         return Process(self.rows.take(kept), self.logs[kept], self.scales)
 
 
@@ -102,7 +97,7 @@ class LatencyModel:
     conformal: Mapping[str, Mapping[str, Mapping[str, float]]]
     about: Mapping[str, Any]
     own: frozenset[int] = field(default_factory=frozenset)
-    _processes: dict[tuple[str, frozenset[int]], Process] = field(default_factory=dict)
+    _processes: dict[tuple[str, frozenset[int]], Process] = field(default_factory=dict, init=False, repr=False)
 
     def predict(self, questions: Sequence[Question]) -> list[Predicted]:
         """Answer every question, in order."""
@@ -154,11 +149,15 @@ class LatencyModel:
         return found
 
     def _process(self, part: str, rows: Rows) -> Process:
-        asked = frozenset(rows.keys["runtime"].tolist())
-        crowded = asked & {int(code) for code in crowds(self.parts[part].rows)}
-        if (part, crowded) not in self._processes:
-            self._processes[part, crowded] = self.parts[part].process(crowded)
-        return self._processes[part, crowded]
+        """Return the process for some questions.
+
+        A runtime with very many figures that nobody asks about is left out: it says next to nothing of the others, and
+        the work grows with the third power of the figures.
+        """
+        unasked = frozenset(crowds(self.parts[part].rows) - set(rows.keys["runtime"].tolist()))
+        if (part, unasked) not in self._processes:
+            self._processes[part, unasked] = self.parts[part].without(unasked)
+        return self._processes[part, unasked]
 
 
 def part_of(question: Question) -> str:
