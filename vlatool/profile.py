@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
 
 from vlatool._profile_problems import problem, wrong_names, wrong_sources
 from vlatool.errors import OutputError, ProfileError, nearest
+from vlatool.files import whole_file
 
 SEARCH_PATH = "VLATOOL_PROFILES"
 SUFFIXES = (".yaml", ".yml")
@@ -24,8 +25,6 @@ Kind = Literal["vendor", "measured", "derived", "estimate", "unverified"]
 COMPUTED = ("float32", "float16", "bfloat16", "float8", "int8", "w8", "w4")
 """Precisions of a candidate: a dtype of weights and activations, or of weights alone."""
 DTYPES = ("float32", "tf32", "float16", "bfloat16", "float8", "int8", "int4", "float4")
-GROUNDED: tuple[Kind, ...] = ("vendor", "measured", "derived")
-"""The kinds that rest on something that was seen."""
 
 
 def _known_dtype(name: str) -> str:
@@ -40,8 +39,15 @@ def _known_computed(name: str) -> str:
     return name
 
 
+def _version(text: str) -> str:
+    if not re.fullmatch(r"[0-9]+(\.[0-9]+)*", text):
+        raise ValueError(f"must be a version like '3.10'; got {text!r}")
+    return text
+
+
 Dtype = Annotated[str, AfterValidator(_known_dtype)]
 Computed = Annotated[str, AfterValidator(_known_computed)]
+Version = Annotated[str, AfterValidator(_version)]
 
 
 class _Strict(BaseModel):
@@ -135,7 +141,7 @@ class Software(_Strict):
 
     release: str
     os: str
-    python: str
+    python: Version
     cuda: str | None = None
     tensorrt: str | None = None
     engines: dict[str, str] = Field(default_factory=dict)
@@ -286,7 +292,8 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
         raise OutputError(f"{target} exists.", "choose another file, or pass --force")
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", path.read_text(encoding="utf-8"), count=1)
     try:
-        target.write_text(text, encoding="utf-8")
+        with whole_file(target) as draft:
+            draft.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.errors import DataError, UsageError, nearest
 from vlatool.export.onnx import ExportOnnx
+from vlatool.files import whole_file
 from vlatool.host import cache_directory
 from vlatool.hwselect._board import Candidate, outcomes, quantized_as
 from vlatool.hwselect._boards_report import boards_report
@@ -138,9 +138,9 @@ def _keep(file: Path, found: Workload) -> None:
         graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        draft = file.with_suffix(f".{os.getpid()}.tmp")
-        draft.write_text(json.dumps({"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)}), encoding="utf-8")
-        draft.replace(file)
+        with whole_file(file) as draft:
+            text = json.dumps({"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)})
+            draft.write_text(text, encoding="utf-8")
     except OSError:
         return  # a cache that cannot be written costs time, nothing else
 

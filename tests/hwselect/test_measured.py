@@ -15,6 +15,7 @@ from vlatool.hwselect._measured import (
     WORK,
     Measured,
     calibrations,
+    elsewhere,
     measured_in,
     measured_questions,
     store,
@@ -128,7 +129,8 @@ def test_measurements_are_kept_in_the_users_data_directory(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     "change",
     [
-        {"ms": 0}, {"ms": -3}, {"ms": "fast"}, {"precision": "int3"}, {"work": {}}, {"work": 3}, {"work": None},
+        {"ms": 0}, {"ms": -3}, {"ms": "fast"}, {"precision": "int3"}, {"precision": ["int8"]},
+        {"engine": {}}, {"mode": None}, {"work": {}}, {"work": 3}, {"work": None},
         {"work": WORKED | {"traits": ["magic"]}}, {"work": WORKED | {"traits": 5}}, {"work": WORKED | {"layers": 0}},
         {"colour": "red"},
     ],
@@ -142,6 +144,26 @@ def test_a_malformed_measurement_is_named(kept: Path, change: dict[str, Any]) ->
     with pytest.raises(DataError, match=r"The calibration .*raspberry-pi-5.json is malformed") as caught:
         measured_questions()
     assert "profiles calibrate" in caught.value.fix
+
+
+def test_a_measurement_in_a_mode_that_is_gone_names_its_file(kept: Path) -> None:
+    file = store([GOOD])
+    file.write_text(file.read_text().replace('"default"', '"9W"'))
+    with pytest.raises(DataError, match=r"raspberry-pi-5.json does not fit any more: .*no power mode '9W'") as caught:
+        measured_questions()
+    assert "remove it" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("made_on", "says"),
+    [({}, ""), ({"cpu": "Intel Xeon"}, "Intel Xeon"), ({"board": "Raspberry Pi 5 Model B Rev 1.0"}, ""),
+     ({"board": "Raspberry Pi 4 Model B", "cpu": "4x Cortex-A72"}, "Raspberry Pi 4 Model B, 4x Cortex-A72")],
+    ids=str,
+)  # fmt: skip
+def test_a_report_from_elsewhere_is_recognised(report: Callable[..., Path], made_on: dict[str, str], says: str) -> None:
+    path = report() / "report.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"environment": made_on}))
+    assert elsewhere(path, PI) == says
 
 
 @pytest.mark.parametrize(

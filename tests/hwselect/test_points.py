@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import DataError
-from vlatool.hwselect._points import Point, known_devices, known_runtime, merged, published_as, read_points
+from vlatool.hwselect._points import Point, known_devices, merged, published_as, read_points
 from vlatool.profile import load_profile
 
 Rows = list[dict[str, str]]
@@ -204,9 +204,3 @@ def test_a_published_device_has_the_size_of_its_profile(pair: tuple[str, str], d
     for dtype, peak in known.peaks.items():
         if dtype in unit.peak_tops:
             assert 0.55 < peak / unit.peak_tops[dtype].value < 1.8
-
-
-def test_a_runtime_that_no_figure_names_is_refused() -> None:
-    known_runtime("tensorrt")
-    with pytest.raises(DataError, match="did you mean 'tensorrt'"):
-        known_runtime("tensorr")

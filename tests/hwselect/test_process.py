@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from vlatool.hwselect._process import KEYS, Process, Rows, Scales, kernel, lower_inverse, with_scales
+from vlatool.hwselect._process import KEYS, Process, Rows, Scales, kernel, lower_inverse
 
 SCALES = Scales()
 
@@ -96,9 +96,3 @@ def test_rows_are_joined_and_taken_in_order() -> None:
     assert len(both) == 5
     np.testing.assert_array_equal(both.take(slice(3, 5)).model, second.model)
     np.testing.assert_array_equal(both.take([0]).keys["pair"], first.keys["pair"][:1])
-
-
-def test_scales_of_a_file_have_known_names() -> None:
-    assert with_scales({"noise": 0.5}).noise == 0.5
-    with pytest.raises(TypeError, match="nois"):
-        with_scales({"nois": 0.5})

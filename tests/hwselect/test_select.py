@@ -9,7 +9,7 @@ import pytest
 from vlatool.errors import ProfileError
 from vlatool.hwselect._board import Candidate, outcomes
 from vlatool.hwselect._latency import LatencyModel
-from vlatool.hwselect._select import Choice, Wants, choose, cost, idle, in_the_cloud, state_of
+from vlatool.hwselect._select import Choice, Wants, choose, cost, in_the_cloud, state_of
 from vlatool.hwselect._workload import GraphWorkload, Workload
 from vlatool.profile import Profile, load_profile
 
@@ -260,8 +260,6 @@ def test_without_a_rate_the_board_works_all_the_time(chosen: Callable[..., Choic
 def test_what_cannot_be_had_has_no_cost(chosen: Callable[..., Choice], rented: Choice) -> None:
     for choice in (chosen(price=1.0), rented):
         assert all(math.isnan(value) for value in vars(cost(choice, Wants(hz=1.0), rented)).values())
-    assert math.isnan(idle(chosen(price=1.0)))
-    assert idle(chosen()) == 4.5
 
 
 def test_the_network_takes_its_time_from_a_rented_machine() -> None:

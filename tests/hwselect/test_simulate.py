@@ -7,7 +7,7 @@ import pytest
 
 from vlatool.hwselect._board import Candidate, Outcome, outcomes
 from vlatool.hwselect._latency import LatencyModel
-from vlatool.hwselect._simulate import bounds, bytes_per_weight, changes, timeline, widest
+from vlatool.hwselect._simulate import bounds, changes, timeline, widest
 from vlatool.hwselect._workload import GraphWorkload, Workload
 from vlatool.profile import load_profile
 
@@ -73,12 +73,6 @@ def test_a_quantized_bundle_is_not_offered_other_precisions(certain: LatencyMode
 def test_the_widest_graph_is_the_one_on_images(policy: Workload) -> None:
     assert widest(policy) == "prefix"
     assert widest(Workload({"a": GraphWorkload()}, {"a": 1})) == "a"
-
-
-def test_bytes_of_a_weight_as_it_is_stored(load: Load) -> None:
-    assert bytes_per_weight(load()) == 4
-    assert bytes_per_weight(load(precision="int8")) == 1
-    assert bytes_per_weight(Workload({}, {})) == 4
 
 
 def test_a_time_line_of_nothing_is_empty() -> None:

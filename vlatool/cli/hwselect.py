@@ -28,7 +28,8 @@ app = typer.Typer(
     cls=_Group, no_args_is_help=True, rich_markup_mode=None,
     help="Say which board runs a policy, and in which precision: vlatool hwselect SOURCE --hz 20.",
 )  # fmt: skip
-Positive = typer.Option(min=0, show_default=False)
+
+POINTS = "published latencies: a CSV file with device, device_class, runtime, model, precision, metric, value"
 
 
 @app.command("select")
@@ -91,7 +92,7 @@ def select(
 
 @app.command("score")
 def score(
-    points: Annotated[Path, typer.Argument(help="published latencies, a CSV file", show_default=False)],
+    points: Annotated[Path, typer.Argument(help=POINTS, show_default=False)],
     held_out: Annotated[
         str | None, typer.Option("--held-out", help="models, devices or calibrated: fit on the rest of this file first")
     ] = None,
@@ -111,7 +112,7 @@ def score(
 
 @app.command("fit")
 def fit(
-    points: Annotated[Path, typer.Argument(help="published latencies, a CSV file", show_default=False)],
+    points: Annotated[Path, typer.Argument(help=POINTS, show_default=False)],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="directory for latency.npz and latency.json", show_default=False)
     ],

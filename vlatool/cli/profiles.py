@@ -23,8 +23,9 @@ def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JS
     if as_json:
         typer.echo(json.dumps([profile.model_dump(mode="json") for profile in found]))
         return
+    width = max((len(profile.name) for profile in found), default=0)
     for profile in found:
-        typer.echo(f"{profile.name:22} {profile.title}")
+        typer.echo(f"{profile.name:{width}}  {profile.title}")
 
 
 @app.command("show")
@@ -123,15 +124,18 @@ def calibrate_profile(
 ) -> None:
     """Tell the latency model what was measured on a board: predictions for it rest on that from now on."""
     from vlatool.bundle import Bundle
-    from vlatool.hwselect._measured import calibrations, measured_in, store
+    from vlatool.hwselect._measured import calibrations, elsewhere, measured_in, store
     from vlatool.hwselect._workload import workload
     from vlatool.profile import load_profile
 
     load = workload(Bundle.open(bundle)) if bundle else None
-    found = measured_in(report, load_profile(name), mode, load)
+    profile = load_profile(name)
+    found = measured_in(report, profile, mode, load)
     file = store(found)
     for each in found:
         typer.echo(f"{each.profile}, {each.mode}, {each.engine}, {each.precision}: {each.ms:.4g} ms measured")
+    if made_on := elsewhere(report, profile):
+        typer.echo(f"warning: the report was made on {made_on}, which {name} does not name in model_strings", err=True)
     typer.echo(f"kept in {file}; remove the file to forget it, or set VLATOOL_CALIBRATIONS (now {calibrations()})")
 
 

@@ -17,7 +17,7 @@ from vlatool.report import Measurement, Report, Row
 
 ROLES = {"fits": "within", "may fit": "subject", "unknown": "subject", "no": "outside"}
 WAY = "way"
-"""Table of a row that says how the board is driven: state, power mode, engine, precision, phases."""
+"""Table of a row that says how the board is driven: state, power mode, engine, precision."""
 
 
 def boards_report(

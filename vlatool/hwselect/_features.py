@@ -61,7 +61,7 @@ class Place:
         unit: ``cpu``, ``gpu``, ``igpu`` or ``npu``.
         cores: Cores (threads) that take part.
         clock_ghz: Of them.
-        peaks: Precision -> 10^12 operations per second, dense; at least float32.
+        peaks: Precision -> 10^12 operations per second, dense; at least one.
         bandwidth_gb_s: Of the memory.
         setting: What else a measurement was taken with: power mode, threads, version.
     """
@@ -156,7 +156,8 @@ def _keys(question: Question) -> dict[str, int]:
     place, runtime = question.place, question.runtime
     precision = ALIKE.get(question.precision, question.precision)
     work = question.work
-    name = f"{work.name} {work.macs:.3g}" if work.name else f"own {work}"
+    own = f"own {work.macs} {work.weights} {work.activations} {work.layers} {sorted(work.traits)}"
+    name = f"{work.name} {work.macs:.3g}" if work.name else own
     unit = f"{place.device}/{place.unit}"
     names = (
         place.unit, unit, runtime, f"{runtime} {precision}", f"{unit} {runtime} {precision}",

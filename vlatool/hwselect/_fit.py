@@ -32,7 +32,6 @@ CALIBRATED, QUICK = 0.6, 6
 """What a device counts of which one model is known; how many of its models are tried in the search for scales."""
 STEP = 0.5
 UNITS = ("cpu", "gpu", "igpu", "npu")
-REGIMES = ("known", "unseen", "calibrated")
 LONGEST = 32
 """Models that calibrate a held-out device, one after the other, at most."""
 

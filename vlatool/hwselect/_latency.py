@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.files import whole_file
 from vlatool.hwselect._features import ALIKE, Question, Shares, rows_of
 from vlatool.hwselect._process import KEYS, Process, Rows, Scales
 
@@ -22,8 +23,6 @@ LEVEL = 0.8
 """Share of measurements that fall into the interval."""
 WIDEST = 1.4
 """Half an interval in log(ms), above which nothing useful is said: more than a factor of 4 either way."""
-NORMAL = 1.2816
-"""Standard deviations on either side that hold ``LEVEL`` of a normal distribution."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +211,8 @@ def write(model: LatencyModel, folder: Path) -> None:
                 for regime, units in model.conformal[part].items()
             },
         }
-    np.savez_compressed(folder / "latency.npz", **arrays)  # type: ignore[arg-type]
     text = json.dumps({"about": dict(model.about), "parts": described}, indent=1)
-    (folder / "latency.json").write_text(text + "\n", encoding="utf-8")
+    with whole_file(folder / "latency.npz") as stored, whole_file(folder / "latency.json") as told:
+        with stored.open("wb") as stream:  # by its name numpy would call it .npz
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+        told.write_text(text + "\n", encoding="utf-8")

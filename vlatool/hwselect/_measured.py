@@ -10,17 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import DataError
+from vlatool.errors import DataError, ProfileError
+from vlatool.files import whole_file
+from vlatool.host import matches
 from vlatool.hwselect._board import Candidate, place_of, stored_precision
 from vlatool.hwselect._features import PRECISIONS, Question, Work
 from vlatool.hwselect._workload import TRAITS, Workload
 from vlatool.profile import Profile, load_profile, names
+from vlatool.report import read_report
 
 WORK = "workload"
 """Table of a benchmark's row: what one inference computes."""
 PLACES = "VLATOOL_CALIBRATIONS"
 NUMBERS = ("macs", "weights", "activations", "layers")
 LAYOUT = 1
+AGAIN = "remove it, and make it again: vlatool profiles calibrate PROFILE --from REPORT"
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,6 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
         DataError: when there is no such report, or it holds no latency with its work.
         ProfileError: when the profile has no such mode.
     """
-    from vlatool.report import read_report
-
     found = []
     missing = 0
     name = mode or profile.default_mode
@@ -113,15 +115,21 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
     return found
 
 
+def elsewhere(report: Path, profile: Profile) -> str:
+    """Return what a report was made on when that is not the profile's board; empty when it is, or is not said."""
+    made_on = read_report(report).environment
+    said = [str(made_on[key]) for key in ("board", "cpu") if made_on.get(key)]
+    return "" if matches(profile.model_strings, made_on) else ", ".join(said)
+
+
 def store(measured: list[Measured]) -> Path:
     """Keep measurements beside those of other boards; return the file."""
     file = calibrations() / f"{measured[0].profile}.json"
     known = [item for item in _read(file) if item not in measured] if file.is_file() else []
     file.parent.mkdir(parents=True, exist_ok=True)
-    draft = file.with_suffix(f".{os.getpid()}.tmp")
     rows = [dict(vars(item)) for item in (*known, *measured)]
-    draft.write_text(json.dumps({"schema": LAYOUT, "measured": rows}, indent=1) + "\n", encoding="utf-8")
-    draft.replace(file)
+    with whole_file(file) as draft:
+        draft.write_text(json.dumps({"schema": LAYOUT, "measured": rows}, indent=1) + "\n", encoding="utf-8")
     return file
 
 
@@ -136,31 +144,35 @@ def measured_questions(file: Path | None = None) -> list[tuple[Question, float]]
     """Return what a file of ``store`` holds, or all that is kept.
 
     Raises:
-        DataError: when the file is missing or malformed.
+        DataError: when the file is missing or malformed, or its board's profile has changed.
     """
-    files = [file] if file else sorted(calibrations().glob("*.json"))
-    known = [item for each in files for item in _read(each)]
-    return [(item.question(), item.ms) for item in known if file or item.profile in names()]
+    found = []
+    for each in [file] if file else sorted(calibrations().glob("*.json")):
+        try:
+            found += [(item.question(), item.ms) for item in _read(each) if file or item.profile in names()]
+        except ProfileError as error:
+            raise DataError(f"The calibration {each} does not fit any more: {error.message}", AGAIN) from error
+    return found
 
 
 def _read(file: Path) -> list[Measured]:
-    fix = "make it again: vlatool profiles calibrate PROFILE --from REPORT"
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
         found = [Measured(**row) for row in data["measured"]]
     except OSError as error:
-        raise DataError(f"The calibration {file} cannot be read: {error.strerror}.", fix) from error
+        raise DataError(f"The calibration {file} cannot be read: {error.strerror}.", AGAIN) from error
     except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
-        raise DataError(f"The calibration {file} is malformed: {type(error).__name__}: {error}.", fix) from error
+        raise DataError(f"The calibration {file} is malformed: {type(error).__name__}: {error}.", AGAIN) from error
     for item in found:
         if not is_sound(item):
-            raise DataError(f"The calibration {file} is malformed: {item}.", fix)
+            raise DataError(f"The calibration {file} is malformed: {item}.", AGAIN)
     return found
 
 
 def is_sound(item: Measured) -> bool:
-    """Say whether a measurement can be learnt from: numbers above zero, a known precision, known traits."""
-    if not isinstance(item.work, Mapping):
+    """Say whether a measurement can be learnt from: names, numbers above zero, a known precision, known traits."""
+    named = (item.profile, item.mode, item.engine, item.precision)
+    if not isinstance(item.work, Mapping) or not all(isinstance(name, str) for name in named):
         return False
     numbers = [item.ms, *(item.work.get(name) for name in NUMBERS)]
     traits = item.work.get("traits")

@@ -1,7 +1,7 @@
 """Published latencies, in the columns of the collection that the model is fitted on.
 
     device, power_mode, runtime, model, params_m, gflops_or_gmacs, input, precision, batch, metric, value,
-    source_url_or_repo_path, year, macts_m, n_layers, avg_wall_power_w, device_class, notes
+    macts_m, n_layers, device_class; any others are not read
 
 ``gflops_or_gmacs`` holds 10^9 multiply-accumulates, ``params_m`` and ``macts_m`` 10^6 weights and activations.
 ``data/models.csv`` says more of some models (weights as often as they are read); what is left out follows from the
@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError
 from vlatool.hwselect._features import Place, Question, Work
 
 DATA = Path(__file__).with_name("data")
@@ -61,7 +61,6 @@ class Point:
         log_ms: Natural logarithm of the milliseconds of one item.
         group: Name of the device, as held out.
         kind: ``device_class``: cpu, gpu, igpu, npu.
-        watts: Average wall power, NaN when not measured.
         why: Why there is no question.
     """
 
@@ -70,7 +69,6 @@ class Point:
     group: str
     kind: str
     model: str
-    watts: float = math.nan
     why: str = ""
 
 
@@ -78,7 +76,7 @@ def read_points(path: Path) -> list[Point]:
     """Read a file of published latencies.
 
     Raises:
-        DataError: when it cannot be read, lacks a column, or a value is not a number above zero; names the line.
+        DataError: when it cannot be read, lacks a column, or a value is not a number; names the line.
     """
     try:
         with path.open(encoding="utf-8", newline="") as stream:
@@ -87,14 +85,13 @@ def read_points(path: Path) -> list[Point]:
             if missing:
                 known = ", ".join(reader.fieldnames or ()) or "none"
                 raise DataError(f"{path} has no column '{missing[0]}'; its columns: {known[:300]}.")
-            rows = [
-                (reader.line_num, {key: (text or "").strip() for key, text in row.items() if key}) for row in reader
-            ]
+            rows = [(reader.line_num, _stripped(row)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
     found = [_point(row, f"{path}, line {number}") for number, row in rows]
     if not found:
-        raise DataError(f"{path} holds no row.", "give a file in the format of published latencies, see docs/guides")
+        fix = f"give a CSV file with a row for each figure; columns: {', '.join(NEEDED)}"
+        raise DataError(f"{path} holds no row.", fix)
     return found
 
 
@@ -114,9 +111,7 @@ def _point(row: Mapping[str, str], where: str) -> Point:
         raise DataError(f"{where}: the metric '{metric}' is unknown; allowed: latency_ms, fps, tokens_per_s.")
     if kind not in ("cpu", "gpu", "igpu", "npu"):
         raise DataError(f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.")
-    blank = Point(
-        None, math.nan, _name(row["device"]), kind, row["model"], _number(row.get("avg_wall_power_w", ""), where, "w")
-    )
+    blank = Point(None, math.nan, _name(row["device"]), kind, row["model"])
     if not (value > 0 and math.isfinite(value)):
         return replace(blank, why="its value is 0, endless or missing: nothing was measured")
     blank = replace(blank, log_ms=math.log(value if metric == "latency_ms" else 1000 / value))
@@ -260,14 +255,3 @@ def _number(text: str, where: str, column: str) -> float:
         return float(text)
     except ValueError:
         raise DataError(f"{where}: '{text}' in the column '{column}' is no number.") from None
-
-
-def known_runtime(name: str) -> None:
-    """Raise for a runtime that no published figure names.
-
-    Raises:
-        DataError: names the known ones.
-    """
-    known = sorted({found for _, found in RUNTIMES})
-    if name not in known:
-        raise DataError(f"There is no runtime '{name}'; {nearest(name, known)}.")

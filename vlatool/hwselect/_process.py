@@ -10,7 +10,7 @@ chapters 2 and 5). A measurement on a board is one more point: conditioning on i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -162,8 +162,3 @@ def lower_inverse(factor: Array) -> Array:
     found[half:, half:] = lower_inverse(factor[half:, half:])
     found[half:, :half] = -found[half:, half:] @ (factor[half:, :half] @ found[:half, :half])
     return found
-
-
-def with_scales(values: Mapping[str, float]) -> Scales:
-    """Return scales from a file; unknown names are an error of the file."""
-    return replace(Scales(), **values)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from vlatool.errors import ProfileError
-from vlatool.hwselect._board import Candidate, Outcome, candidates, idle_watts, outcomes, power_limit, quantized_as
+from vlatool.hwselect._board import Candidate, Outcome, candidates, outcomes, power_limit, quantized_as
 from vlatool.hwselect._latency import LatencyModel
 from vlatool.hwselect._workload import Workload
 from vlatool.profile import Profile
@@ -265,8 +265,3 @@ def in_the_cloud(wants: Wants) -> Wants:
     """Return what is left of the wishes for a rented machine: no watts, no price, and the network's time is gone."""
     limit = wants.limit_ms - wants.network_ms
     return replace(wants, hz=None, latency_ms=max(limit, 1e-3), watts=None, price=None, memory_gb=None)
-
-
-def idle(choice: Choice) -> float:
-    """Return what the board draws when nothing runs."""
-    return idle_watts(choice.outcome.candidate) if choice.outcome else math.nan

@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from vlatool.hwselect._board import FLOAT32, Candidate, Outcome, Phase, at, outcomes, quantized_as
+from vlatool.hwselect._board import Candidate, Outcome, Phase, at, outcomes, quantized_as
 from vlatool.hwselect._features import Shares, roofline_parts
-from vlatool.hwselect._latency import LatencyModel
+from vlatool.hwselect._latency import LatencyModel, part_of
 from vlatool.hwselect._workload import Workload
 
 PRUNED = 0.7
@@ -51,8 +51,7 @@ def bounds(outcome: Outcome, shares: Mapping[str, Shares]) -> list[Bound]:
     """Return each phase with what holds it back."""
     found = []
     for phase in outcome.phases:
-        part = "npu" if phase.question.place.unit == "npu" else "processors"
-        parts = roofline_parts(phase.question, shares[part])
+        parts = roofline_parts(phase.question, shares[part_of(phase.question)])
         whole = sum(parts.values())
         found.append(Bound(phase, {name: value / whole for name, value in parts.items()}))
     return found
@@ -97,9 +96,3 @@ def timeline(found: list[Bound], width: int = 40) -> Iterator[str]:
         held = f"{bound.shares[bound.by]:.0%} {bound.by}"
         yield f"{phase.name[:16]:16} {bar:{width + 1}} {phase.ms:8.3g} ms{times}  {held}"
         begin += phase.ms
-
-
-def bytes_per_weight(load: Workload) -> float:
-    """Return the bytes that a weight takes as it is stored."""
-    weights = sum(graph.weights for graph in load.graphs.values())
-    return load.weight_bytes / weights if weights else float(FLOAT32)

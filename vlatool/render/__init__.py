@@ -12,6 +12,7 @@ from typing import Protocol
 
 from vlatool import registry
 from vlatool.errors import OutputError
+from vlatool.files import whole_file
 from vlatool.report import Report
 
 FILES = {"json": "report.json", "html": "report.html", "markdown": "report.md"}
@@ -54,9 +55,8 @@ def write_reports(report: Report, directory: Path) -> list[Path]:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for path, text in texts.items():
-            part = path.with_name(path.name + ".part")
-            part.write_text(text, encoding="utf-8")
-            part.replace(path)
+            with whole_file(path) as draft:
+                draft.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(
             f"The reports cannot be written to {directory}: {error}.", "name another directory"
