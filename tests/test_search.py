@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from vlatool import search as search_module
 from vlatool.bundle import Bundle
 from vlatool.judge import Budget
 from vlatool.launch import cached_transform
@@ -14,7 +16,7 @@ from vlatool.profile import load_profile
 from vlatool.quantize._sensitivity import LayerError
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.recipe import Limits
-from vlatool.search import Search, Trial, built, has_bfloat16, variants_for
+from vlatool.search import BF16, Search, Trial, built, processor_has, variants_for
 from vlatool.stage import Context
 
 BAD = ({"quantize.static_int8": {"samples": 1, "method": "percentile", "percentile": 60, "per_channel": False}},)
@@ -42,7 +44,20 @@ def test_bfloat16_is_tried_only_where_the_processor_has_it() -> None:
     nuc = variants_for(load_profile("intel-nuc-13-pro"), calibrated=True)
     assert "openvino_int8" in nuc
     assert "openvino_bf16" not in nuc
-    assert not has_bfloat16(load_profile("intel-nuc-13-pro"))
+    assert not processor_has(load_profile("intel-nuc-13-pro"), *BF16)
+
+
+def test_convolutions_are_tried_only_where_the_processor_has_matrix_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    def options(*features: str) -> list[dict[str, Any]]:
+        monkeypatch.setattr(search_module, "isa", lambda: features)
+        return [each for (stage,) in variants_for(None, calibrated=True).values() for each in stage.values()]
+
+    assert not any("convolutions" in each for each in options("avx512_vnni", "avx512_bf16"))
+    with_amx = options("amx_tile", "amx_bf16", "amx_int8")
+    assert {"layout": "openvino", "compute": "bfloat16"} in with_amx, "the same without convolutions races, too"
+    assert {"layout": "openvino", "compute": "bfloat16", "convolutions": True, "attention": True} in with_amx
+    assert {"convolutions": True} in [each for (stage,) in variants_for(None, calibrated=False).values()
+                                      for each in stage.values()]  # fmt: skip
 
 
 def test_every_variant_can_be_built_as_stages() -> None:

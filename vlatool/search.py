@@ -26,6 +26,7 @@ from vlatool.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.errors import VlatoolError
 from vlatool.evaluate.recorded import Recorded
+from vlatool.host import isa
 from vlatool.judge import budget_of
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.profile import Profile
@@ -48,6 +49,12 @@ SAMPLES = 8
 """Observations on which it is measured, at most."""
 TIMED = 20
 BF16 = ("amx_bf16", "avx512_bf16")
+AMX = ("amx_tile", "amx_int8")
+INT8: dict[str, dict[str, Any]] = {
+    "int8": {}, "int8_mse": {"method": "mse"}, "int8_attention": {"attention": True},
+    "int8_elementwise": {"elementwise": True},
+}  # fmt: skip
+"""Name -> options of the int8 variants of OpenVINO."""
 
 
 @dataclass(frozen=True)
@@ -237,37 +244,30 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
             found["static_int8"] = ({"quantize.static_int8": {}},)
             found["static_int8_mse"] = ({"quantize.static_int8": {"method": "mse"}},)
     if "openvino" in engines and importlib.util.find_spec("openvino") is not None:
-        found.update(_openvino_variants(has_bfloat16(profile), calibrated))
+        found.update(_openvino_variants(processor_has(profile, *BF16), processor_has(profile, *AMX), calibrated))
     return found
 
 
-def _openvino_variants(bfloat16: bool, calibrated: bool) -> dict[str, StageList]:
+def _openvino_variants(bfloat16: bool, amx: bool, calibrated: bool) -> dict[str, StageList]:
+    """Return the variants of OpenVINO; with matrix units (AMX) their products are convolutions, as ``_pixels`` says."""
     found: dict[str, StageList] = {}
-    if bfloat16:
-        found["openvino_bf16"] = ({"quantize.bfloat16": {}},)
-    if not calibrated:
-        return found
+    forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if amx else {"": {}}
+    for form, how in forms.items():
+        if bfloat16:
+            found[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
     rest = {"compute": "bfloat16"} if bfloat16 else {}
-    for name, options in (
-        ("int8", {}),
-        ("int8_mse", {"method": "mse"}),
-        ("int8_attention", {"attention": True}),
-        ("int8_elementwise", {"elementwise": True}),
-    ):
-        stage = {"layout": "openvino", **rest, **options}
-        found[f"openvino_{name}"] = ({"quantize.static_int8": stage},)
+    for name, options in INT8.items() if calibrated else ():
+        for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
+            stage = {"layout": "openvino", **rest, **how, **options}
+            found[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
     return found
 
 
-def has_bfloat16(profile: Profile | None) -> bool:
-    """Say whether the board's processor (this host's, for None) multiplies bfloat16 in hardware."""
+def processor_has(profile: Profile | None, *features: str) -> bool:
+    """Say whether the board's processor (this host's, for None) has one of these features."""
     if profile is not None:
-        return any(name in BF16 for unit in profile.units.values() for name in unit.isa)
-    try:
-        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return False
-    return any(name in flags for name in BF16)
+        return any(name in features for unit in profile.units.values() for name in unit.isa)
+    return any(name in features for name in isa() or [])
 
 
 def built(stages: Iterable[dict[str, dict[str, Any]]]) -> list[Transform]:

@@ -14,9 +14,12 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "openvino bf16, mse": (*OPENVINO, "--method", "mse"),
     "openvino bf16, elementwise": (*OPENVINO, "--elementwise"),
     "openvino bf16, elementwise, attention": (*OPENVINO, "--elementwise", "--attention"),
+    "openvino bf16, convolutions": (*OPENVINO, "--convolutions"),
+    "openvino bf16, mse, convolutions": (*OPENVINO, "--method", "mse", "--convolutions"),
     "static-int8": ("quantize", "static-int8", "{bundle}"),
     "dynamic-int8": ("quantize", "dynamic-int8", "{bundle}"),
     "bfloat16": ("quantize", "bfloat16", "{bundle}"),
+    "bfloat16, convolutions": ("quantize", "bfloat16", "{bundle}", "--convolutions"),
     "float32": (),
 }
 """Name -> ``vlatool`` command that makes the bundle; the float32 bundle itself when empty."""

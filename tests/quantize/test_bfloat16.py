@@ -10,6 +10,7 @@ import pytest
 
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, GraphError
+from vlatool.quantize import _pixels
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
@@ -51,6 +52,20 @@ def test_the_weights_are_stored_as_they_were(halved: Bundle, float_bundle: Bundl
     assert {tensor.name: tensor.raw_data for tensor in stored.graph.initializer} == {
         tensor.name: tensor.raw_data for tensor in before.graph.initializer
     }
+
+
+def test_products_of_many_rows_may_be_convolutions(
+    halved: Bundle,
+    quantized: Callable[..., Bundle],
+    drift: Callable[..., float],
+    operators: Callable[[Bundle], dict[str, int]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(_pixels, "FEWEST", 4)
+    written = quantized(Bfloat16(convolutions=True))
+    assert operators(written)["Conv"] > operators(halved)["Conv"]
+    assert drift(written, halved) < drift(halved)
+    assert drift(written) < 1.5 * drift(halved)
 
 
 def test_another_engine_refuses_it(halved: Bundle) -> None:

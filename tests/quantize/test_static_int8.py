@@ -8,7 +8,7 @@ import pytest
 from vlatool.bundle import Bundle, seal
 from vlatool.data import recorded_observations
 from vlatool.errors import DataError, MissingExtra, RecipeError
-from vlatool.quantize import static_int8
+from vlatool.quantize import _pixels, static_int8
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.static_int8 import StaticInt8, engines_differ
 from vlatool.stage import build_stage
@@ -157,6 +157,22 @@ def test_openvino_and_onnxruntime_agree_on_an_int8_graph(quantized, float_bundle
     monkeypatch.setattr(static_int8, "DIFFERENCE", -1.0)
     with pytest.warns(UserWarning, match="OpenVINO computes other values than the int8 graph says"):
         quantized(StaticInt8(layout="openvino"))
+
+
+def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operators, monkeypatch):
+    monkeypatch.setattr(_pixels, "FEWEST", 4)
+    options = {"layout": "openvino", "samples": 8}
+    plain, written = quantized(StaticInt8(**options)), quantized(StaticInt8(**options, convolutions=True))
+    assert operators(written)["Conv"] > operators(plain)["Conv"]
+    assert operators(written).get("MatMul", 0) < operators(plain)["MatMul"]
+    assert drift(written, plain) < max(0.5 * drift(plain), 0.01)
+    assert drift(written) < 1.5 * drift(plain)
+
+
+def test_convolutions_are_for_openvino():
+    with pytest.raises(RecipeError, match="The layout ort has no use for convolutions") as caught:
+        StaticInt8(convolutions=True).check(None, None)
+    assert caught.value.fix == "use layout openvino"
 
 
 def test_other_dtypes_need_the_layout_that_computes_in_them():

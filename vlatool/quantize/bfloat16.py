@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from pydantic import Field
+
 from vlatool.bundle import Bundle
 from vlatool.errors import require
 from vlatool.quantize._graphs import Quantization, load, save
+from vlatool.quantize._pixels import use_convolutions
 from vlatool.stage import Context
 
 if TYPE_CHECKING:
@@ -23,6 +26,10 @@ class Bfloat16(Quantization):
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "openvino", "numpy")
 
+    convolutions: bool = Field(
+        False, description="write products of many rows as 1x1 convolutions, faster on processors with AMX"
+    )
+
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """OpenVINO is installed."""
         super().check(source, profile)
@@ -32,7 +39,10 @@ class Bfloat16(Quantization):
         """Mark every selected graph."""
 
         def mark(_name: str, original: Path, target: Path) -> str:
-            save(load(original), target)
+            model = load(original)
+            if self.convolutions:
+                use_convolutions(model)
+            save(model, target)
             return "bfloat16"
 
         return self.transform(source, out, context, mark, "openvino")
