@@ -14,6 +14,7 @@ from vlatool.hwselect._latency import shipped
 from vlatool.hwselect._simulate import Change
 from vlatool.hwselect._workload import workload
 from vlatool.profile import load_profile, names
+from vlatool.render._boards import limit_ms
 from vlatool.select_boards import Asked, _change, counted, opened, select_boards, simulated, simulation_lines
 from vlatool.stage import Context
 
@@ -77,6 +78,24 @@ def test_the_report_names_the_work_and_what_to_run_next(float_bundle: Bundle) ->
     assert not any(sentence.startswith("Next: vlatool optimize ") for sentence in report.summary), "it is a bundle"
     assert any("measure before you buy many" in warning for warning in report.warnings)
     assert told == ["predicting"]
+
+
+@pytest.mark.parametrize("per_chunk", [False, True])
+def test_the_report_tells_what_a_chunk_and_a_tick_cost(per_chunk: bool, float_bundle: Bundle) -> None:
+    """The policy gives 4 actions, of which 2 are executed, at 10 Hz."""
+    asked = Asked(boards=("raspberry-pi-5",), per_chunk=per_chunk)
+    report = select_boards(str(float_bundle.path), asked, Context())
+    predicted = {item.name: item.value for item in report.rows[0].measurements}
+    for whole, each in (("latency_p50", "latency_per_action"), ("energy", "energy_per_action")):
+        assert predicted[each] == pytest.approx(predicted[whole] / 2)
+    told = next(each for each in report.summary if "2 actions are executed: there each control tick" in each)
+    assert told.endswith("--per-chunk.") == (not per_chunk)
+    assert limit_ms(report) == (200 if per_chunk else 100)
+
+
+def test_actions_per_chunk_need_a_rate(float_bundle: Bundle) -> None:
+    with pytest.raises(UsageError, match="--per-chunk asks how often the loop ticks"):
+        select_boards(str(float_bundle.path), Asked(latency_ms=3.0, per_chunk=True), Context())
 
 
 @pytest.mark.parametrize(("platform", "has"), [("arm", False), ("quadcopter", True)])

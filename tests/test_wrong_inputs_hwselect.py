@@ -178,6 +178,8 @@ NUMBERS = [
         lambda at: at.choose("--network-ms=-1")),
     Row("a network that never answers", "--network-ms is inf", 2, lambda at: at.choose("--network-ms", "inf")),
     Row("no robot", "--robots", 2, lambda at: at.choose("--robots", 0)),
+    Row("an inference for each chunk of no rate", "--per-chunk asks how often the loop ticks", 2,
+        lambda at: at.choose("--latency-ms", 5, "--per-chunk")),
     Row("half a robot", "--robots", 2, lambda at: at.choose("--robots", 0.5)),
     Row("a rate in words", "Invalid value for '--hz'", 2, lambda at: at.choose("--hz", "often")),
 ]  # fmt: skip

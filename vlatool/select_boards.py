@@ -57,6 +57,8 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
         ProfileError: when a board or platform is unknown.
         VlatoolError: when the policy cannot be counted.
     """
+    if asked.per_chunk and asked.latency_ms and not asked.hz:
+        raise UsageError("--per-chunk asks how often the loop ticks.", "give --hz, too, or leave it out")
     for precision in asked.precisions:
         if precision not in PRECISIONS:
             raise UsageError(f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.")
@@ -71,8 +73,10 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     boards = [load_profile(name) for name in (asked.boards or names())]
     bundle = opened(source, context)
     load = counted(bundle, context)
+    spec = bundle.manifest.spec
+    asked = replace(asked, execute=spec.execute or spec.chunk)
     if asked.hz is None and asked.latency_ms is None:
-        asked = replace(asked, hz=bundle.manifest.spec.control_hz)
+        asked = replace(asked, hz=spec.control_hz)
     model = shipped().conditioned(measured_questions(calibration))
     owned = [board for board in boards if board.price_usd_per_hour is None]
     rented = [board for board in boards if board.price_usd_per_hour is not None]
@@ -161,7 +165,8 @@ def simulated(
     candidate = Candidate(profile, name, engine or profile.engine, precision)
     if precision and precision not in candidate.figures.dtypes:
         raise UsageError(f"--precision is '{precision}'; {nearest(precision, candidate.figures.dtypes)}.")
-    load = counted(opened(source, context), context)
+    bundle = opened(source, context)
+    spec, load = bundle.manifest.spec, counted(bundle, context)
     model = shipped().conditioned(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
@@ -172,7 +177,7 @@ def simulated(
         "precision": precision or quantized_as(load) or "float32", "origin": "predicted",
         "latency_ms": [outcome.latency.ms, outcome.latency.low, outcome.latency.high],
         "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
-        "joules": outcome.joules,
+        "joules": outcome.joules, "execute": spec.execute or spec.chunk, "control_hz": spec.control_hz,
         "phases": [
             {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares)}
             for bound in phases
@@ -195,9 +200,14 @@ def simulation_lines(found: dict[str, Any]) -> list[str]:
     ms, low, high = found["latency_ms"]
     where = ", ".join(found[name] for name in ("profile", "mode", "engine", "precision"))
     costs = f"{found['memory_mb'][0]:.0f} MB, {found['watts'][0]:.0f} W, {found['joules']:.3g} J"
+    count, hz = found["execute"], found["control_hz"]
+    actions = f"each of the {count} actions that are executed of it" if count > 1 else "each action"
+    share = ms / count * hz / 1e3
+    busy = f"busy {share:.1%} of the time" if share < 1 else f"{share:.3g} times the time that there is"
     lines = [
         f"PREDICTED for {where}; nothing was run there",
         f"{ms:.4g} ms an inference (80 %: {low:.4g}-{high:.4g}), {costs}",
+        f"{actions}: {ms / count:.3g} ms, {found['joules'] / count:.3g} J; at the policy's {hz:g} Hz {busy}",
         "", *found["timeline"], "", "what a change would give",
     ]  # fmt: skip
     for change in found["changes"]:

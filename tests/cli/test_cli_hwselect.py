@@ -223,6 +223,8 @@ def test_simulate_shows_where_the_time_goes(vlatool, float_bundle):
     lines = out.splitlines()
     assert lines[0] == "PREDICTED for raspberry-pi-5, default, ort_cpu, float32; nothing was run there"
     assert "ms an inference (80 %: " in lines[1]
+    assert lines[2].startswith("each of the 2 actions that are executed of it: ")
+    assert "at the policy's 10 Hz busy " in lines[2]
     assert any(line.startswith("main ") and "█" in line for line in lines)
     assert any(line.startswith("  int8 in the place of float32: ") for line in lines)
     assert any("30 % of each layer pruned" in line for line in lines)
@@ -242,6 +244,7 @@ def test_simulate_prints_json(vlatool, float_bundle, board, settings):
     assert found["origin"] == "predicted"
     middle, low, high = found["latency_ms"]
     assert 0 < low <= middle <= high
+    assert (found["execute"], found["control_hz"]) == (2, 10)
     assert found["joules"] == pytest.approx(found["watts"][0] * middle / 1e3)
     assert sum(phase["ms"] for phase in found["phases"]) == pytest.approx(middle)
     for phase in found["phases"]:

@@ -84,6 +84,14 @@ def test_rate_and_latency_both_limit() -> None:
     assert Wants().limit_ms == math.inf
 
 
+def test_an_inference_for_each_chunk_may_last_as_long_as_its_actions() -> None:
+    assert (Wants(hz=10, execute=4).inference_hz, Wants(hz=10, execute=4).limit_ms) == (10, 100)
+    wants = Wants(hz=10, execute=4, per_chunk=True)
+    assert (wants.inference_hz, wants.limit_ms) == (2.5, 400)
+    assert replace(wants, latency_ms=30).limit_ms == 30
+    assert replace(wants, hz=None).limit_ms == math.inf
+
+
 def test_seven_billion_weights_do_not_fit_a_small_board(chosen: Callable[..., Choice], load: Load) -> None:
     found = chosen(ORIN, load(gmacs=7000.0, weights_m=7000.0), precisions=("float16",))
     assert found.state == "no"
@@ -218,6 +226,8 @@ def test_owning_costs_the_board_and_its_energy(chosen: Callable[..., Choice]) ->
     assert found.owned == pytest.approx(10 * (PI.price_usd.value + 2 * 365 * 5 * average / 1000 * 0.4))
     assert math.isnan(found.cloud)
     assert math.isnan(found.break_even_hours)
+    rarer = cost(choice, replace(wants, execute=4, per_chunk=True)).average_watts
+    assert rarer == pytest.approx(4.5 + (choice.outcome.watts[0] - 4.5) * busy / 4)
     assert math.isnan(cost(choice, replace(wants, battery_wh=None)).battery_hours)
 
 

@@ -18,7 +18,6 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "openvino bf16, mse, convolutions": (*OPENVINO, "--method", "mse", "--convolutions"),
     "static-int8": ("quantize", "static-int8", "{bundle}"),
     "dynamic-int8": ("quantize", "dynamic-int8", "{bundle}"),
-    "bfloat16": ("quantize", "bfloat16", "{bundle}"),
     "bfloat16, convolutions": ("quantize", "bfloat16", "{bundle}", "--convolutions"),
     "float32": (),
 }

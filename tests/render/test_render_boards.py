@@ -79,6 +79,7 @@ def test_reasons_name_board_and_engine() -> None:
 
 @pytest.mark.parametrize(
     ("limits", "ms"), [({}, math.inf), ({"hz": 10.0}, 100.0), ({"latency_ms": 30.0}, 30.0),
+                       ({"hz": 10.0, "ticks_an_inference": 4}, 400.0),
                        ({"hz": 50.0, "latency_ms": 30.0}, 20.0)],
 )  # fmt: skip
 def test_the_limit_is_the_stricter_of_rate_and_latency(limits: dict[str, float], ms: float) -> None:

@@ -41,6 +41,13 @@ def select(
             help="inferences in a second; the policy's control rate when neither it nor --latency-ms is given"
         ),
     ] = None,
+    per_chunk: Annotated[
+        bool,
+        typer.Option(
+            "--per-chunk",
+            help="--hz counts control ticks, and an inference may last as long as the executed actions of a chunk",
+        ),
+    ] = False,
     latency_ms: Annotated[float | None, typer.Option(help="what one inference may take")] = None,
     max_watts: Annotated[float | None, typer.Option(help="limit of the board's power mode")] = None,
     max_price: Annotated[float | None, typer.Option(help="US dollars")] = None,
@@ -85,6 +92,7 @@ def select(
             hz=hz, latency_ms=latency_ms, watts=max_watts, price=max_price, memory_gb=memory, battery_wh=battery_wh,
             robots=robots, years=years, hours_a_day=hours, kwh_price=kwh_price, network_ms=network_ms,
             precisions=tuple(precision or ()), platform=platform, boards=tuple(boards or ()), cloud=cloud,
+            per_chunk=per_chunk,
         )  # fmt: skip
         report = select_boards(source, asked, context, calibration)
     show(report, as_json=as_json, out=output, force=force)

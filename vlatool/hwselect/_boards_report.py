@@ -30,7 +30,7 @@ def boards_report(
         "hwselect",
         f"Boards for {name}",
         "pass" if first else "fail" if all(choice.state == "no" for choice in choices) else "inconclusive",
-        summary=(*_summary(name, choices, first, wants), work_sentence(load)),
+        summary=(*_summary(name, choices, first, wants), work_sentence(load), *chunk_sentence(first, wants)),
         rows=rows,
         limits=limits(wants),
         command=command,
@@ -50,10 +50,24 @@ def work_sentence(load: Workload) -> str:
     return f"One inference: {'; '.join(parts)}."
 
 
+def chunk_sentence(first: Choice | None, wants: Wants) -> list[str]:
+    """Say what a chunk of actions costs on the chosen board, and each action of it."""
+    if wants.execute < 2 or first is None or first.outcome is None:
+        return []
+    ms, joules, count = first.outcome.latency.ms, first.outcome.joules, wants.execute
+    told = (
+        f"One inference gives a chunk, of which {count} actions are executed: there each control tick costs "
+        f"{_number(ms / count)} ms and {_number(joules / count)} J."
+    )
+    hint = "" if wants.per_chunk or not wants.hz else " To infer once a chunk and not once a tick: --per-chunk."
+    return [told + hint]
+
+
 def limits(wants: Wants) -> dict[str, Any]:
     """Return what was asked for: name with its unit -> value."""
     asked = {
-        "hz": wants.hz, "latency_ms": wants.latency_ms, "max_watts": wants.watts, "max_price_usd": wants.price,
+        "hz": wants.hz, "ticks_an_inference": wants.execute if wants.per_chunk else None,
+        "latency_ms": wants.latency_ms, "max_watts": wants.watts, "max_price_usd": wants.price,
         "memory_gb": wants.memory_gb, "precision": ", ".join(wants.precisions) or None,
     }  # fmt: skip
     return {name: value for name, value in asked.items() if value is not None}
@@ -75,7 +89,7 @@ def _summary(name: str, choices: Sequence[Choice], first: Choice | None, wants: 
         f"({_number(found.latency.low)}-{_number(found.latency.high)}), {found.watts[0]:.0f} W, "
         f"{first.profile.price_usd.value:,.0f} dollars."
     )
-    hz = f" --hz {wants.hz:g}" if wants.hz else ""
+    hz = f" --hz {wants.inference_hz:g}" if wants.inference_hz else ""
     if not way.precision:  # a bundle that is quantized already
         return [text]
     if (Path(name) / MANIFEST).is_file():
@@ -100,7 +114,7 @@ def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) ->
     if outcome is not None:
         candidate = outcome.candidate
         way |= {"power mode": candidate.mode, "engine": candidate.engine, "precision": candidate.precision}
-        measurements += numbers(outcome)
+        measurements += numbers(outcome, wants.execute)
         spent = cost(choice, wants, cloud)
         for name, value, unit in (
             ("average_watts", spent.average_watts, "W"), ("owned_cost", spent.owned, "USD"),
@@ -114,8 +128,8 @@ def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) ->
     return Row(choice.profile.name, role, choice.reason, tuple(measurements), details=tables)
 
 
-def numbers(outcome: Outcome) -> list[Measurement]:
-    """Return latency, memory, power and energy of an inference as predictions."""
+def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
+    """Return latency, memory, power and energy of an inference as predictions, and of each action executed of it."""
     where, latency = outcome.candidate.profile.name, outcome.latency
     way = f"{outcome.candidate.engine}, power mode {outcome.candidate.mode}"
     note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
@@ -130,6 +144,8 @@ def numbers(outcome: Outcome) -> list[Measurement]:
     if latency.known:
         ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
         found.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
+        each = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
+        found += [Measurement(name, value / execute, unit, "predicted", where) for name, value, unit in each]
     return found
 
 

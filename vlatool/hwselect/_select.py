@@ -24,7 +24,7 @@ class Wants:
     """What a user asks for; None: anything.
 
     Args:
-        hz: Inferences in a second.
+        hz: Inferences in a second; control ticks in a second when ``per_chunk``.
         latency_ms: Of one inference.
         watts: The board's limit, by its power mode.
         price: In US dollars.
@@ -34,6 +34,8 @@ class Wants:
         kwh_price: US dollars.
         network_ms: Way to a cloud machine and back.
         precisions: Those that are allowed; all when empty.
+        execute: Actions of one inference (a chunk) that are executed.
+        per_chunk: Whether an inference may last as long as the actions before it: the loop goes on with them meanwhile.
     """
 
     hz: float | None = None
@@ -48,11 +50,18 @@ class Wants:
     kwh_price: float = 0.3
     network_ms: float = 40.0
     precisions: tuple[str, ...] = ()
+    execute: int = 1
+    per_chunk: bool = False
+
+    @property
+    def inference_hz(self) -> float | None:
+        """Inferences in a second."""
+        return self.hz / self.execute if self.hz and self.per_chunk else self.hz
 
     @property
     def limit_ms(self) -> float:
         """What one inference may take, by rate and latency; infinite without either."""
-        by_rate = 1e3 / self.hz if self.hz else math.inf
+        by_rate = 1e3 / self.inference_hz if self.inference_hz else math.inf
         return min(by_rate, self.latency_ms or math.inf)
 
 
@@ -235,7 +244,7 @@ def cost(choice: Choice, wants: Wants, cloud: Choice | None = None) -> Cost:
     nothing = math.nan
     if outcome is None or not outcome.latency.known or board.price_usd_per_hour is not None:
         return Cost(nothing, nothing, nothing, nothing, nothing)
-    rate = wants.hz or 1e3 / outcome.latency.ms
+    rate = wants.inference_hz or 1e3 / outcome.latency.ms
     average = outcome.average_watts(rate)
     hours = wants.years * 365 * wants.hours_a_day
     energy = average / 1e3 * wants.kwh_price

@@ -128,7 +128,8 @@ def chart(report: Report, width: int) -> str:
 def limit_ms(report: Report) -> float:
     """Return what one inference may take."""
     rate, own = report.limits.get("hz"), report.limits.get("latency_ms")
-    return min(1e3 / rate if rate else math.inf, own or math.inf)
+    ticks = report.limits.get("ticks_an_inference", 1)
+    return min(1e3 * ticks / rate if rate else math.inf, own or math.inf)
 
 
 def _front(canvas: Canvas, found: Sequence[tuple[Row, Measurement]], across: Axis, up: Axis) -> None:
