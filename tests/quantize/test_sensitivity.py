@@ -9,7 +9,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.launch import run_transform
 from vlatool.quantize._graphs import load as load_graph
 from vlatool.quantize._layers import find_layers
-from vlatool.quantize._sensitivity import Switchboard, group_sensitivities, ranges_of, sensitivities
+from vlatool.quantize._sensitivity import Switchboard, ranges_of, sensitivities
 from vlatool.quantize._switches import add_switches
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
@@ -87,9 +87,7 @@ def test_a_group_is_all_its_layers_together(quantized, float_bundle, observation
     ranges = ranges_of(float_bundle, stage, Context())
     with Switchboard(float_bundle, stage, ranges) as board:
         everything = list(board.shares)
-    (whole, one) = group_sensitivities(
-        float_bundle, stage, ranges, [everything, everything[:1]], observations, Context()
-    )
+        whole, one = board.errors([everything, everything[:1]], observations, Context(), ordered=False)
     pairs = zip(outputs(quantized(stage), observations), outputs(float_bundle, observations), strict=True)
     assert whole.error == pytest.approx(np.mean([relative_error(*pair) for pair in pairs]), rel=0.02)
     assert whole.error > one.error

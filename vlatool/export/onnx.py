@@ -8,7 +8,7 @@ import io
 import logging
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,7 +20,7 @@ from vlatool.data import observations_for
 from vlatool.errors import GraphError, require
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
-from vlatool.manifest import Graph
+from vlatool.manifest import Graph, ProgramStep
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
@@ -72,23 +72,7 @@ class ExportOnnx(Transform):
         for module in ("onnxscript", "onnx"):
             require(module, "build")
         arguments = tuple(torch.from_numpy(np.ascontiguousarray(feed)) for feed in (session.first_feeds or {}).values())
-        try:
-            with _quiet():
-                exported = torch.onnx.export(
-                    session.module,
-                    arguments,
-                    dynamo=True,
-                    opset_version=self.opset,
-                    input_names=list(session.step.feeds),
-                    output_names=list(session.step.gives),
-                    verbose=False,
-                )
-        except Exception as error:  # the seam: the exporter raises many foreign types
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
-            raise GraphError(
-                f"torch cannot export the graph '{name}': {reason}.",
-                "split data-dependent control flow out of forward(); see docs/guides/your-own-policy.md",
-            ) from error
+        exported = exported_by_torch(session.module, arguments, session.step, self.opset)
         file = f"graphs/{name}.onnx"
         (out / "graphs").mkdir(exist_ok=True)
         name_by_module(exported.model)
@@ -107,6 +91,32 @@ class ExportOnnx(Transform):
                     f"allowed {self.tolerance:g}.",
                     "look for random numbers or in-place state in forward(), or raise --tolerance if you know why",
                 )
+
+
+def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, opset: int, **options: Any) -> Any:
+    """Export a module with torch's dynamo exporter; return its ``ONNXProgram``.
+
+    Args:
+        arguments: One tensor for each feed of the step, real or fake.
+        options: For ``torch.onnx.export``.
+
+    Raises:
+        GraphError: when torch cannot.
+    """
+    torch = require("torch", "build")
+    try:
+        with quiet_exporter(), torch.no_grad():
+            return torch.onnx.export(
+                module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
+                output_names=list(step.gives), verbose=False, **options,
+            )  # fmt: skip
+    except Exception as error:  # the seam: the exporter raises many foreign types
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
+        raise GraphError(
+            f"torch cannot export the graph '{step.graph}': {reason}.",
+            "keep data-dependent control flow, and what depends on the values of weights, out of forward(); see "
+            "docs/guides/your-own-policy.md",
+        ) from error
 
 
 def name_by_module(model: Any) -> None:
@@ -148,7 +158,7 @@ def _weight_bytes(module: nn.Module) -> int:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet_exporter() -> Iterator[None]:
     """Keep the exporter's progress prints, log lines and warnings away from the user's terminal."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "torch")]
     levels = [logger.level for logger in loggers]

@@ -11,7 +11,7 @@ from typing import Any
 
 from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, nearest, require
-from vlatool.export.onnx import _quiet, name_by_module, strip_notes
+from vlatool.export.onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
 from vlatool.manifest import ProgramStep
 from vlatool.sources._description import read_description, read_location
 from vlatool.sources._faked import faked_modules, run_faked
@@ -66,7 +66,7 @@ def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
 
     def visit(step: ProgramStep, module: Any, feeds: list[Any], real: dict[str, Any]) -> None:
         if step.graph not in exported:
-            exported[step.graph] = (_export(torch, step, module, feeds, opset), real)
+            exported[step.graph] = (exported_by_torch(module, feeds, step, opset, optimize=False).model, real)
 
     run_faked(bundle, modules, visit)
     return {
@@ -115,28 +115,6 @@ def _missing(graph: str, name: str, shards: dict[str, StoredTensor], file: Path)
     )
 
 
-def _export(torch: Any, step: ProgramStep, module: Any, feeds: list[Any], opset: int) -> Any:
-    try:
-        with _quiet(), torch.no_grad():
-            exported = torch.onnx.export(
-                module,
-                tuple(feeds),
-                dynamo=True,
-                optimize=False,
-                opset_version=opset,
-                input_names=list(step.feeds),
-                output_names=list(step.gives),
-                verbose=False,
-            )
-    except Exception as error:  # the seam: the exporter raises many foreign types
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
-        raise GraphError(
-            f"torch cannot export the graph '{step.graph}' without its weights: {reason}.",
-            "forward() must not look at the values of weights; see docs/concepts/large-models.md",
-        ) from error
-    return exported.model
-
-
 def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any], opset: int, file: Path) -> Skeleton:
     """Give initializers their values or their place in a shard, then fold what is computed from small constants."""
     import onnx_ir
@@ -154,7 +132,7 @@ def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any]
                 f"The value of the constant '{name}' is not known: it was made while the graph was exported.",
                 "make it in the module's __init__ and register it as a buffer",
             )
-    with _quiet(), _silent("onnx_ir"):
+    with quiet_exporter(), _silent("onnx_ir"):
         onnxscript.optimizer.optimize_ir(model, input_size_limit=FOLDED, output_size_limit=FOLDED)
     name_by_module(model)
     strip_notes(model)

@@ -89,20 +89,6 @@ def sensitivities(
         return board.errors([(place,) for place in board.shares], observations, context, seconds=seconds)
 
 
-def group_sensitivities(
-    bundle: Bundle,
-    stage: StaticInt8,
-    ranges: Mapping[str, Mapping[str, Range]] | None,
-    groups: Sequence[Sequence[Place]],
-    observations: Sequence[Mapping[str, Any]],
-    context: Context,
-) -> list[LayerError]:
-    """Measure groups of (graph, layer) that are int8 together; in the order of the groups. See ``sensitivities``."""
-    found = ranges_of(bundle, stage, context) if ranges is None else ranges
-    with Switchboard(bundle, stage, found) as board:
-        return board.errors(groups, observations, context, ordered=False)
-
-
 def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, dict[str, Range]]:
     """Return graph -> value -> (low, high) that the stage quantizes activations over, from its calibration data.
 
