@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 from typer.testing import CliRunner
 
 from vlatool.bundle import Bundle, seal
 from vlatool.cli import app
+from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, GraphError
 from vlatool.explain import Options, explain, explanation
 from vlatool.explain._islands import QuantizedGraph, fallbacks, timed
@@ -209,6 +211,17 @@ def test_openvino_is_profiled_by_its_own_counters(fragile, made):
     assert any(row["operator"].startswith("FullyConnected") for row in details(report, "Time by operator"))
     assert details(report, "Layers that cost")[0]["layer"].startswith(FRAGILE)
     assert len(report.rows) == 2
+
+
+def test_attention_that_openvino_fuses_with_a_quantization_counts_as_computation(float_bundle, tmp_path):
+    pytest.importorskip("openvino")
+    bundle = StaticInt8(samples=8, layout="openvino").run(float_bundle, tmp_path, Context())
+    names = {node.name for node in onnx.load(bundle.path / "graphs/main.onnx").graph.node}
+    found = [each for each in profile(bundle, recorded_observations(float_bundle, 1), 3) if each.kind == "Subgraph"]
+    assert any(each.product and each.precision == "float32" for each in found), "the products inside attention"
+    for each in found:
+        assert each.name in names
+        assert ("quantize" in each.name) == (each.precision == "quantize-dequantize")
 
 
 def test_dynamic_int8_is_explained_too(fragile, made):

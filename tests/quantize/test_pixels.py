@@ -11,7 +11,7 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.quantize._pixels import use_convolutions
+from vlatool.quantize._pixels import padded_rows, use_convolutions
 
 ROWS, WIDTH = 37, 24
 RANDOM = np.random.default_rng(5)
@@ -97,7 +97,14 @@ def test_a_product_with_its_bias_is_a_convolution(leading: tuple[int, ...]) -> N
     (conv,) = [node for node in model.graph.node if node.op_type == "Conv"]
     assert conv.name == "layer/MatMul"
     assert len(conv.input) == 3
-    assert ("Pad" in [node.op_type for node in model.graph.node]) == (np.prod(leading) % 16 != 0)
+    assert ("Pad" in [node.op_type for node in model.graph.node]) == (np.prod(leading) % 8 != 0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "wanted"), [(32, 32), (33, 40), (50, 56), (113, 120), (145, 152), (160, 160), (161, 176), (197, 208)]
+)
+def test_tiles_are_filled_where_that_adds_few_rows(rows: int, wanted: int) -> None:
+    assert padded_rows(rows) == wanted
 
 
 @pytest.mark.parametrize("transposed", [0, 1])
