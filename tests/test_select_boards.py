@@ -15,7 +15,7 @@ from vlatool.hwselect._simulate import Change
 from vlatool.hwselect._workload import workload
 from vlatool.profile import load_profile, names
 from vlatool.render._boards import limit_ms
-from vlatool.select_boards import Asked, _change, counted, opened, select_boards, simulated, simulation_lines
+from vlatool.select_boards import LAYOUT, Asked, _change, counted, opened, select_boards, simulated, simulation_lines
 from vlatool.stage import Context
 
 ENGINES = [(name, engine) for name in names() for engine in load_profile(name).engines]
@@ -41,14 +41,14 @@ def test_a_count_is_kept_and_read_again(float_bundle: Bundle) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 1}', b'{"layout": 1, "graphs": 3, "runs": {}}',
-                b'{"layout": 1, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
+    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 2}', b'{"layout": 2, "graphs": 3, "runs": {}}',
+                b'{"layout": 2, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
 )  # fmt: skip
 def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> None:
     wanted = counted(float_bundle, Context())
     kept()[0].write_bytes(content)
     assert counted(float_bundle, Context()) == wanted
-    assert json.loads(kept()[0].read_text())["layout"] == 1
+    assert json.loads(kept()[0].read_text())["layout"] == LAYOUT
 
 
 def test_a_cache_that_cannot_be_written_costs_time_alone(float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,7 +30,7 @@ from vlatool.profile import Profile, load_profile, names
 from vlatool.report import Report
 from vlatool.stage import Context
 
-LAYOUT = 1
+LAYOUT = 2
 """Version of a cached workload."""
 
 

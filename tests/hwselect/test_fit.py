@@ -12,7 +12,7 @@ import pytest
 from vlatool.hwselect import _fit, _latency
 from vlatool.hwselect._features import Question, Shares, rows_of
 from vlatool.hwselect._fit import Folds, Sample, assess, conformal, fit_files, fitted, loss, tune
-from vlatool.hwselect._latency import LEVEL, LatencyModel
+from vlatool.hwselect._latency import LEVEL, LatencyModel, read_model
 from vlatool.hwselect._points import Point, read_points
 from vlatool.hwselect._process import Process, Scales
 
@@ -138,9 +138,17 @@ def no_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder.mkdir()
     monkeypatch.setattr(_fit, "DATA", folder)
     monkeypatch.setattr(_latency, "DATA", folder)
-    _latency.shipped.cache_clear()
+    _latency.read_model.cache_clear()
     yield folder
-    _latency.shipped.cache_clear()
+    _latency.read_model.cache_clear()
+
+
+def test_a_fit_anew_does_not_begin_at_the_shipped_scales(points_file: Path, tmp_path: Path) -> None:
+    for anew in (False, True):
+        list(fit_files(points_file, tmp_path, seconds=0, seed=0, anew=anew))
+        scales = read_model(tmp_path).parts["processors"].scales
+        assert (scales == Scales()) == anew
+        read_model.cache_clear()
 
 
 def test_a_fit_writes_what_is_then_read(points_file: Path, no_data: Path) -> None:

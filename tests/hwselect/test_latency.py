@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vlatool.errors import DataError
 from vlatool.hwselect import _latency
 from vlatool.hwselect._features import Place, Question, Work
-from vlatool.hwselect._latency import WIDEST, LatencyModel, crowds, no_ground, part_of, shipped, write
+from vlatool.hwselect._latency import WIDEST, LatencyModel, crowds, no_ground, part_of, read_model, shipped, write
 from vlatool.hwselect._points import Point, known_devices
 from vlatool.hwselect._workload import Workload
 from vlatool.profile import load_profile, names
@@ -33,11 +34,11 @@ def reread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     def through(model: LatencyModel) -> LatencyModel:
         write(model, tmp_path)
         monkeypatch.setattr(_latency, "DATA", tmp_path)
-        shipped.cache_clear()
+        read_model.cache_clear()
         return shipped()
 
     yield through
-    shipped.cache_clear()
+    read_model.cache_clear()
 
 
 def test_what_was_measured_is_answered_as_measured(model: LatencyModel, points: list[Point]) -> None:
@@ -144,6 +145,44 @@ def test_a_runtime_with_very_many_figures_counts_where_it_is_asked_about(
     assert model.predict([crowded])[0].ms == with_all[crowded]
     monkeypatch.undo()
     assert model.predict([other])[0].ms == with_all[other], "what was left out once is not left out for ever"
+
+
+def test_a_directory_takes_the_place_of_the_shipped_model(
+    model: LatencyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(model, tmp_path)
+    before = shipped().about
+    monkeypatch.setenv("VLATOOL_LATENCY", str(tmp_path))
+    assert shipped().about == model.about != before
+    monkeypatch.delenv("VLATOOL_LATENCY")
+    assert shipped().about == before
+
+
+@pytest.mark.parametrize("damage", ["absent", "empty", "cut", "no archive", "no JSON", "another file", "no part"])
+def test_a_directory_without_a_model_is_named(
+    damage: str, model: LatencyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "fit"
+    if damage != "absent":
+        folder.mkdir()
+    if damage not in ("absent", "empty"):
+        write(model, folder)
+    arrays, parameters = folder / "latency.npz", folder / "latency.json"
+    if damage == "cut":
+        arrays.write_bytes(arrays.read_bytes()[:-200])
+    elif damage == "no archive":
+        arrays.write_text("hello")
+    elif damage == "no JSON":
+        parameters.write_text("{")
+    elif damage == "another file":
+        parameters.write_text("[1]")
+    elif damage == "no part":
+        np.savez(arrays, a=np.zeros(3))
+    monkeypatch.setenv("VLATOOL_LATENCY", str(folder))
+    with pytest.raises(DataError, match="There is no latency model in") as caught:
+        shipped()
+    assert str(folder) in caught.value.message
+    assert "unset VLATOOL_LATENCY" in str(caught.value.fix)
 
 
 def test_npus_are_asked_apart() -> None:

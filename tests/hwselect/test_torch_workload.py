@@ -109,6 +109,43 @@ def test_a_large_policy_is_counted_without_its_memory(tmp_path: Path) -> None:
     assert grown < 600_000, "kB; the weights would be 4.3 GB"
 
 
+STRIDED = """\
+from torch import nn
+
+class Policy(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(6, 8, bias=False)
+
+    def forward(self, state):
+        return self.layer(state.transpose(1, 2))
+
+def make():
+    return Policy()
+"""
+STRIDED_YAML = """\
+schema: 1
+name: strided
+version: 1.0.0
+source: policy.py:make
+spec:
+  inputs: [{name: state, shape: [1, 6, 5]}]
+  outputs: [{name: action, shape: [1, 5, 8]}]
+  control_hz: 10
+  chunk: 5
+"""
+
+
+def test_the_weight_of_a_linear_layer_over_strided_rows_counts_once(tmp_path: Path) -> None:
+    """torch writes it as a batched product with the weight expanded over the batch."""
+    folder = tmp_path / "strided"
+    folder.mkdir()
+    (folder / "policy.py").write_text(STRIDED)
+    (folder / "policy.yaml").write_text(STRIDED_YAML)
+    found = torch_workload(remade(folder, tmp_path / "source")).graphs["main"]
+    assert (found.weights, found.macs, found.traits) == (48, {"float32": 5 * 48}, frozenset())
+
+
 def test_a_sample_is_counted_with_its_attention(tmp_path: Path) -> None:
     (tmp_path / "sample").mkdir()
     write_sample("action_expert", tmp_path / "sample", 0)

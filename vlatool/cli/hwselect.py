@@ -128,9 +128,12 @@ def fit(
         float, typer.Option(min=0, help="for the search of the scales; 0 keeps those that are shipped")
     ] = 900.0,
     seed: Annotated[int, typer.Option(min=0, help="of the search")] = 0,
+    anew: Annotated[
+        bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
+    ] = False,
 ) -> None:
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.hwselect._fit import fit_files
 
-    for line in fit_files(points, output, seconds, seed):
+    for line in fit_files(points, output, seconds, seed, anew):
         typer.echo(line, err=True)

@@ -323,8 +323,12 @@ def by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
     return {part: [point for point in kept if (point.kind == "npu") == (part == "npu")] for part in PARTS}
 
 
-def fit_files(path: Path, out: Path, seconds: float, seed: int) -> Iterator[str]:
+def fit_files(path: Path, out: Path, seconds: float, seed: int, anew: bool = False) -> Iterator[str]:
     """Fit on a file and write the model's data; yields what is done.
+
+    Args:
+        anew: Begin the search for scales at ``Scales()`` and ``Shares()``, and not at those of the shipped model, which
+            saw all that was published.
 
     Raises:
         DataError: when the file is malformed.
@@ -341,7 +345,7 @@ def fit_files(path: Path, out: Path, seconds: float, seed: int) -> Iterator[str]
     out.mkdir(parents=True, exist_ok=True)
     for part, mine in usable.items():
         sample = Sample.of(mine)
-        before = _before(part)
+        before = _before(part, anew)
         groups = f"{len(set(sample.devices))} devices and {len(set(sample.models))} models"
         yield f"{part}: {len(sample.published)} figures of {groups}"
         scales, shares[part] = tune(sample, *before, seconds / len(usable), seed, told.append)
@@ -353,8 +357,8 @@ def fit_files(path: Path, out: Path, seconds: float, seed: int) -> Iterator[str]
     yield f"written: {out / 'latency.npz'}, {out / 'latency.json'}"
 
 
-def _before(part: str) -> tuple[Scales, Shares]:
-    if not (DATA / "latency.json").is_file():
+def _before(part: str, anew: bool) -> tuple[Scales, Shares]:
+    if anew or not (DATA / "latency.json").is_file():
         return Scales(), Shares()
     model = shipped()
     return model.parts[part].scales, model.shares[part]

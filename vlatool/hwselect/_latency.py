@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
+import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.errors import DataError
 from vlatool.files import whole_file
 from vlatool.hwselect._features import ALIKE, Question, Shares, rows_of
 from vlatool.hwselect._process import KEYS, Process, Rows, Scales
 
 Array = NDArray[Any]
 DATA = Path(__file__).with_name("data")
+PLACE = "VLATOOL_LATENCY"
+"""Variable that names a directory of ``vlatool hwselect fit``."""
 LEVEL = 0.8
 """Share of measurements that fall into the interval."""
 WIDEST = 1.4
@@ -174,12 +179,29 @@ def no_ground(question: Question, published: bool) -> str:
     return "" if published else f"no latency was published for the runtime {question.runtime}"
 
 
-@functools.cache
 def shipped() -> LatencyModel:
-    """Return the model of the package's data files."""
-    parameters = json.loads((DATA / "latency.json").read_text(encoding="utf-8"))
+    """Return the model of the package's data files, or of those in ``$VLATOOL_LATENCY``.
+
+    Raises:
+        DataError: when the files there cannot be read.
+    """
+    own = os.environ.get(PLACE)
+    try:
+        return read_model(Path(own) if own else DATA)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        raise DataError(
+            f"There is no latency model in {own or DATA}: {reason}.",
+            f"unset {PLACE}, or make one: vlatool hwselect fit POINTS.csv -o DIR",
+        ) from error
+
+
+@functools.cache
+def read_model(folder: Path) -> LatencyModel:
+    """Return the model of a directory that ``write`` wrote; read once in a process."""
+    parameters = json.loads((folder / "latency.json").read_text(encoding="utf-8"))
     parts, shares = {}, {}
-    with np.load(DATA / "latency.npz", allow_pickle=False) as stored:
+    with (folder / "latency.npz").open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
         for part, values in parameters["parts"].items():
             arrays = {name: stored[f"{part}.{name}"] for name in ("model", "traits", "device", "prior")}
             keys = stored[f"{part}.keys"]

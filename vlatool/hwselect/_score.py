@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from vlatool.errors import UsageError
 from vlatool.hwselect._features import rows_of
 from vlatool.hwselect._fit import UNITS, Folds, Sample, Scores, by_part
-from vlatool.hwselect._latency import LEVEL, WIDEST, Predicted, no_ground, shipped
+from vlatool.hwselect._latency import LEVEL, PLACE, WIDEST, Predicted, no_ground, shipped
 from vlatool.hwselect._points import Point, read_points
 
 Array = NDArray[Any]
@@ -41,7 +42,8 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
     points = read_points(path)
     if held_out is None:
         found = shipped().predict([point.question for point in points if point.question])
-        return _summary(points, found, "the shipped model")
+        own = os.environ.get(PLACE)
+        return _summary(points, found, f"the model of {own}" if own else "the shipped model")
     if held_out not in SPLITS:
         raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.")
     shown: list[Point] = []

@@ -119,8 +119,7 @@ def _watching(seen: _Seen) -> contextlib.AbstractContextManager[Any]:
 def _count(torch: Any, seen: _Seen, name: str, args: Any, given: Any) -> None:
     if name in PRODUCTS:
         first, second = args[PRODUCTS[name] : PRODUCTS[name] + 2]
-        weights = 0 if name in ("bmm", "baddbmm") else _weights(torch, second)
-        seen.product(given.numel() * first.shape[-1], given.numel(), weights)
+        seen.product(given.numel() * first.shape[-1], given.numel(), _weights(torch, second))
     elif name == "convolution":
         weight, groups, transposed = args[1], args[8], args[6]
         base = args[0].numel() if transposed else given.numel()
@@ -135,6 +134,10 @@ def _count(torch: Any, seen: _Seen, name: str, args: Any, given: Any) -> None:
 
 
 def _weights(torch: Any, tensor: Any) -> int:
-    """Return the numbers in a factor that is a parameter, or a view of one; 0 for an activation."""
+    """Return the numbers in a factor that is a parameter, or a view of one; 0 for an activation.
+
+    A linear layer of strided rows is a batched product with its weight expanded over the batch: that counts once.
+    """
     base = tensor._base if tensor._base is not None else tensor
-    return tensor.numel() if isinstance(base, torch.nn.Parameter) else 0
+    sizes = (size for size, stride in zip(tensor.shape, tensor.stride(), strict=True) if stride)
+    return math.prod(sizes) if isinstance(base, torch.nn.Parameter) else 0
