@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.quantize._pixels import padded_rows, use_convolutions
+from vlatool.quantize._pixel_forms import padded_rows
+from vlatool.quantize._pixels import use_convolutions
+from vlatool.quantize._precision import precision_shares
 
 ROWS, WIDTH = 37, 24
 RANDOM = np.random.default_rng(5)
@@ -167,6 +170,26 @@ def test_an_int8_block_computes_what_it_did(rms: bool) -> None:
     draft = Draft()
     kinds = rewritten(draft, block(draft, "x", rms=rms, quantize=True), products=6 + rms)
     assert kinds.count("DequantizeLinear") == 2 * (6 + rms)
+
+
+def test_what_attention_quantizes_is_quantized_after_the_rows_are_dropped() -> None:
+    """Between a quantization and the product that it serves stands nothing that engines do not look through."""
+    draft = Draft()
+    product = draft.add("MatMul", draft.quantized("x"), draft.int8(WIDTH, WIDTH))
+    heads = draft.add("Reshape", draft.quantized(product), np.array([1, ROWS, 2, WIDTH // 2]))
+    turned = draft.add("Transpose", heads, perm=[0, 2, 1, 3])
+    found = draft.add("MatMul", turned, draft.add("Transpose", heads, perm=[0, 2, 3, 1]))
+    kinds = rewritten(draft, found, products=1)
+    last = len(kinds) - 1 - kinds[::-1].index("QuantizeLinear")
+    assert kinds[last - 1] == "Slice"
+
+
+def test_the_precision_of_a_product_is_seen_through_its_new_form(tmp_path: Path) -> None:
+    draft = Draft()
+    model = draft.model(draft.add("MatMul", draft.quantized("x"), draft.int8(WIDTH, 8)))
+    use_convolutions(model)
+    onnx.save(model, tmp_path / "a.onnx")
+    assert precision_shares(tmp_path / "a.onnx") == {"int8": 1.0}
 
 
 def test_an_int8_product_gets_a_bias_that_changes_nothing() -> None:

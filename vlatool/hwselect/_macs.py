@@ -19,7 +19,7 @@ CONVOLUTIONS = {"Conv", "ConvInteger", "QLinearConv", "FusedConv"}
 OTHERS = {"Gemm", "QGemm", "ConvTranspose", "MatMulNBits", "Einsum", "Attention", "LSTM", "GRU", "RNN"}
 OPAQUE = {"FusedMatMul", "QAttention", "MultiHeadAttention", "GroupQueryAttention"}
 """They compute, but nothing here counts them: a graph that has one has an unknown layer, never a wrong sum."""
-MOVED = {"Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "MaxPool"}
+MOVED = {"Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "Pad", "MaxPool"}
 """They move values and leave their precision as it is."""
 COMPUTE = MATMULS | CONVOLUTIONS | OTHERS | OPAQUE
 
