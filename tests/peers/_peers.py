@@ -238,6 +238,7 @@ PEERS = {
     "nncf:int8 (f32)": _nncf("default", FLOAT, False),
     "nncf:int8 transformer, no SmoothQuant (bf16)": _nncf("transformer", HALF, True),
     "nncf:int8 transformer, no SmoothQuant (f32)": _nncf("transformer", FLOAT, True),
+    "torch:compile bf16 autocast": Peer(open_torch(bfloat16=True, compiled=True)),
     "openvino:bf16": Peer(HALF),
     "nncf:int8 weights + dynamic quantization (bf16)": Peer(
         open_openvino("bf16", DYNAMIC_QUANTIZATION_GROUP_SIZE=32), "nncf-weights", "model.xml", make_nncf_weights
@@ -246,7 +247,6 @@ PEERS = {
     "ort:dynamic MatMul": Peer(open_ort, "ort-dynamic-matmul", "model.onnx", make_dynamic(["MatMul"])),
     "ort:static U8S8": Peer(open_ort, "ort-static", "model.onnx", make_static(None)),
     "ort:static U8S8 MatMul/Gemm/Conv": Peer(open_ort, "ort-static-layers", "model.onnx", make_static(LAYERS)),
-    "torch:compile bf16 autocast": Peer(open_torch(bfloat16=True, compiled=True)),
     "torch:bf16 autocast": Peer(open_torch(bfloat16=True)),
     "torchao:int8 dynamic": Peer(open_torch(quantized=True)),
     "torchao:int8 dynamic, compile": Peer(open_torch(quantized=True, compiled=True)),
