@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import yaml
+from _edits import put, take
 
 from vlatool.bundle import Bundle, seal
 from vlatool.cli import main
@@ -304,25 +305,6 @@ def unsupported_compression(data: bytes) -> bytes:
     """The archive says that its first array is compressed by method 99."""
     at = data.index(b"PK\x01\x02") + 10
     return data[:at] + b"\x63\x00" + data[at + 2 :]
-
-
-def put(*path: Any) -> Callable[[dict[str, Any]], None]:
-    """Set the value at a path (the last argument) in nested mappings and lists."""
-
-    def change(data: Any) -> None:
-        *where, last, value = path
-        for key in where:
-            data = data[key]
-        data[last] = value
-
-    return change
-
-
-def take(key: str) -> Callable[[dict[str, Any]], None]:
-    def change(data: dict[str, Any]) -> None:
-        del data[key]
-
-    return change
 
 
 WORDS = ("go", "to", "the", "red", "blue", "ball", "box")

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import onnx
 import pytest
 import yaml
+from _edits import put, take
 from onnx import TensorProto, helper
 
 from vlatool.cli import main
@@ -123,30 +124,6 @@ class Row(NamedTuple):
     says: str
     code: int
     line: Callable[[Workshop], Line]
-
-
-def put(*path: Any) -> Callable[[dict[str, Any]], None]:
-    """Set the value at a path (the last argument) in nested mappings."""
-
-    def change(data: Any) -> None:
-        *where, last, value = path
-        for key in where:
-            data = data[key]
-        data[last] = value
-
-    return change
-
-
-def take(*path: str) -> Callable[[dict[str, Any]], None]:
-    """Take the value at a path away."""
-
-    def change(data: Any) -> None:
-        *where, last = path
-        for key in where:
-            data = data[key]
-        del data[last]
-
-    return change
 
 
 def latency(ms: float = 9.5, origin: str = "measured") -> Measurement:
