@@ -20,7 +20,7 @@ from vlatool.hwselect._features import PRECISIONS
 from vlatool.hwselect._latency import LatencyModel, shipped
 from vlatool.hwselect._measured import measured_questions
 from vlatool.hwselect._select import Choice, Wants, choose, in_the_cloud
-from vlatool.hwselect._simulate import Change, bounds, changes, timeline
+from vlatool.hwselect._simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.hwselect._torch_workload import torch_workload
 from vlatool.hwselect._workload import GraphWorkload, Workload, workload
 from vlatool.launch import cached_transform
@@ -30,7 +30,7 @@ from vlatool.profile import Profile, load_profile, names
 from vlatool.report import Report
 from vlatool.stage import Context
 
-LAYOUT = 2
+LAYOUT = 3
 """Version of a cached workload."""
 
 
@@ -129,6 +129,7 @@ def _kept(file: Path) -> Workload | None:
     try:
         for name, fields in data["graphs"].items():
             fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
+            fields["parts"] = {part: tuple(numbers) for part, numbers in fields["parts"].items()}
             graphs[name] = GraphWorkload(**fields)
         return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
     except (KeyError, TypeError, ValueError, AttributeError):
@@ -179,12 +180,22 @@ def simulated(
         "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
         "joules": outcome.joules, "execute": spec.execute or spec.chunk, "control_hz": spec.control_hz,
         "phases": [
-            {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares)}
+            {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares),
+             "parts": parts_of(bound.phase, load.graphs[bound.phase.name], model.shares)}
             for bound in phases
         ],
         "timeline": [*timeline(phases)],
         "changes": [_change(change) for change in changes(candidate, load, model)],
     }  # fmt: skip
+
+
+def _part_lines(phases: list[dict[str, Any]]) -> list[str]:
+    told = []
+    for phase in phases:
+        shares = sorted(phase["parts"].items(), key=lambda item: -item[1])
+        if shares:
+            told.append(f"  {phase['name']}: {', '.join(f'{name} {share:.0%}' for name, share in shares)}")
+    return ["parts of a graph, by the work that they have", *told] if told else []
 
 
 def _change(change: Change) -> dict[str, Any]:
@@ -208,7 +219,7 @@ def simulation_lines(found: dict[str, Any]) -> list[str]:
         f"PREDICTED for {where}; nothing was run there",
         f"{ms:.4g} ms an inference (80 %: {low:.4g}-{high:.4g}), {costs}",
         f"{actions}: {ms / count:.3g} ms, {found['joules'] / count:.3g} J; at the policy's {hz:g} Hz {busy}",
-        "", *found["timeline"], "", "what a change would give",
+        "", *found["timeline"], *_part_lines(found["phases"]), "", "what a change would give",
     ]  # fmt: skip
     for change in found["changes"]:
         if change["latency_ms"] is None:

@@ -228,6 +228,8 @@ def test_simulate_shows_where_the_time_goes(vlatool, float_bundle):
     assert any(line.startswith("main ") and "█" in line for line in lines)
     assert any(line.startswith("  int8 in the place of float32: ") for line in lines)
     assert any("30 % of each layer pruned" in line for line in lines)
+    (parts,) = [line for line in lines if line.startswith("  main: ")]
+    assert {word.split()[0] for word in parts.removeprefix("  main: ").split(", ")} == {"vision", "head", "other"}
 
 
 @pytest.mark.parametrize(
@@ -249,6 +251,7 @@ def test_simulate_prints_json(vlatool, float_bundle, board, settings):
     assert sum(phase["ms"] for phase in found["phases"]) == pytest.approx(middle)
     for phase in found["phases"]:
         assert sum(phase["shares"].values()) == pytest.approx(1)
+        assert sum(phase["parts"].values()) == pytest.approx(1)
     for change in found["changes"]:
         assert (change["latency_ms"] is None) == bool(change["why"])
 

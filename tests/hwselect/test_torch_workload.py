@@ -20,9 +20,10 @@ def test_a_source_counts_as_the_bundle_that_is_exported_from_it(source_bundle: B
     found, wanted = torch_workload(source_bundle), workload(float_bundle)
     assert found.runs == wanted.runs
     assert set(found.graphs) == set(wanted.graphs) == {"main"}
-    for name in ("macs", "layers", "activations", "weights", "traits", "activation_bytes"):
+    for name in ("macs", "layers", "activations", "weights", "traits", "activation_bytes", "parts"):
         assert getattr(found.graphs["main"], name) == getattr(wanted.graphs["main"], name), name
     assert wanted.graphs["main"].traits == {"attention", "branches"}
+    assert set(wanted.graphs["main"].parts) == {"vision", "head", ""}
 
 
 def test_nothing_is_unknown_and_memory_is_near_that_of_the_bundle(source_bundle: Bundle, float_bundle: Bundle) -> None:

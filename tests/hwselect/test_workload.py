@@ -391,3 +391,18 @@ def test_what_a_shape_leads_to_is_no_weight(tmp_path: Path) -> None:
     path = save(tmp_path / "m.onnx", nodes, [2], [weight("w", (2,))])
     tensors = open_graph(onnx, path)
     assert [tensors.is_constant(name) for name in ("w", "wc", "c", "r", "x", "y", "")] == [True] * 3 + [False] * 4
+
+
+def test_each_layer_counts_for_the_first_part_that_names_its_module(tmp_path: Path) -> None:
+    nodes = [
+        helper.make_node("MatMul", ["x", "a"], ["h"], name="vision.blocks.0.up/MatMul"),
+        helper.make_node("MatMul", ["h", "b"], ["k"], name="head/MatMul"),
+        helper.make_node("MatMul", ["k", "c"], ["y"], name="node_matmul_7"),
+    ]
+    path = save(tmp_path / "m.onnx", nodes, [1, 3, 4], [weight("a", (4, 8)), weight("b", (8, 2)), weight("c", (2, 5))])
+    found = graph_workload(path, {"vision": ["vision", "vision.*"], "head": ["head"], "all": ["v*", "h*"]})
+    assert found.parts == {"vision": (96, 32, 24, 1), "head": (48, 16, 6, 1), "": (30, 10, 15, 1)}
+    totals = (sum(found.macs.values()), found.weights, found.activations, found.layers)
+    assert tuple(map(sum, zip(*found.parts.values(), strict=True))) == totals
+    assert graph_workload(path).parts == {}
+    assert graph_workload(path, {"tail": ["tail"]}).parts == {}, "all that no part names says nothing"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from vlatool.hwselect._board import Candidate, Outcome, Phase, at, outcomes, quantized_as
 from vlatool.hwselect._features import Shares, roofline_parts
 from vlatool.hwselect._latency import LatencyModel, part_of
-from vlatool.hwselect._workload import Workload
+from vlatool.hwselect._workload import GraphWorkload, Workload
 
 PRUNED = 0.7
 SMALLER = 0.5
@@ -55,6 +55,20 @@ def bounds(outcome: Outcome, shares: Mapping[str, Shares]) -> list[Bound]:
         whole = sum(parts.values())
         found.append(Bound(phase, {name: value / whole for name, value in parts.items()}))
     return found
+
+
+def parts_of(phase: Phase, graph: GraphWorkload, shares: Mapping[str, Shares]) -> dict[str, float]:
+    """Return part of the policy -> its share (0-1) of a graph's time, by the roofline of its layers alone.
+
+    What belongs to no part is ``other``; nothing when the policy names no parts.
+    """
+    found = {}
+    for part, (macs, weights, activations, layers) in graph.parts.items():
+        work = replace(phase.question.work, macs=macs, weights=weights, activations=activations, layers=layers)
+        rates = shares[part_of(phase.question)]
+        found[part or "other"] = sum(roofline_parts(replace(phase.question, work=work), rates).values())
+    whole = sum(found.values()) or 1.0
+    return {part: ms / whole for part, ms in found.items()}
 
 
 def changes(candidate: Candidate, load: Workload, model: LatencyModel) -> list[Change]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import math
 import warnings
 import weakref
 from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from vlatool.bundle import Bundle
 from vlatool.errors import SourceError, require
-from vlatool.hwselect._workload import GraphWorkload, Tally, Workload
+from vlatool.hwselect._workload import GraphWorkload, Tally, Workload, part_named
 from vlatool.manifest import ProgramStep
 from vlatool.sources._faked import faked_modules, run_faked
 
@@ -40,7 +42,7 @@ def torch_workload(bundle: Bundle) -> Workload:
         runs[step.graph] += step.repeat
         if step.graph in seen:
             return None
-        seen[step.graph] = _Seen(_stored(module))
+        seen[step.graph] = _Seen(_stored(module), _where(module, bundle.manifest.parts))
         return _watching(seen[step.graph])
 
     try:
@@ -57,7 +59,7 @@ def torch_workload(bundle: Bundle) -> Workload:
         tally = found.tally
         graphs[name] = GraphWorkload(
             {"float32": found.macs}, tally.layers, tally.weights, tally.activations, tally.traits(),
-            found.stored, 4 * tally.activations, found.peak,
+            found.stored, 4 * tally.activations, found.peak, parts=tally.parts(),
         )  # fmt: skip
     return Workload(graphs, dict(runs))
 
@@ -68,12 +70,16 @@ class _Seen:
 
     Args:
         stored: Bytes of parameters and buffers, each once, in float32.
+        where: Module (its ``id``) -> part of the policy.
+        inside: Parts of the modules that are running, the innermost last.
         macs: Multiply-accumulates.
         alive: Bytes of intermediate tensors that exist now.
         peak: The most of them.
     """
 
     stored: int
+    where: Mapping[int, str] = field(default_factory=dict)
+    inside: list[str] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
     macs: int = 0
     alive: int = 0
@@ -81,7 +87,7 @@ class _Seen:
 
     def product(self, macs: int, written: int, weights: int, groups: int = 1) -> None:
         self.macs += macs
-        self.tally.layer(macs, written, weights, groups)
+        self.tally.layer(macs, written, weights, groups, self.inside[-1] if self.inside else "")
 
     def keep(self, tensor: Any) -> None:
         size = tensor.numel() * tensor.element_size()
@@ -98,8 +104,34 @@ def _stored(module: Any) -> int:
     return sum(4 * tensor.numel() if tensor.is_floating_point() else tensor.numel() for tensor in tensors.values())
 
 
-def _watching(seen: _Seen) -> contextlib.AbstractContextManager[Any]:
-    """Return a context in which every operator of torch is counted."""
+def _where(module: Any, parts: Mapping[str, Sequence[str]]) -> dict[int, str]:
+    return {id(each): part_named(name, parts) for name, each in module.named_modules()} if parts else {}
+
+
+@contextlib.contextmanager
+def _watching(seen: _Seen) -> Iterator[None]:
+    """Count every operator of torch, for the part of the policy whose module runs."""
+    hooks = importlib.import_module("torch.nn.modules.module")
+
+    def enter(module: Any, _inputs: Any) -> None:
+        seen.inside.append(seen.where.get(id(module), ""))
+
+    def leave(_module: Any, _inputs: Any, _outputs: Any) -> None:
+        seen.inside.pop()
+
+    handles = [
+        hooks.register_module_forward_pre_hook(enter),
+        hooks.register_module_forward_hook(leave, always_call=True),
+    ]
+    try:
+        with _counting(seen):
+            yield
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def _counting(seen: _Seen) -> contextlib.AbstractContextManager[Any]:
     import torch
     from torch.utils._python_dispatch import TorchDispatchMode
 

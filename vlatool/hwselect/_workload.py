@@ -6,9 +6,10 @@ counted, as in the published tables that the predictions rest on.
 
 from __future__ import annotations
 
+import fnmatch
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ class GraphWorkload:
         peak_bytes: The most bytes of tensors, weights apart, that are alive at one node.
         integer_ops: Whether int8 is computed by integer operators (MatMulInteger and its kin) and not in QDQ form.
         unknown: Compute layers that cannot be counted, because their shapes are not static.
+        parts: Part of the policy (vision, language ...; empty: none) -> multiply-accumulates, weights, activations and
+            layers of its compute layers.
     """
 
     macs: Mapping[str, int] = field(default_factory=dict)
@@ -54,6 +57,7 @@ class GraphWorkload:
     peak_bytes: int = 0
     integer_ops: bool = False
     unknown: tuple[str, ...] = ()
+    parts: Mapping[str, tuple[int, int, int, int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -107,12 +111,17 @@ def workload(bundle: Bundle) -> Workload:
     runs: Counter[str] = Counter()
     for step in bundle.manifest.program:
         runs[step.graph] += step.repeat
-    graphs = {name: graph_workload(bundle.path / graph.file) for name, graph in bundle.manifest.graphs.items()}
+    parts = bundle.manifest.parts
+    graphs = {name: graph_workload(bundle.path / graph.file, parts) for name, graph in bundle.manifest.graphs.items()}
     return Workload(graphs, dict(runs) or dict.fromkeys(graphs, 1))
 
 
-def graph_workload(path: Path) -> GraphWorkload:
+def graph_workload(path: Path, parts: Mapping[str, Sequence[str]] | None = None) -> GraphWorkload:
     """Count the work of one run of an ONNX file; a free first axis counts as 1.
+
+    Args:
+        path: The file.
+        parts: Part of the policy -> globs of module names, to count each by itself.
 
     Raises:
         GraphError: when the file cannot be read.
@@ -124,10 +133,15 @@ def graph_workload(path: Path) -> GraphWorkload:
     except Exception as error:  # the seam: every exception type of onnx and protobuf becomes ours
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
-    return _count(tensors)
+    return _count(tensors, parts or {})
 
 
-def _count(tensors: Tensors) -> GraphWorkload:
+def part_named(module: str, parts: Mapping[str, Sequence[str]]) -> str:
+    """Return the first part that a module belongs to; empty for none."""
+    return next((part for part, globs in parts.items() if any(fnmatch.fnmatchcase(module, glob) for glob in globs)), "")
+
+
+def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]]) -> GraphWorkload:
     macs: Counter[str] = Counter()
     tally = Tally()
     activation_bytes = 0
@@ -144,11 +158,12 @@ def _count(tensors: Tensors) -> GraphWorkload:
             continue
         macs[precision_of(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
-        tally.layer(count, math.prod(tensors.shape(node.output[0]) or ()), *_operands(node, tensors))
+        part = part_named(node.name.rpartition("/")[0] or node.name, parts)
+        tally.layer(count, math.prod(tensors.shape(node.output[0]) or ()), *_operands(node, tensors), part=part)
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
         dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
-        activation_bytes, tensors.peak_bytes(), integer, tuple(unknown),
+        activation_bytes, tensors.peak_bytes(), integer, tuple(unknown), tally.parts(),
     )  # fmt: skip
 
 
@@ -175,9 +190,13 @@ class Tally:
     _grouped: int = 0
     _products: int = 0
     _rows: int = 0
+    _parts: dict[str, tuple[int, int, int, int]] = field(default_factory=dict)
 
-    def layer(self, macs: int, written: int, weights: int, groups: int = 1) -> None:
-        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights and its groups."""
+    def layer(self, macs: int, written: int, weights: int, groups: int = 1, part: str = "") -> None:
+        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights, groups and part."""
+        before = self._parts.get(part, (0, 0, 0, 0))
+        added = zip(before, (macs, weights, written, 1), strict=True)
+        self._parts[part] = tuple(old + new for old, new in added)  # type: ignore[assignment]
         self.layers += 1
         self.weights += weights
         self.activations += written
@@ -190,6 +209,10 @@ class Tally:
     def concat(self, found: bool) -> None:
         """Take in a node that may be a concatenation."""
         self._concats += found
+
+    def parts(self) -> dict[str, tuple[int, int, int, int]]:
+        """Return the sums of each part; nothing when all layers are of none."""
+        return dict(self._parts) if set(self._parts) - {""} else {}
 
     def traits(self) -> frozenset[str]:
         """Return which of ``TRAITS`` the graph has."""

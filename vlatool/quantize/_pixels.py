@@ -179,7 +179,7 @@ class _Rewriter(Forms):
 
     def _by_row(self, node: Any, others: list[str]) -> bool:
         """Say whether an operator computes each row by itself; ``others`` are inputs that are the same for all rows."""
-        last = (-1, len(self.shapes[node.input[0]]) - 1)
+        last = (-1, len(self.shapes.get(node.input[0], ())) - 1)
         if node.op_type == "LayerNormalization":
             return self.options(node).get("axis", -1) in last and all(name in self.constants for name in others)
         if node.op_type == "ReduceMean":
