@@ -9,7 +9,8 @@ import pytest
 
 from vlatool.bundle import Bundle, seal
 from vlatool.errors import DataError
-from vlatool.evaluate.recorded import Recorded, compare
+from vlatool.evaluate import recorded
+from vlatool.evaluate.recorded import Recorded, compare, run_recorded
 from vlatool.runtime import load
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context
@@ -56,6 +57,31 @@ def test_a_baseline_gets_its_row_and_the_bundle_its_distance_to_it(float_bundle,
     assert row.value("error_baseline.dx") == pytest.approx(expected[0], rel=1e-4)
     assert row.value("error_baseline.dy") == pytest.approx(expected[1], rel=1e-4)
     assert base.value("error_expert.dx") != row.value("error_expert.dx")
+
+
+def test_a_baseline_runs_once_for_all_that_are_compared_with_it(
+    float_bundle, int8_bundle, policy_template, monkeypatch
+):
+    ran = []
+
+    def counting(bundle, *rest):
+        ran.append(bundle.hash)
+        return run_recorded(bundle, *rest)
+
+    monkeypatch.setattr(recorded, "REFERENCES", {})
+    monkeypatch.setattr(recorded, "run_recorded", counting)
+    first, again = (
+        Recorded(baseline=float_bundle.path).run(int8_bundle, Context()).rows[-1].measurements for _ in range(2)
+    )
+    assert ran == [float_bundle.hash, int8_bundle.hash, int8_bundle.hash]
+    assert first == again
+    Recorded(baseline=float_bundle.path, samples=3).run(int8_bundle, Context())
+    other = policy_template / "calibration.npz"
+    Recorded(baseline=float_bundle.path, data=other).run(int8_bundle, Context())
+    assert ran[3:] == [float_bundle.hash, int8_bundle.hash] * 2, "other observations"
+    for samples in range(4, 12):
+        Recorded(baseline=float_bundle.path, samples=samples).run(int8_bundle, Context())
+    assert len(recorded.REFERENCES) == recorded.KEPT
 
 
 def test_against_itself_a_bundle_has_no_error(float_bundle):
