@@ -6,18 +6,31 @@ from typing import Any
 
 import pytest
 
+from vlatool import select_boards as select_boards_module
 from vlatool.bundle import Bundle
-from vlatool.errors import DataError, UsageError
+from vlatool.errors import DataError, OutputError, UsageError
 from vlatool.host import cache_directory
 from vlatool.hwselect._board import Candidate, outcomes
 from vlatool.hwselect._latency import shipped
 from vlatool.hwselect._simulate import Change
+from vlatool.hwselect._stored import LAYOUT, digest, read_workload
+from vlatool.hwselect._torch_workload import torch_workload
 from vlatool.hwselect._workload import workload
 from vlatool.profile import load_profile, names
 from vlatool.render._boards import limit_ms
-from vlatool.select_boards import LAYOUT, Asked, _change, counted, opened, select_boards, simulated, simulation_lines
+from vlatool.select_boards import (
+    Asked,
+    _change,
+    carry_count,
+    counted,
+    opened,
+    select_boards,
+    simulated,
+    simulation_lines,
+)
 from vlatool.stage import Context
 
+SAMPLES = Path(__file__).parents[1] / "sample_models"
 ENGINES = [(name, engine) for name in names() for engine in load_profile(name).engines]
 
 
@@ -54,6 +67,60 @@ def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> 
 def test_a_cache_that_cannot_be_written_costs_time_alone(float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VLATOOL_CACHE", "/proc/none")
     assert counted(float_bundle, Context()) == workload(float_bundle)
+
+
+def forget() -> None:
+    for file in kept():
+        file.unlink()
+
+
+def test_a_policy_that_carries_its_count_is_not_counted_again(
+    policy_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = carry_count(str(policy_dir), Context())
+    assert file == policy_dir / "workload.json"
+    wanted = counted(opened(str(policy_dir), Context()), Context())
+    forget()
+    monkeypatch.setattr(select_boards_module, "torch_workload", None)
+    assert counted(opened(str(policy_dir), Context()), Context()) == wanted
+    file.write_text(file.read_text().replace('"layers": ', '"layers": 1'))
+    assert counted(opened(str(policy_dir), Context()), Context()).layers > wanted.layers, "it was read"
+
+
+@pytest.mark.parametrize("change", ["code", "spec", "damage", "another version"])
+def test_a_count_of_something_else_is_made_again(
+    change: str, policy_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = carry_count(str(policy_dir), Context())
+    wrong = file.read_text().replace('"layers": ', '"layers": 1')
+    file.write_text("{" if change == "damage" else wrong)
+    forget()
+    description = policy_dir / "policy.yaml"
+    if change == "code":
+        (policy_dir / "policy.py").write_text((policy_dir / "policy.py").read_text() + "\n# edited\n")
+    elif change == "spec":
+        description.write_text(description.read_text().replace("control_hz: 10", "control_hz: 20"))
+    elif change == "another version":
+        monkeypatch.setattr("vlatool.hwselect._stored.__version__", "99")
+    bundle = opened(str(policy_dir), Context())
+    assert counted(bundle, Context()) == torch_workload(bundle)
+
+
+def test_only_a_policy_with_code_carries_a_count(float_bundle: Bundle, policy_dir: Path) -> None:
+    with pytest.raises(UsageError, match="is counted without torch"):
+        carry_count(str(float_bundle.path), Context())
+    (policy_dir / "workload.json").mkdir()
+    with pytest.raises(OutputError, match=r"workload\.json cannot be written"):
+        carry_count(str(policy_dir), Context())
+
+
+@pytest.mark.parametrize("sample", sorted(path.parent.name for path in SAMPLES.glob("*/policy.yaml")))
+def test_the_sample_policies_carry_true_counts(sample: str) -> None:
+    """After a change of their code: vlatool hwselect sample_models/NAME --carry-count."""
+    bundle = opened(str(SAMPLES / sample), Context())
+    carried = read_workload(SAMPLES / sample / "workload.json", digest(bundle))
+    assert carried is not None, "it is of another code, weights, spec or version"
+    assert carried == torch_workload(bundle)
 
 
 def test_a_policy_and_an_onnx_file_are_opened_as_sources(policy_template: Path, float_bundle: Bundle) -> None:

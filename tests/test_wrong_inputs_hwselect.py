@@ -157,6 +157,7 @@ NUMBERS = [
     Row("no robot", "--robots", 2, lambda at: at.choose("--robots", 0)),
     Row("an inference for each chunk of no rate", "--per-chunk asks how often the loop ticks", 2,
         lambda at: at.choose("--latency-ms", 5, "--per-chunk")),
+    Row("a bundle that shall carry a count", "is counted without torch", 2, lambda at: at.choose("--carry-count")),
     Row("half a robot", "--robots", 2, lambda at: at.choose("--robots", 0.5)),
     Row("a rate in words", "Invalid value for '--hz'", 2, lambda at: at.choose("--hz", "often")),
 ]  # fmt: skip

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.errors import DataError, UsageError, nearest
+from vlatool.errors import DataError, OutputError, UsageError, nearest
 from vlatool.export.onnx import ExportOnnx
-from vlatool.files import whole_file
 from vlatool.host import cache_directory
 from vlatool.hwselect._board import Candidate, outcomes, quantized_as
 from vlatool.hwselect._boards_report import boards_report
@@ -21,17 +19,19 @@ from vlatool.hwselect._latency import LatencyModel, shipped
 from vlatool.hwselect._measured import measured_questions
 from vlatool.hwselect._select import Choice, Wants, choose, in_the_cloud
 from vlatool.hwselect._simulate import Change, bounds, changes, parts_of, timeline
+from vlatool.hwselect._stored import digest, read_workload, write_workload
 from vlatool.hwselect._torch_workload import torch_workload
-from vlatool.hwselect._workload import GraphWorkload, Workload, workload
+from vlatool.hwselect._workload import Workload, workload
 from vlatool.launch import cached_transform
 from vlatool.pipeline import sourced
 from vlatool.platforms import load_platform
 from vlatool.profile import Profile, load_profile, names
 from vlatool.report import Report
+from vlatool.sources._description import read_location
 from vlatool.stage import Context
 
-LAYOUT = 3
-"""Version of a cached workload."""
+CARRIED = "workload.json"
+"""File beside ``policy.yaml`` that holds the count of a policy."""
 
 
 @dataclass(frozen=True)
@@ -103,51 +103,50 @@ def opened(source: str, context: Context) -> Bundle:
 
 
 def counted(bundle: Bundle, context: Context) -> Workload:
-    """Return the work of one inference of a bundle or source; kept in the cache by the bundle's hash."""
+    """Return the work of one inference of a bundle or source.
+
+    It is kept in the cache by the bundle's hash; a policy may carry its count, too (``carry_count``).
+    """
     file = cache_directory() / "workloads" / f"{bundle.hash.removeprefix('sha256:')[:32]}.json"
-    if (found := _kept(file)) is not None:
+    if (found := read_workload(file)) is not None:
         return found
     if bundle.manifest.graphs:
         found = workload(bundle)
+    elif (carried := read_workload(_beside(bundle), digest(bundle))) is not None:
+        return carried
     elif "factory" in bundle.manifest.source:
         context.tell("counting the policy's work, without its weights", None)
         found = torch_workload(bundle)
     else:
         found = workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
-    _keep(file, found)
+    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+        write_workload(file, found)
     return found
 
 
-def _kept(file: Path) -> Workload | None:
+def carry_count(source: str, context: Context) -> Path:
+    """Write the count of a policy beside its ``policy.yaml``: whoever has it then chooses boards without torch.
+
+    The count holds as long as code, arguments, spec and program are those that were counted.
+
+    Raises:
+        UsageError: when the source is a bundle, or an ONNX file, which are counted without torch.
+        OutputError: when the file cannot be written.
+    """
+    bundle = opened(source, context)
+    if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
+        raise UsageError(f"{source} is counted without torch; only a policy with code carries a count.")
+    file = _beside(bundle)
+    found = counted(bundle, context)
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if not isinstance(data, dict) or data.get("layout") != LAYOUT:
-        return None
-    graphs = {}
-    try:
-        for name, fields in data["graphs"].items():
-            fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
-            fields["parts"] = {part: tuple(numbers) for part, numbers in fields["parts"].items()}
-            graphs[name] = GraphWorkload(**fields)
-        return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
-    except (KeyError, TypeError, ValueError, AttributeError):
-        return None
+        write_workload(file, found, digest(bundle))
+    except OSError as error:
+        raise OutputError(f"{file} cannot be written: {error.strerror}.", "make the folder writable") from error
+    return file
 
 
-def _keep(file: Path, found: Workload) -> None:
-    graphs: dict[str, Any] = {}
-    for name, graph in found.graphs.items():
-        fields = dataclasses.asdict(graph)
-        graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(file) as draft:
-            text = json.dumps({"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)})
-            draft.write_text(text, encoding="utf-8")
-    except OSError:
-        return  # a cache that cannot be written costs time, nothing else
+def _beside(bundle: Bundle) -> Path:
+    return read_location(bundle.path) / CARRIED if "factory" in bundle.manifest.source else Path(CARRIED)
 
 
 def simulated(

@@ -370,6 +370,7 @@ def test_samples_are_listed_and_made(vlatool, tmp_path):
     code, out, _ = vlatool("samples", "make", "action-expert", "-o", tmp_path / "made", "--seed", 3)
     assert (code, out) == (0, f"{tmp_path / 'made'}: action-expert, seed 3\n")
     assert (tmp_path / "made/policy.yaml").is_file()
+    assert json.loads((tmp_path / "made/workload.json").read_text())["runs"] == {"main": 1}
 
 
 # ---- small parts

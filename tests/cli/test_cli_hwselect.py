@@ -123,6 +123,13 @@ def test_hwselect_counts_a_policy_once(vlatool, policy_dir):
     assert "counting the policy's work" not in vlatool("hwselect", policy_dir, *SMALL)[2]
 
 
+def test_hwselect_writes_the_count_that_a_policy_carries(vlatool, policy_dir):
+    code, out, err = vlatool("hwselect", policy_dir, "--boards", "raspberry-pi-5", "--carry-count", "--json")
+    assert code == 0
+    assert f"count kept in {policy_dir / 'workload.json'}" in err
+    assert strict(out)["kind"] == "hwselect"
+
+
 def test_flags_may_come_before_the_source(vlatool, float_bundle):
     assert vlatool("hwselect", "--hz", 10, *SMALL, float_bundle.path)[0] == 0
 

@@ -68,12 +68,19 @@ def select(
         Path | None,
         typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given"),
     ] = None,
+    carry: Annotated[
+        bool,
+        typer.Option(
+            "--carry-count",
+            help="write the policy's work to workload.json beside policy.yaml: torch is not needed again",
+        ),
+    ] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Rank the boards that can run a policy at a rate, within power, price and memory. Everything is predicted."""
-    from vlatool.select_boards import Asked, select_boards
+    from vlatool.select_boards import Asked, carry_count, select_boards
 
     numbers = {
         "hz": hz, "latency_ms": latency_ms, "max_watts": max_watts, "max_price": max_price, "memory": memory,
@@ -95,6 +102,9 @@ def select(
             per_chunk=per_chunk,
         )  # fmt: skip
         report = select_boards(source, asked, context, calibration)
+        file = carry_count(source, context) if carry else None
+    if file:
+        typer.echo(f"count kept in {file}", err=True)
     show(report, as_json=as_json, out=output, force=force)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +10,8 @@ import typer
 
 from vlatool import registry
 from vlatool.bundle import writing
-from vlatool.cli._console import refuse_existing
-from vlatool.errors import UsageError, nearest
+from vlatool.cli._console import progress, refuse_existing
+from vlatool.errors import MissingExtra, UsageError, nearest
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -31,6 +32,7 @@ def make(
 ) -> None:
     """Write a policy with seeded random weights, for latency and memory work."""
     from vlatool.samples._write import write_sample
+    from vlatool.select_boards import carry_count
 
     known = [entry.replace("_", "-") for entry in registry.names("samples")]
     if name.replace("_", "-") not in known:
@@ -38,4 +40,6 @@ def make(
     refuse_existing(output, force)
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)
+    with contextlib.suppress(MissingExtra), progress() as context:  # without torch it is counted where torch is
+        carry_count(str(output), context)
     typer.echo(f"{output}: {name}, seed {seed}")

@@ -1,0 +1,68 @@
+"""A workload as a file: in the cache, or beside a policy that carries it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from vlatool import __version__
+from vlatool.bundle import Bundle
+from vlatool.files import whole_file
+from vlatool.hwselect._workload import GraphWorkload, Workload
+
+LAYOUT = 3
+"""Version of the file."""
+
+
+def digest(bundle: Bundle) -> str:
+    """Return what a count of a source depends on, as SHA-256: code, weights, arguments, spec, program and parts.
+
+    Code inside a package is known by the version of vlatool alone.
+    """
+    manifest = bundle.manifest.to_dict()
+    depends = {key: manifest.get(key) for key in ("source", "spec", "program", "parts")}
+    text = json.dumps({**depends, "vlatool": __version__}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_workload(file: Path, of: str = "") -> Workload | None:
+    """Return the workload of a file; None when there is none, it is damaged, or it is of something else.
+
+    Args:
+        file: The file.
+        of: ``digest`` that it must have.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(data, dict) or data.get("layout") != LAYOUT or data.get("digest", "") != of:
+        return None
+    graphs = {}
+    try:
+        for name, fields in data["graphs"].items():
+            fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
+            fields["parts"] = {part: tuple(numbers) for part, numbers in fields["parts"].items()}
+            graphs[name] = GraphWorkload(**fields)
+        return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+
+
+def write_workload(file: Path, found: Workload, of: str = "") -> None:
+    """Write a workload as ``read_workload`` reads it.
+
+    Raises:
+        OSError: when the file cannot be written.
+    """
+    graphs: dict[str, Any] = {}
+    for name, graph in found.graphs.items():
+        fields = dataclasses.asdict(graph)
+        graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(file) as draft:
+        data = {"layout": LAYOUT, "digest": of, "graphs": graphs, "runs": dict(found.runs)}
+        draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
