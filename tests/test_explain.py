@@ -217,11 +217,11 @@ def test_attention_that_openvino_fuses_with_a_quantization_counts_as_computation
     pytest.importorskip("openvino")
     bundle = StaticInt8(samples=8, layout="openvino").run(float_bundle, tmp_path, Context())
     names = {node.name for node in onnx.load(bundle.path / "graphs/main.onnx").graph.node}
-    found = [each for each in profile(bundle, recorded_observations(float_bundle, 1), 3) if each.kind == "Subgraph"]
+    found = [each for each in profile(bundle, recorded_observations(float_bundle, 1), 3) if "Subgraph" in each.kind]
     assert any(each.product and each.precision == "float32" for each in found), "the products inside attention"
     for each in found:
-        assert each.name in names
-        assert ("quantize" in each.name) == (each.precision == "quantize-dequantize")
+        assert ("quantize" in each.name.lower()) == (each.precision == "quantize-dequantize")
+        assert each.precision == "quantize-dequantize" or each.name in names
 
 
 def test_dynamic_int8_is_explained_too(fragile, made):

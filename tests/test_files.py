@@ -35,6 +35,15 @@ def test_a_failure_leaves_the_old_file_and_no_draft(tmp_path: Path, error: type[
     assert list(tmp_path.iterdir()) == [file]
 
 
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("old")
+    (tmp_path / "link.json").symlink_to(tmp_path / "a.json")
+    with whole_file(tmp_path / "link.json") as draft:
+        draft.write_text("new")
+    assert (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "a.json").read_text() == "new"
+
+
 def test_a_draft_that_was_not_written_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), whole_file(tmp_path / "a.json"):
         pass

@@ -60,6 +60,15 @@ def test_convolutions_are_tried_only_where_the_processor_has_matrix_units(monkey
                                       for each in stage.values()]  # fmt: skip
 
 
+def test_a_plan_with_the_graphs_of_another_one_is_not_tried_again(search) -> None:
+    run = search(metric="relative_error", max_metric=0.5)
+    stages = ({"quantize.static_int8": {}},)
+    first, again = run._try("first", stages), run._try("again", stages)
+    assert first.speedup > 0
+    assert (again.speedup, again.note) == (0.0, "It has the graphs of first.")
+    assert run._try("first", stages).speedup > 0
+
+
 def test_every_variant_can_be_built_as_stages() -> None:
     for stages in variants_for(None, calibrated=True).values():
         assert len(built(stages)) == 1

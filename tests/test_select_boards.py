@@ -155,7 +155,7 @@ def test_the_report_tells_what_a_chunk_and_a_tick_cost(per_chunk: bool, float_bu
     predicted = {item.name: item.value for item in report.rows[0].measurements}
     for whole, each in (("latency_p50", "latency_per_action"), ("energy", "energy_per_action")):
         assert predicted[each] == pytest.approx(predicted[whole] / 2)
-    told = next(each for each in report.summary if "2 actions are executed: there each control tick" in each)
+    told = next(each for each in report.summary if "2 actions are executed: with one inference for each chunk" in each)
     assert told.endswith("--per-chunk.") == (not per_chunk)
     assert limit_ms(report) == (200 if per_chunk else 100)
 

@@ -12,6 +12,8 @@ from pathlib import Path
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a draft beside ``path``: it takes the place of ``path`` when the block ends, and is removed when it fails.
 
+    A symbolic link stays one: the file that it leads to is written.
+
     Raises:
         OSError: when the draft cannot be moved.
 
@@ -23,10 +25,12 @@ def whole_file(path: Path) -> Iterator[Path]:
         >>> target.read_text()
         'all of it'
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    target = path.resolve()
+    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         yield draft
-        draft.replace(path)
+        draft.replace(target)
     except BaseException:
-        draft.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the first error is the one to tell
+            draft.unlink(missing_ok=True)
         raise

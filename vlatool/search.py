@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.errors import VlatoolError
+from vlatool.errors import GraphError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.host import isa
 from vlatool.judge import budget_of
@@ -100,6 +100,7 @@ class Search:
 
     def __post_init__(self) -> None:
         self.trials: list[Trial] = []
+        self._seen: dict[str, str] = {}
         self._begun = time.monotonic()
         self._planned = 1
         self._layers: list[LayerError] | None = None
@@ -140,6 +141,7 @@ class Search:
     def _try(self, name: str, stages: StageList) -> Trial:
         """Build a plan, time it against float32 and measure its error; failures are trials that say why."""
         done = len(self.trials)
+        self._planned = max(self._planned, done + 1)
         left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
         told = f", about {left:.0f} s left" if done else ""
         self.context.tell(f"search: plan {done + 1} of at most {self._planned}{told}: {name}", done / self._planned)
@@ -149,6 +151,9 @@ class Search:
             for stage in built(stages):
                 stage.check(bundle, self.profile)
                 bundle = cached_transform(stage, bundle, self.cache, quiet)
+            twin = self._seen.setdefault(graphs_of(bundle), name)
+            if twin != name:  # no product has enough rows to become a convolution, say
+                raise GraphError(f"It has the graphs of {twin}.")
             timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, cold=False)
             speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
             error = self._error(bundle, quiet)
@@ -261,6 +266,14 @@ def _openvino_variants(bfloat16: bool, amx: bool, calibrated: bool) -> dict[str,
             stage = {"layout": "openvino", **rest, **how, **options}
             found[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
     return found
+
+
+def graphs_of(bundle: Bundle) -> str:
+    """Return what two bundles share that compute the same on the same engine."""
+    manifest = bundle.manifest
+    files = sorted(f"{path} {record.sha256}" for path, record in manifest.files.items() if path.startswith("graphs/"))
+    computes = sorted(f"{name} {graph.compute}" for name, graph in manifest.graphs.items())
+    return "\n".join([manifest.engine, *computes, *files])
 
 
 def processor_has(profile: Profile | None, *features: str) -> bool:

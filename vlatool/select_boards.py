@@ -74,7 +74,7 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
     bundle = opened(source, context)
     load = counted(bundle, context)
     spec = bundle.manifest.spec
-    asked = replace(asked, execute=spec.execute or spec.chunk)
+    asked = replace(asked, execute=spec.executed)
     if asked.hz is None and asked.latency_ms is None:
         asked = replace(asked, hz=spec.control_hz)
     model = shipped().conditioned(measured_questions(calibration))
@@ -112,7 +112,7 @@ def counted(bundle: Bundle, context: Context) -> Workload:
         return found
     if bundle.manifest.graphs:
         found = workload(bundle)
-    elif (carried := read_workload(_beside(bundle), digest(bundle))) is not None:
+    elif _may_carry(bundle) and (carried := read_workload(_beside(bundle), digest(bundle))) is not None:
         return carried
     elif "factory" in bundle.manifest.source:
         context.tell("counting the policy's work, without its weights", None)
@@ -127,15 +127,22 @@ def counted(bundle: Bundle, context: Context) -> Workload:
 def carry_count(source: str, context: Context) -> Path:
     """Write the count of a policy beside its ``policy.yaml``: whoever has it then chooses boards without torch.
 
-    The count holds as long as code, arguments, spec and program are those that were counted.
+    The count holds as long as all of ``digest`` is what was counted.
 
     Raises:
-        UsageError: when the source is a bundle, or an ONNX file, which are counted without torch.
+        UsageError: when the source is a bundle or an ONNX file, which are counted without torch, or its factory lies in
+            a package, whose changes nobody would notice.
         OutputError: when the file cannot be written.
     """
     bundle = opened(source, context)
-    if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
-        raise UsageError(f"{source} is counted without torch; only a policy with code carries a count.")
+    if not _may_carry(bundle):
+        if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
+            raise UsageError(f"{source} is counted without torch; only a policy with code carries a count.")
+        raise UsageError(
+            f"The factory of {source} lies in a package ({bundle.manifest.source['factory']}), whose changes nobody "
+            "would notice.",
+            "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
+        )
     file = _beside(bundle)
     found = counted(bundle, context)
     try:
@@ -145,8 +152,16 @@ def carry_count(source: str, context: Context) -> Path:
     return file
 
 
+def _may_carry(bundle: Bundle) -> bool:
+    """Say whether a count can be known to be of this code: it lies beside ``policy.yaml``, or comes with vlatool."""
+    if bundle.manifest.graphs:
+        return False
+    source = bundle.manifest.source
+    return bool(source.get("code")) or str(source.get("factory", "")).startswith("vlatool.")
+
+
 def _beside(bundle: Bundle) -> Path:
-    return read_location(bundle.path) / CARRIED if "factory" in bundle.manifest.source else Path(CARRIED)
+    return read_location(bundle.path) / CARRIED
 
 
 def simulated(
@@ -177,7 +192,7 @@ def simulated(
         "precision": precision or quantized_as(load) or "float32", "origin": "predicted",
         "latency_ms": [outcome.latency.ms, outcome.latency.low, outcome.latency.high],
         "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
-        "joules": outcome.joules, "execute": spec.execute or spec.chunk, "control_hz": spec.control_hz,
+        "joules": outcome.joules, "execute": spec.executed, "control_hz": spec.control_hz,
         "phases": [
             {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares),
              "parts": parts_of(bound.phase, load.graphs[bound.phase.name], model.shares)}

@@ -174,7 +174,12 @@ class PolicySpec:
     @property
     def inference_hz(self) -> float:
         """Inferences per second that the control rate and the executed part of the chunk ask for."""
-        return self.control_hz / (self.execute or self.chunk)
+        return self.control_hz / self.executed
+
+    @property
+    def executed(self) -> int:
+        """Actions of an inference that are executed."""
+        return self.execute or self.chunk
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PolicySpec:

@@ -151,6 +151,14 @@ def test_a_fit_anew_does_not_begin_at_the_shipped_scales(points_file: Path, tmp_
         read_model.cache_clear()
 
 
+def test_a_fit_begins_at_what_was_shipped_whatever_the_user_has(
+    points_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VLATOOL_LATENCY", str(tmp_path / "none yet"))
+    list(fit_files(points_file, tmp_path / "made", seconds=0, seed=0))
+    assert read_model(tmp_path / "made").parts["npu"].scales == read_model(_latency.DATA).parts["npu"].scales
+
+
 def test_a_fit_writes_what_is_then_read(points_file: Path, no_data: Path) -> None:
     told = list(fit_files(points_file, no_data, seconds=0, seed=3))
     assert told[0] == "processors: 42 figures of 7 devices and 6 models"

@@ -158,7 +158,10 @@ def test_a_directory_takes_the_place_of_the_shipped_model(
     assert shipped().about == before
 
 
-@pytest.mark.parametrize("damage", ["absent", "empty", "cut", "no archive", "no JSON", "another file", "no part"])
+@pytest.mark.parametrize(
+    "damage",
+    ["absent", "empty", "cut", "no archive", "no JSON", "another file", "no array", "no part", "flipped", "a list"],
+)
 def test_a_directory_without_a_model_is_named(
     damage: str, model: LatencyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,8 +179,16 @@ def test_a_directory_without_a_model_is_named(
         parameters.write_text("{")
     elif damage == "another file":
         parameters.write_text("[1]")
-    elif damage == "no part":
+    elif damage == "no array":
         np.savez(arrays, a=np.zeros(3))
+    elif damage == "no part":
+        parameters.write_text('{"about": {}, "parts": {}}')
+    elif damage == "a list":
+        parameters.write_text('{"about": {}, "parts": []}')
+    elif damage == "flipped":
+        data = bytearray(arrays.read_bytes())
+        data[200:400] = bytes(255 - byte for byte in data[200:400])
+        arrays.write_bytes(data)
     monkeypatch.setenv("VLATOOL_LATENCY", str(folder))
     with pytest.raises(DataError, match="There is no latency model in") as caught:
         shipped()

@@ -3,11 +3,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from vlatool.errors import UsageError
+from vlatool.errors import DataError, UsageError
 from vlatool.hwselect import _score
 from vlatool.hwselect._latency import LatencyModel
 from vlatool.hwselect._score import lines, score_points
@@ -133,3 +134,12 @@ def test_a_person_reads_a_line_for_each_group(points_file: Path) -> None:
     assert [line.split()[0] for line in text[3:7]] == ["all", "cpu", "gpu", "npu"]
     assert "The interval is meant to hold 80%." in text
     assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+def test_a_model_without_a_kind_of_unit_says_so(
+    points_file: Path, model: LatencyModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = {"processors": model.parts["processors"]}
+    monkeypatch.setattr(_score, "shipped", lambda: replace(model, parts=parts))
+    with pytest.raises(DataError, match="The latency model has no figures of npu"):
+        score_points(points_file, "models")

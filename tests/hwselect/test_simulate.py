@@ -7,7 +7,7 @@ import pytest
 
 from vlatool.hwselect._board import Candidate, Outcome, outcomes
 from vlatool.hwselect._latency import LatencyModel
-from vlatool.hwselect._simulate import bounds, changes, timeline, widest
+from vlatool.hwselect._simulate import bounds, changes, parts_of, timeline, widest
 from vlatool.hwselect._workload import GraphWorkload, Workload
 from vlatool.profile import load_profile
 
@@ -34,6 +34,20 @@ def test_each_phase_says_what_holds_it_back(outcome: Outcome, certain: LatencyMo
     for bound in (prefix, step):
         assert set(bound.shares) == {"compute", "memory", "overhead"}
         assert sum(bound.shares.values()) == pytest.approx(1)
+
+
+def test_parts_share_the_time_by_their_work(certain: LatencyModel, load: Load) -> None:
+    """Three times the work in every respect is three times the time; what no part names is told, too."""
+    small = (10**8, 10**6, 10**5, 4)
+    graph = replace(
+        load().graphs["main"], parts={"vision": tuple(3 * each for each in small), "head": small, "": small}
+    )
+    (phase,) = outcomes([PI], Workload({"main": graph}, {"main": 1}), certain)[0].phases
+    found = parts_of(phase, graph, certain.shares)
+    assert found == {"vision": pytest.approx(0.6), "head": pytest.approx(0.2), "other": pytest.approx(0.2)}
+    bound = replace(graph, parts={"vision": (10**9, 1, 1, 0), "head": (0, 10**9, 0, 0)})
+    assert parts_of(phase, bound, certain.shares)["head"] != pytest.approx(0.5, abs=0.05), "operations are not bytes"
+    assert parts_of(phase, replace(graph, parts={}), certain.shares) == {}
 
 
 def test_the_time_line_runs_from_begin_to_end(outcome: Outcome, certain: LatencyModel) -> None:

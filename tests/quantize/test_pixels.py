@@ -268,6 +268,19 @@ def test_what_cannot_be_a_convolution_stays(what: str) -> None:
     assert model.SerializeToString() == before
 
 
+def test_weights_that_are_inputs_of_the_graph_too_are_none_afterwards() -> None:
+    """As files before IR version 4 have them."""
+    draft = Draft()
+    found = draft.add("MatMul", "x", weight(WIDTH, 8))
+    model = draft.model(found)
+    for tensor in model.graph.initializer:
+        model.graph.input.append(helper.make_tensor_value_info(tensor.name, tensor.data_type, tensor.dims))
+    before = computed(model, draft.shape)[0]
+    assert use_convolutions(model) == 1
+    assert [value.name for value in model.graph.input] == ["x"]
+    np.testing.assert_allclose(computed(model, draft.shape)[0], before, rtol=1e-4, atol=2e-5)
+
+
 def test_a_graph_inside_reads_values_as_they_were() -> None:
     draft = Draft()
     product = draft.add("MatMul", "x", weight(WIDTH, WIDTH))

@@ -101,8 +101,8 @@ def select(
             precisions=tuple(precision or ()), platform=platform, boards=tuple(boards or ()), cloud=cloud,
             per_chunk=per_chunk,
         )  # fmt: skip
-        report = select_boards(source, asked, context, calibration)
         file = carry_count(source, context) if carry else None
+        report = select_boards(source, asked, context, calibration)
     if file:
         typer.echo(f"count kept in {file}", err=True)
     show(report, as_json=as_json, out=output, force=force)

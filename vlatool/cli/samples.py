@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ import typer
 from vlatool import registry
 from vlatool.bundle import writing
 from vlatool.cli._console import progress, refuse_existing
-from vlatool.errors import MissingExtra, UsageError, nearest
+from vlatool.errors import MissingExtra, UsageError, VlatoolError, nearest
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -40,6 +39,11 @@ def make(
     refuse_existing(output, force)
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)
-    with contextlib.suppress(MissingExtra), progress() as context:  # without torch it is counted where torch is
-        carry_count(str(output), context)
+    try:
+        with progress() as context:
+            carry_count(str(output), context)
+    except MissingExtra:
+        pass  # it is counted where torch is
+    except (VlatoolError, OSError) as error:
+        typer.echo(f"warning: it carries no count: {error}", err=True)
     typer.echo(f"{output}: {name}, seed {seed}")

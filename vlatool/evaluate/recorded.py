@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,8 +58,7 @@ class Recorded(Measure):
         reference: Array | None = None
         rows = []
         if self.baseline:
-            context.tell("running the baseline", None)
-            reference = self._reference(Bundle.open(self.baseline), self._data(source), recording, indices, context)
+            reference = self._reference(Bundle.open(self.baseline), source, recording, indices, context)
             rows.append(Row("baseline", "baseline", measurements=tuple(compare(action, reference, expert, "expert"))))
         got = run_recorded(source, recording, indices, self.engine, context)
         measurements = compare(action, got, expert, "expert")
@@ -70,15 +70,19 @@ class Recorded(Measure):
         return Report("evaluate", title, summary=(text,), rows=tuple(rows), environment=fingerprint())
 
     def _reference(
-        self, baseline: Bundle, data: Path, recording: Recording, indices: Sequence[int], context: Context
+        self, baseline: Bundle, source: Bundle, recording: Recording, indices: Sequence[int], context: Context
     ) -> Array:
         """Run the baseline, once in a process: a search compares many bundles with it."""
+        data = self._data(source)
         state = data.stat()
-        key = (baseline.hash, data, state.st_mtime_ns, state.st_size, tuple(indices), self.engine)
+        spec = json.dumps(source.manifest.spec.to_dict(), sort_keys=True)
+        key = (baseline.hash, spec, data, state.st_mtime_ns, state.st_size, tuple(indices), self.engine)
         if key not in REFERENCES:
+            context.tell("running the baseline", None)
             while len(REFERENCES) >= KEPT:
                 REFERENCES.pop(next(iter(REFERENCES)))
             REFERENCES[key] = run_recorded(baseline, recording, indices, self.engine, context)
+            REFERENCES[key].setflags(write=False)
         return REFERENCES[key]
 
     def _data(self, source: Bundle) -> Path:

@@ -60,8 +60,7 @@ class Operator:
     @property
     def product(self) -> bool:
         """Whether it is a matrix product or a convolution."""
-        fused = self.kind == "Subgraph" and "MatMul" in self.name
-        return (fused or any(word in self.kind for word in PRODUCTS)) and self.precision not in (MOVING, QUANTIZING)
+        return any(word in self.kind for word in PRODUCTS) and self.precision not in (MOVING, QUANTIZING)
 
 
 class _Profiled(Protocol):
@@ -187,21 +186,22 @@ class _OpenvinoProfiled:
         try:
             core = openvino.Core()
             model = core.read_model(str(path))
-            known = {node.get_friendly_name() for node in model.get_ops()}
+            known = {node.get_friendly_name(): str(node.get_type_name()) for node in model.get_ops()}
             self._compiled = core.compile_model(model, DEVICE, settings)
             self._request = self._compiled.create_infer_request()
+            self._fused = fused_names(self._compiled, known)
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
             raise GraphError(f"OpenVINO cannot profile {path.name}: {str(error)[:200]}") from error
         self._outputs = [output.get_any_name() for output in self._compiled.outputs]
         self._runs: list[dict[tuple[str, str, str], float]] = []
-        self._fused = fused_names(self._compiled, known)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         self._request.infer(feeds)
         spent: dict[tuple[str, str, str], float] = {}
         for item in self._request.profiling_info:
             if str(item.status).endswith("EXECUTED"):
-                key = (self._fused.get(item.node_name, item.node_name), item.node_type, item.exec_type)
+                named = self._fused.get(item.node_name, (item.node_name, item.node_type))
+                key = (*named, item.exec_type)
                 spent[key] = spent.get(key, 0.0) + item.real_time.total_seconds() * 1e6
         self._runs.append(spent)
         outputs = enumerate(self._outputs)
@@ -211,26 +211,26 @@ class _OpenvinoProfiled:
         return self._runs
 
 
-def fused_names(compiled: Any, known: Iterable[str]) -> dict[str, str]:
-    """Return subgraph -> the node of the file that it mostly is.
+def fused_names(compiled: Any, known: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Return subgraph -> name of the node of the file that it mostly is, and its kind: with its product, if it has one.
 
     OpenVINO fuses small operators, and whole attentions, into a Subgraph that it names after its last one, which is
     often the quantization of what it gives.
 
     Args:
         compiled: The compiled model.
-        known: Names of the nodes as they were read.
+        known: Name of each node as it was read -> its operator type.
     """
-    names = set(known)
-    found: dict[str, str] = {}
+    found: dict[str, tuple[str, str]] = {}
     for node in compiled.get_runtime_model().get_ops():
         about = node.get_rt_info()
         if str(about["layerType"].astype(str)) != "Subgraph":
             continue
-        inside = [name for name in str(about["originalLayersNames"].astype(str)).split(",") if name in names]
-        computing = [name for name in inside if not _is_quantizer(name)]
+        inside = [name for name in str(about["originalLayersNames"].astype(str)).split(",") if name in known]
+        computing = [name for name in inside if not _is_quantizer(name) and known[name] != "FakeQuantize"]
+        product = next((name for name in computing if known[name] == "MatMul"), "")
         if computing:
-            found[node.get_friendly_name()] = next((name for name in computing if "MatMul" in name), computing[0])
+            found[node.get_friendly_name()] = (product or computing[0], "Subgraph (MatMul)" if product else "Subgraph")
     return found
 
 

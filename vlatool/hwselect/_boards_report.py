@@ -56,10 +56,10 @@ def chunk_sentence(first: Choice | None, wants: Wants) -> list[str]:
         return []
     ms, joules, count = first.outcome.latency.ms, first.outcome.joules, wants.execute
     told = (
-        f"One inference gives a chunk, of which {count} actions are executed: there each control tick costs "
-        f"{_number(ms / count)} ms and {_number(joules / count)} J."
+        f"One inference gives a chunk, of which {count} actions are executed: with one inference for each chunk, a "
+        f"control tick costs {_number(ms / count)} ms and {_number(joules / count)} J there."
     )
-    hint = "" if wants.per_chunk or not wants.hz else " To infer once a chunk and not once a tick: --per-chunk."
+    hint = "" if wants.per_chunk or not wants.hz else " Asked about here is an inference each tick; else: --per-chunk."
     return [told + hint]
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError
 from vlatool.hwselect._features import Question, Shares, rows_of
-from vlatool.hwselect._latency import DATA, LEVEL, Known, LatencyModel, shipped, write
+from vlatool.hwselect._latency import DATA, LEVEL, Known, LatencyModel, read_model, write
 from vlatool.hwselect._points import Point, merged, read_points
 from vlatool.hwselect._process import Rows, Scales, kernel
 
@@ -360,5 +360,5 @@ def fit_files(path: Path, out: Path, seconds: float, seed: int, anew: bool = Fal
 def _before(part: str, anew: bool) -> tuple[Scales, Shares]:
     if anew or not (DATA / "latency.json").is_file():
         return Scales(), Shares()
-    model = shipped()
-    return model.parts[part].scales, model.shares[part]
+    model = read_model(DATA)  # and not the user's own: the search begins at what was shipped
+    return (model.parts[part].scales, model.shares[part]) if part in model.parts else (Scales(), Shares())

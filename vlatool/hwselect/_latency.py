@@ -7,6 +7,7 @@ import json
 import math
 import os
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -188,12 +189,16 @@ def shipped() -> LatencyModel:
     own = os.environ.get(PLACE)
     try:
         return read_model(Path(own) if own else DATA)
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-        raise DataError(
-            f"There is no latency model in {own or DATA}: {reason}.",
-            f"unset {PLACE}, or make one: vlatool hwselect fit POINTS.csv -o DIR",
-        ) from error
+        fix = f"unset {PLACE}, or make one: vlatool hwselect fit POINTS.csv -o DIR" if own else "install vlatool again"
+        raise DataError(f"There is no latency model in {own or DATA}: {reason}.", fix) from error
+
+
+DAMAGE = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading a file that is none of ours raises."""
 
 
 @functools.cache
@@ -209,6 +214,8 @@ def read_model(folder: Path) -> LatencyModel:
                         **{name: array.astype(float) for name, array in arrays.items()})  # fmt: skip
             parts[part] = Known(rows, stored[f"{part}.logs"].astype(float), Scales(**values["scales"]))
             shares[part] = Shares(**values["shares"])
+    if not parts:
+        raise ValueError("it has no part")
     conformal = {part: values["conformal"] for part, values in parameters["parts"].items()}
     return LatencyModel(parts, shares, conformal, parameters["about"])
 

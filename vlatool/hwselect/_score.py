@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import UsageError
+from vlatool.errors import DataError, UsageError
 from vlatool.hwselect._features import rows_of
 from vlatool.hwselect._fit import UNITS, Folds, Sample, Scores, by_part
 from vlatool.hwselect._latency import LEVEL, PLACE, WIDEST, Predicted, no_ground, shipped
@@ -37,13 +37,14 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
 
     Raises:
         UsageError: when ``held_out`` is none of these.
-        DataError: when the file is malformed.
+        DataError: when the file is malformed, or the model knows nothing of its kind of unit.
     """
     points = read_points(path)
+    own = os.environ.get(PLACE)
+    whose = f"the model of {own}" if own else "the shipped model"
     if held_out is None:
         found = shipped().predict([point.question for point in points if point.question])
-        own = os.environ.get(PLACE)
-        return _summary(points, found, f"the model of {own}" if own else "the shipped model")
+        return _summary(points, found, whose)
     if held_out not in SPLITS:
         raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.")
     shown: list[Point] = []
@@ -61,12 +62,14 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
         "devices": "each device left out whole",
         "calibrated": f"each device left out but for one model, {DRAWS} times, chosen with seed {seed}",
     }
-    return _summary(shown, answers, f"{how[held_out]}; scales of the shipped model")
+    return _summary(shown, answers, f"{how[held_out]}; scales of {whose}")
 
 
 def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, Predicted]:
     """Return question -> its prediction from the rows that are not left out with it."""
     model = shipped()
+    if part not in model.parts:
+        raise DataError(f"The latency model has no figures of {part}, and so no scales for them.", f"unset {PLACE}")
     folds = Folds(rows_of(sample.questions, model.shares[part]), sample, model.parts[part].scales)
     random = np.random.default_rng(seed)
     told = np.zeros(len(sample.logs), bool)

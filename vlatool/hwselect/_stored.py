@@ -20,7 +20,7 @@ LAYOUT = 3
 def digest(bundle: Bundle) -> str:
     """Return what a count of a source depends on, as SHA-256: code, weights, arguments, spec, program and parts.
 
-    Code inside a package is known by the version of vlatool alone.
+    vlatool's own samples are known by its version.
     """
     manifest = bundle.manifest.to_dict()
     depends = {key: manifest.get(key) for key in ("source", "spec", "program", "parts")}
@@ -46,6 +46,8 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
         for name, fields in data["graphs"].items():
             fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
             fields["parts"] = {part: tuple(numbers) for part, numbers in fields["parts"].items()}
+            if not isinstance(fields["macs"], dict) or any(len(numbers) != 4 for numbers in fields["parts"].values()):
+                return None
             graphs[name] = GraphWorkload(**fields)
         return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
     except (KeyError, TypeError, ValueError, AttributeError):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ class GraphWorkload:
         integer_ops: Whether int8 is computed by integer operators (MatMulInteger and its kin) and not in QDQ form.
         unknown: Compute layers that cannot be counted, because their shapes are not static.
         parts: Part of the policy (vision, language ...; empty: none) -> multiply-accumulates, weights, activations and
-            layers of its compute layers.
+            layers of its compute layers, but for those that are unknown.
     """
 
     macs: Mapping[str, int] = field(default_factory=dict)
@@ -136,9 +136,14 @@ def graph_workload(path: Path, parts: Mapping[str, Sequence[str]] | None = None)
     return _count(tensors, parts or {})
 
 
-def part_named(module: str, parts: Mapping[str, Sequence[str]]) -> str:
-    """Return the first part that a module belongs to; empty for none."""
-    return next((part for part, globs in parts.items() if any(fnmatch.fnmatchcase(module, glob) for glob in globs)), "")
+def part_named(name: str, parts: Mapping[str, Sequence[str]]) -> str:
+    """Return the first part that a module, or a node named after one (``head/MatMul``), belongs to; empty for none."""
+    names = (name, name.rpartition("/")[0] or name)
+    return next((part for part, globs in parts.items() if _matches(names, globs)), "")
+
+
+def _matches(names: Iterable[str], globs: Iterable[str]) -> bool:
+    return any(fnmatch.fnmatchcase(name, glob) for name in names for glob in globs)
 
 
 def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]]) -> GraphWorkload:
@@ -158,7 +163,7 @@ def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]]) -> GraphWorkloa
             continue
         macs[precision_of(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
-        part = part_named(node.name.rpartition("/")[0] or node.name, parts)
+        part = part_named(node.name, parts)
         tally.layer(count, math.prod(tensors.shape(node.output[0]) or ()), *_operands(node, tensors), part=part)
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(

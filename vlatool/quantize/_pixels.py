@@ -32,7 +32,8 @@ FLOAT = 1  # onnx.TensorProto.FLOAT
 def use_convolutions(model: Any) -> int:
     """Rewrite the products of a weight and at least ``FEWEST`` rows in place; return how many there were.
 
-    Nodes keep their names. What depends on a symbolic shape stays as it is.
+    A product keeps the name of its node, and takes the bias that is added next into itself. What depends on a symbolic
+    shape stays as it is.
 
     Args:
         model: An ``onnx.ModelProto`` of opset 13 or later: float32, or with QDQ operators.
@@ -61,7 +62,9 @@ class _Rewriter(Forms):
             self.nodes = [node for node in self.nodes if node.op_type != "DequantizeLinear" or node.output[0] in read]
             used = read_names(self.nodes) | self.outputs
             kept = [tensor for tensor in self.constants.values() if tensor.name in used]
-            del self.graph.node[:], self.graph.initializer[:], self.graph.value_info[:]
+            inputs = [value for value in self.graph.input if value.name not in self.constants or value.name in used]
+            del self.graph.node[:], self.graph.initializer[:], self.graph.value_info[:], self.graph.input[:]
+            self.graph.input.extend(inputs)
             self.graph.node.extend(self.nodes)
             self.graph.initializer.extend(kept)
         return self.count
@@ -123,7 +126,11 @@ class _Rewriter(Forms):
         if made not in self.shapes:
             image = self._image_of(node.input[0], f"{made}/stored", output_first)
             self.add(
-                "DequantizeLinear", [image, *node.input[1:]], made, node.name, **({"axis": 0} if by_channel else {})
+                "DequantizeLinear",
+                [image, *node.input[1:]],
+                made,
+                f"{node.name}/image",
+                **({"axis": 0} if by_channel else {}),
             )
             self.shapes[made] = ()
         return made
