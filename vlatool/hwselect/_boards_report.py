@@ -59,8 +59,9 @@ def chunk_sentence(first: Choice | None, wants: Wants) -> list[str]:
         f"One inference gives a chunk, of which {count} actions are executed: with one inference for each chunk, a "
         f"control tick costs {_number(ms / count)} ms and {_number(joules / count)} J there."
     )
-    hint = "" if wants.per_chunk or not wants.hz else " Asked about here is an inference each tick; else: --per-chunk."
-    return [told + hint]
+    if wants.per_chunk or not wants.hz:
+        return [told]
+    return [f"{told} This answer is for an inference at every tick; for one in each chunk: --per-chunk."]
 
 
 def limits(wants: Wants) -> dict[str, Any]:
