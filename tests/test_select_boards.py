@@ -106,6 +106,20 @@ def test_a_count_of_something_else_is_made_again(
     assert counted(bundle, Context()) == torch_workload(bundle)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"macs": 3}, {"macs": {"float32": "many"}}, {"layers": -1}, {"weights": None}, {"parts": {"head": [1, 2]}}],
+)
+def test_a_carried_count_with_odd_values_is_made_again(change: dict[str, Any], policy_dir: Path) -> None:
+    file = carry_count(str(policy_dir), Context())
+    wanted = counted(opened(str(policy_dir), Context()), Context())
+    forget()
+    data = json.loads(file.read_text())
+    data["graphs"]["main"] |= change
+    file.write_text(json.dumps(data))
+    assert counted(opened(str(policy_dir), Context()), Context()) == wanted
+
+
 def test_only_a_policy_with_code_carries_a_count(float_bundle: Bundle, policy_dir: Path) -> None:
     with pytest.raises(UsageError, match="is counted without torch"):
         carry_count(str(float_bundle.path), Context())

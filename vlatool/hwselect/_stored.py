@@ -15,6 +15,7 @@ from vlatool.hwselect._workload import GraphWorkload, Workload
 
 LAYOUT = 3
 """Version of the file."""
+COUNTS = ("layers", "weights", "activations", "weight_bytes", "activation_bytes", "peak_bytes")
 
 
 def digest(bundle: Bundle) -> str:
@@ -46,7 +47,10 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
         for name, fields in data["graphs"].items():
             fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
             fields["parts"] = {part: tuple(numbers) for part, numbers in fields["parts"].items()}
-            if not isinstance(fields["macs"], dict) or any(len(numbers) != 4 for numbers in fields["parts"].values()):
+            counts = [fields[key] for key in COUNTS] + list(fields["macs"].values())
+            counts += [number for part in fields["parts"].values() for number in part]
+            fours = all(len(part) == 4 for part in fields["parts"].values())
+            if not fours or not all(isinstance(each, int) and each >= 0 for each in counts):
                 return None
             graphs[name] = GraphWorkload(**fields)
         return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
