@@ -208,6 +208,20 @@ def test_a_held_out_score_is_the_same_each_time(vlatool, points_file, held_out):
     assert found["predicted"] > 0
 
 
+def test_a_score_can_fit_everything_anew(vlatool, published, points_at):
+    path = points_at([row for row in published if row["device"] in ("raspberry-pi-4", "rk3588")])
+    line = ["hwselect", "score", path, "--held-out", "devices", "--refit", 0]
+    code, out, err = vlatool(*line)
+    assert code == 0, err
+    heads = [row for row in out.splitlines() if "all fitted anew without it, 0 s each" in row]
+    assert [head.split(";")[0] for head in heads] == [
+        "each device left out whole", "each device left out but for one model, 5 times, chosen with seed 0",
+    ]  # fmt: skip
+    assert "1 of 2 parts left out" in err
+    found = strict(vlatool(*line, "--json")[1])
+    assert {kind: each["predicted"] > 0 for kind, each in found.items()} == {"devices": True, "calibrated": True}
+
+
 def test_fit_writes_the_model_and_says_so(vlatool, points_file, tmp_path):
     code, out, err = vlatool("hwselect", "fit", points_file, "-o", tmp_path / "made", "--seconds", 0)
     assert (code, out) == (0, ""), err
@@ -218,7 +232,7 @@ def test_fit_writes_the_model_and_says_so(vlatool, points_file, tmp_path):
     assert set(about["parts"]) == {"processors", "npu"}
     with np.load(tmp_path / "made/latency.npz") as stored:
         assert len(stored["processors.logs"]) == 42
-        assert stored["npu.keys"].shape == (18, 8)
+        assert stored["npu.keys"].shape == (18, 11)
 
 
 # ---- simulate

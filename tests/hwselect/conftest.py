@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from vlatool.hwselect._features import Shares, rows_of
-from vlatool.hwselect._fit import Sample, conformal
+from vlatool.hwselect._fit import conformal
+from vlatool.hwselect._folds import Sample
 from vlatool.hwselect._latency import Known, LatencyModel
 from vlatool.hwselect._points import Point, read_points
 from vlatool.hwselect._process import Scales

@@ -39,11 +39,12 @@ def main() -> int:
     fresh = read_points(UNSEEN)
     print(f"{'':38}{'device':27}{'runtime':17}{'dtype':9}{'published':>10}{'predicted':>11}  80 % interval")
     for title, name, device, file in LANDMARKS:
-        rest = merged([point for point in known if not re.match(name, point.model)])
+        rest = merged([point for point in known if not re.match(name.partition(" ")[0], point.model)])
         model = fitted(rest, shipped())
         asked = [
             point for point in (fresh if file else known)
-            if point.question and re.match(name, point.model) and point.group.startswith(device)
+            if point.question and re.match(name, point.question.work.name)
+            and point.question.place.device.startswith(device)
         ]  # fmt: skip
         answers = model.predict([point.question for point in asked if point.question])
         for point, answer in zip(asked, answers, strict=True):
@@ -60,7 +61,8 @@ def line(title: str, point: Point, ms: float, low: float, high: float, why: str)
     question = point.question
     runtime, dtype = (question.runtime, question.precision) if question else ("", "")
     told = why or f"{low:.3g}-{high:.3g} {'inside' if low <= published <= high else 'OUTSIDE'}"
-    return f"{title:38}{point.group:27}{runtime:17}{dtype:9}{published:>10.4g}{ms:>11.4g}  {told}"
+    device = question.place.device if question else ""
+    return f"{title:38}{device:27}{runtime:17}{dtype:9}{published:>10.4g}{ms:>11.4g}  {told}"
 
 
 if __name__ == "__main__":

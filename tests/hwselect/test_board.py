@@ -90,6 +90,11 @@ def test_a_place_has_the_clocks_of_its_mode() -> None:
     assert slow.setting == "7W"
 
 
+def test_a_place_has_the_instruction_set_of_its_unit() -> None:
+    assert place_of(Candidate(ORIN, "7W", "ort_tensorrt", "int8")).isa == "sm_87"
+    assert place_of(Candidate(PI, "default", "ort_cpu", "int8")).isa == "asimd asimdhp asimddp"
+
+
 def test_a_unit_with_its_own_way_to_memory_has_its_bandwidth() -> None:
     narrow = PI.units["cpu"].model_copy(update={"bandwidth_gb_s": PI.bandwidth_gb_s.model_copy(update={"value": 3.0})})
     board = PI.model_copy(update={"units": {"cpu": narrow}})

@@ -21,7 +21,7 @@ from vlatool.hwselect._process import KEYS
 from vlatool.hwselect._workload import TRAITS
 
 WORK = Work(1e9, 4e6, 2e6, 30, frozenset({"attention"}), "net 224")
-PLACE = Place("board", "cpu", 4, 2.0, {"float32": 0.1, "float16": 0.2, "int8": 0.4}, 10.0, "15W")
+PLACE = Place("board", "cpu", 4, 2.0, {"float32": 0.1, "float16": 0.2, "int8": 0.4}, 10.0, "15W", "asimd asimddp")
 WHOLE = Shares(**dict.fromkeys(vars(Shares()), 1.0))
 
 
@@ -80,18 +80,32 @@ def same(first: Question, second: Question) -> set[str]:
     ("other", "differ"),
     [
         (ask(), set()),
-        (ask("int8"), {"kind", "pair", "setting", "known"}),
-        (ask(runtime="mnn-cpu"), {"runtime", "kind", "pair", "setting", "known"}),
+        (ask("int8"), {"kind", "made", "pair", "setting", "known"}),
+        (ask(runtime="mnn-cpu"), {"runtime", "kind", "made", "line", "pair", "setting", "known"}),
         (ask(place=replace(PLACE, setting="7W")), {"setting"}),
-        (ask(place=replace(PLACE, device="other")), {"device", "pair", "setting"}),
-        (ask(place=replace(PLACE, unit="gpu")), {"unit", "device", "pair", "setting"}),
+        (ask(place=replace(PLACE, device="other")), {"device", "line", "pair", "setting"}),
+        (ask(place=replace(PLACE, isa="avx2")), {"core", "made"}),
+        (ask(place=replace(PLACE, isa="asimddp asimd")), set()),
+        (ask(place=replace(PLACE, unit="gpu")), {"unit", "core", "made", "device", "line", "pair", "setting"}),
         (ask(work=replace(WORK, name="other 224")), {"model", "known"}),
         (ask(work=replace(WORK, macs=4e9)), {"model", "known"}),
     ],
-    ids=["same", "precision", "runtime", "mode", "device", "unit", "model", "size"],
+    ids=["same", "precision", "runtime", "mode", "device", "cores", "order", "unit", "model", "size"],
 )
 def test_categories_say_what_two_questions_share(other: Question, differ: set[str]) -> None:
     assert same(ask(), other) == {*KEYS} - differ
+
+
+def test_a_device_of_unknown_cores_shares_them_with_none() -> None:
+    bare = replace(PLACE, isa="")
+    assert same(ask(place=bare), ask(place=replace(bare, device="other"))) == {*KEYS} - {
+        "core",
+        "made",
+        "device",
+        "line",
+        "pair",
+        "setting",
+    }
 
 
 def test_float8_is_spoken_for_by_int8_and_bfloat16_by_float16() -> None:

@@ -177,6 +177,52 @@ def test_fewer_threads_are_fewer_cores(one: Callable[..., Point]) -> None:
     assert half.place.setting == "2t 1"
 
 
+def test_int8_of_ncnns_vulkan_is_computed_by_the_processor(one: Callable[..., Point]) -> None:
+    """ncnn has no int8 kernels for Vulkan; published figures of both are the same."""
+    options = {"device": "jetson-agx-xavier-32gb", "device_class": "gpu", "runtime": "ncnn-vulkan 1T"}
+    whole, half = one(**options, precision="int8"), one(**options, precision="fp16")
+    assert whole.question is not None
+    assert half.question is not None
+    assert (whole.kind, whole.question.place.unit, whole.question.runtime) == ("cpu", "cpu", "ncnn-cpu")
+    assert whole.question.place.cores == 1
+    assert (half.kind, half.question.place.unit, half.question.runtime) == ("gpu", "gpu", "ncnn-vulkan")
+    laptop = one(**(options | {"device": "rtx-a3000-laptop"}), precision="int8")
+    assert laptop.why == "nothing is known of the device 'rtx-a3000-laptop' (cpu)", "its GPU is not what computed"
+
+
+def test_little_and_big_cores_are_different_cores(one: Callable[..., Point]) -> None:
+    found = [
+        one(device="rk3588", runtime=f"ncnn-cpu 4T{more}").question for more in ("", " powersave=1", " powersave=2")
+    ]
+    clocks = [question.place.clock_ghz for question in found if question]
+    assert clocks == [2.3, 1.8, 2.3]
+    peaks = [question.place.peaks["float32"] for question in found if question]
+    assert peaks[1] < peaks[0] < peaks[2], "half of all cores is a mean of both"
+    assert {question.place.device for question in found if question} == {"rk3588"}
+
+
+@pytest.mark.parametrize(
+    ("name", "board"),
+    [("jetson-agx-orin", "jetson-agx-orin-64gb"), ("jetson-orin-nano-8gb-super", "jetson-orin-nano-8gb"),
+     ("raspberry-pi-5 (oc 2.9GHz)", "raspberry-pi-5"), ("raspberry-pi-4", "raspberry-pi-4")],
+)  # fmt: skip
+def test_a_board_is_held_out_with_its_other_names(one: Callable[..., Point], name: str, board: str) -> None:
+    assert one(device=name).group == board
+
+
+def test_the_parts_of_a_model_are_held_out_with_it(one: Callable[..., Point]) -> None:
+    names = ("GR00T-N1.7-3B end-to-end", "GR00T-N1.7-3B backbone (ViT+LLM)", "GR00T-N1.7-3B action head (DiT, 4 steps)")
+    assert {one(model=name).model for name in names} == {"GR00T-N1.7-3B"}
+    assert one(model="resnet50").model == "resnet50"
+
+
+def test_what_tensorrt_leaves_to_pytorch_is_pytorchs(one: Callable[..., Point]) -> None:
+    found = [one(runtime="tensorrt dit_only", model=f"GR00T-N1.7-3B {part}", device="jetson-agx-orin-64gb",
+                 device_class="gpu", precision="bf16").question
+             for part in ("backbone (ViT+LLM)", "action head (DiT, 4 steps)")]  # fmt: skip
+    assert [question.runtime for question in found if question] == ["torch-cuda", "tensorrt"]
+
+
 def test_what_a_row_leaves_out_follows_from_the_rest(one: Callable[..., Point]) -> None:
     question = one(macts_m="", n_layers="").question
     assert question is not None
@@ -200,6 +246,7 @@ def test_a_published_device_has_the_size_of_its_profile(pair: tuple[str, str], d
     profile = load_profile(pair[0])
     unit = profile.units["gpu" if pair[1] == "igpu" else pair[1]]
     known = known_devices()[device, pair[1]]
+    assert sorted(known.isa.split()) == sorted(unit.isa), "boards with the same cores speak for each other"
     assert 0.8 < known.cores / unit.cores.value < 1.25
     for dtype, peak in known.peaks.items():
         if dtype in unit.peak_tops:

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+from vlatool.hwselect import _process
 from vlatool.hwselect._process import KEYS, Process, Rows, Scales, kernel, lower_inverse
 
 SCALES = Scales()
@@ -44,12 +45,27 @@ def test_the_kernel_is_a_covariance() -> None:
     np.testing.assert_allclose(np.diag(found), np.square(parts).sum())
 
 
-@pytest.mark.parametrize("name", ["runtime", "device", "model", "known"])
+@pytest.mark.parametrize("name", ["runtime", "core", "device", "line", "model", "known"])
 def test_a_shared_category_adds_its_variance(name: str) -> None:
     one = replace(rows(1, 4), keys={key: np.array([1]) for key in KEYS})
     other = replace(one, keys=dict(one.keys) | {name: np.array([2])})
     gap = kernel(one, one, SCALES) - kernel(one, other, SCALES)
     assert gap[0, 0] == pytest.approx(getattr(SCALES, name) ** 2)
+
+
+def test_the_kernel_is_the_same_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = rows(7, 20), rows(5, 21)
+    whole = kernel(first, second, SCALES)
+    monkeypatch.setattr(_process, "BLOCK", 3)
+    np.testing.assert_array_equal(kernel(first, second, SCALES), whole)
+    one = kernel(first.take(slice(2, 3)), second.take(slice(4, 5)), SCALES)
+    np.testing.assert_allclose(one, whole[2:3, 4:5], rtol=1e-12)
+
+
+def test_devices_that_are_alike_speak_for_each_other() -> None:
+    one = replace(rows(1, 4), keys={key: np.array([1]) for key in KEYS})
+    near, far = (replace(one, device=one.device + step) for step in (0.1, 9.0))
+    assert kernel(one, near, SCALES)[0, 0] > kernel(one, far, SCALES)[0, 0]
 
 
 def test_a_measurement_moves_its_device_and_narrows_it() -> None:

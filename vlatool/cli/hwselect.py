@@ -5,27 +5,16 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._default import group_with
 from vlatool.errors import UsageError
 
-
-class _Group(TyperGroup):
-    """A group whose first word is a policy when it is no command."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the command ``select``."""
-        if args and args[0] not in ("--help", *self.list_commands(ctx)):
-            args = ["select", *args]
-        return super().parse_args(ctx, args)
-
-
 app = typer.Typer(
-    cls=_Group, no_args_is_help=True, rich_markup_mode=None,
+    cls=group_with("select"), no_args_is_help=True, rich_markup_mode=None,
     help="Say which board runs a policy, and in which precision: vlatool hwselect SOURCE --hz 20.",
 )  # fmt: skip
 
@@ -82,13 +71,10 @@ def select(
     """Rank the boards that can run a policy at a rate, within power, price and memory. Everything is predicted."""
     from vlatool.select_boards import Asked, carry_count, select_boards
 
-    numbers = {
-        "hz": hz, "latency_ms": latency_ms, "max_watts": max_watts, "max_price": max_price, "memory": memory,
-        "battery_wh": battery_wh, "years": years, "hours": hours, "kwh_price": kwh_price,
-    }  # fmt: skip
-    for name, value in numbers.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise UsageError(f"--{name.replace('_', '-')} is {value:g}; allowed: a number above 0.")
+    _above_zero(
+        hz=hz, latency_ms=latency_ms, max_watts=max_watts, max_price=max_price, memory=memory, battery_wh=battery_wh,
+        years=years, hours=hours, kwh_price=kwh_price,
+    )  # fmt: skip
     if not (math.isfinite(network_ms) and network_ms >= 0):
         raise UsageError(f"--network-ms is {network_ms:g}; allowed: 0 or more.")
     if hours > 24:
@@ -108,24 +94,42 @@ def select(
     show(report, as_json=as_json, out=output, force=force)
 
 
+def _above_zero(**numbers: float | None) -> None:
+    for name, value in numbers.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise UsageError(f"--{name.replace('_', '-')} is {value:g}; allowed: a number above 0.")
+
+
 @app.command("score")
 def score(
     points: Annotated[Path, typer.Argument(help=POINTS, show_default=False)],
     held_out: Annotated[
         str | None, typer.Option("--held-out", help="models, devices or calibrated: fit on the rest of this file first")
     ] = None,
+    refit: Annotated[
+        float | None,
+        typer.Option(
+            min=0, help="choose the model's scales anew without each held-out part, in so many seconds for each of them"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the split")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Predict every row of a file of published latencies, and print error and interval coverage."""
+    from vlatool.hwselect._refit import refit_points
     from vlatool.hwselect._score import lines, score_points
 
-    found = score_points(points, held_out, seed)
+    if refit is None:
+        found = {held_out or "all": score_points(points, held_out, seed)}
+    else:
+        with progress() as context:
+            found = refit_points(points, held_out, seed, refit, context.tell)
     if as_json:
-        typer.echo(json.dumps(found))
+        typer.echo(json.dumps(found if refit is not None else found[held_out or "all"]))
         return
-    for line in lines(found):
-        typer.echo(line)
+    for scores in found.values():
+        for line in lines(scores):
+            typer.echo(line)
 
 
 @app.command("fit")
@@ -136,7 +140,7 @@ def fit(
     ],
     seconds: Annotated[
         float, typer.Option(min=0, help="for the search of the scales; 0 keeps those that are shipped")
-    ] = 900.0,
+    ] = 300.0,
     seed: Annotated[int, typer.Option(min=0, help="of the search")] = 0,
     anew: Annotated[
         bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
@@ -145,5 +149,4 @@ def fit(
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.hwselect._fit import fit_files
 
-    for line in fit_files(points, output, seconds, seed, anew):
-        typer.echo(line, err=True)
+    fit_files(points, output, seconds, seed, anew, lambda line: typer.echo(line, err=True))

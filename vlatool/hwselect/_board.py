@@ -138,7 +138,7 @@ def place_of(candidate: Candidate) -> Place:
     return Place(
         published_as().get((profile.name, unit), profile.name), unit,
         caps.cores.get(figures.unit, part.cores.value), caps.clock_mhz.get(figures.unit, part.clock_mhz.value) / 1e3,
-        peaks, min(own, caps.bandwidth_gb_s), candidate.mode,
+        peaks, min(own, caps.bandwidth_gb_s), candidate.mode, " ".join(part.isa),
     )  # fmt: skip
 
 

@@ -64,6 +64,8 @@ class Place:
         peaks: Precision -> 10^12 operations per second, dense; at least one.
         bandwidth_gb_s: Of the memory.
         setting: What else a measurement was taken with: power mode, threads, version.
+        isa: Instruction set features of its cores, in words, as profiles have them: places with the same ones speak
+            for each other.
     """
 
     device: str
@@ -73,6 +75,7 @@ class Place:
     peaks: Mapping[str, float] = field(hash=False)
     bandwidth_gb_s: float
     setting: str = ""
+    isa: str = ""
 
     def peak(self, precision: str) -> float:
         """Return the peak that a precision computes at: that of float16, or float32, for weights alone in few bits."""
@@ -159,8 +162,10 @@ def _keys(question: Question) -> dict[str, int]:
     own = f"own {work.macs} {work.weights} {work.activations} {work.layers} {sorted(work.traits)}"
     name = f"{work.name} {work.macs:.3g}" if work.name else own
     unit = f"{place.device}/{place.unit}"
+    core = f"{place.unit}/{' '.join(sorted(place.isa.split()))}" if place.isa else unit
     names = (
-        place.unit, unit, runtime, f"{runtime} {precision}", f"{unit} {runtime} {precision}",
-        f"{unit} {runtime} {precision} {place.setting}", name, f"{name} {runtime} {precision}",
+        place.unit, core, unit, runtime, f"{runtime} {precision}", f"{core} {runtime} {precision}", f"{unit} {runtime}",
+        f"{unit} {runtime} {precision}", f"{unit} {runtime} {precision} {place.setting}", name,
+        f"{name} {runtime} {precision}",
     )  # fmt: skip
     return {key: zlib.crc32(text.encode()) for key, text in zip(KEYS, names, strict=True)}

@@ -1,15 +1,11 @@
-"""Fit the latency model: scales by cross-validation over whole models and whole devices, intervals by conformal scores.
-
-Leaving a group out of a Gaussian process needs no second fit: with A the inverse of the covariance of all rows, the
-group's mean is y_g - inv(A_gg) (A y)_g and its covariance inv(A_gg) (Rasmussen and Williams 2006, section 5.4.2).
-"""
+"""Fit the latency model: scales by leaving models and devices out whole, intervals by conformal scores."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import DataError
-from vlatool.hwselect._features import Question, Shares, rows_of
+from vlatool.hwselect._features import Shares, rows_of
+from vlatool.hwselect._folds import UNITS, Folds, Sample
 from vlatool.hwselect._latency import DATA, LEVEL, Known, LatencyModel, read_model, write
 from vlatool.hwselect._points import Point, merged, read_points
-from vlatool.hwselect._process import Rows, Scales, kernel
+from vlatool.hwselect._process import Scales
 
 Array = NDArray[Any]
 TAIL = 0.3
@@ -30,133 +27,10 @@ DEVICES = 0.6
 """What an unseen device counts beside an unseen model."""
 CALIBRATED, QUICK = 0.6, 6
 """What a device counts of which one model is known; how many of its models are tried in the search for scales."""
-STEP = 0.5
-UNITS = ("cpu", "gpu", "igpu", "npu")
-LONGEST = 32
-"""Models that calibrate a held-out device, one after the other, at most."""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """The rows that a fit works on.
-
-    Args:
-        questions: One for each row.
-        logs: (n,) natural logarithm of ms.
-        models, devices: (n,) codes of the groups that are left out whole.
-        units: (n,) index into ``UNITS``.
-        figures: (m,) row of each published figure: several versions of a runtime are one row.
-        published: (m,) their logarithms.
-    """
-
-    questions: tuple[Question, ...]
-    logs: Array
-    models: Array
-    devices: Array
-    units: Array
-    figures: Array
-    published: Array
-
-    @staticmethod
-    def of(points: Sequence[Point]) -> Sample:
-        """Take the points that can be asked about, one row for each question."""
-        asked = [point for point in points if point.question is not None]
-        known = merged(asked)
-        row = {point.question: place for place, point in enumerate(known)}
-        figures = np.array([row[point.question] for point in asked], np.int64)
-        published = np.array([point.log_ms for point in asked])
-        models, devices = (_codes([getattr(each, name) for each in known]) for name in ("model", "group"))
-        units = np.array([UNITS.index(point.kind) for point in known])
-        questions = tuple(point.question for point in known if point.question is not None)
-        logs = np.array([point.log_ms for point in known])
-        return Sample(questions, logs, models, devices, units, figures, published)
-
-
-def _codes(names: Sequence[str]) -> Array:
-    known = {name: code for code, name in enumerate(sorted(set(names)))}
-    return np.array([known[name] for name in names])
-
-
-class Folds:
-    """Predictions of each row without its group.
-
-    Args:
-        rows: Of the sample.
-        sample: The sample.
-        scales: Of the process.
-    """
-
-    def __init__(self, rows: Rows, sample: Sample, scales: Scales) -> None:
-        covariance = kernel(rows, rows, scales)
-        covariance[np.diag_indices(len(rows))] += scales.noise**2
-        self._inverse = np.linalg.inv(covariance)
-        self._residual = sample.logs - rows.prior
-        self._weights = self._inverse @ self._residual
-        self._sample = sample
-
-    def without(self, groups: Array) -> tuple[Array, Array]:
-        """Return error of log(ms) (predicted less measured) and its predicted standard deviation, row by row."""
-        error, deviation = np.zeros(len(groups)), np.zeros(len(groups))
-        for index, mean, covariance in self._each(groups):
-            error[index], deviation[index] = mean - self._residual[index], np.sqrt(np.diag(covariance))
-        return error, deviation
-
-    def calibrated(self, groups: Array, most: int = LONGEST) -> tuple[Array, Array, Array]:
-        """Leave each device out, tell the process of one of its models, and predict the others; for many of its models.
-
-        Args:
-            groups: Devices.
-            most: Models of each that are told, one after the other.
-
-        Returns:
-            Errors, standard deviations and the rows that they belong to.
-        """
-        errors: list[Array] = []
-        deviations: list[Array] = []
-        places: list[Array] = []
-        for index, mean, covariance in self._each(groups):
-            models = np.unique(self._sample.models[index])
-            for model in models[:: max(1, -(-len(models) // most))]:
-                seen = self._sample.models[index] == model
-                rest = ~seen
-                if not rest.any():
-                    continue
-                across = covariance[np.ix_(rest, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
-                told = self._residual[index][seen] - mean[seen]
-                errors.append(mean[rest] + across @ told - self._residual[index][rest])
-                spread = np.diag(covariance)[rest] - np.einsum("ij,ij->i", across, covariance[np.ix_(rest, seen)])
-                deviations.append(np.sqrt(np.maximum(spread, 1e-9)))
-                places.append(index[rest])
-        if not errors:  # every device has one model alone
-            return np.zeros(0), np.zeros(0), np.zeros(0, np.int64)
-        return np.concatenate(errors), np.concatenate(deviations), np.concatenate(places)
-
-    def once(self, groups: Array, random: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Leave each device out, tell the process of one of its models, drawn at random, and predict the others.
-
-        Returns:
-            Error and standard deviation of each row, and which rows were told.
-        """
-        error, deviation = np.zeros(len(groups)), np.ones(len(groups))
-        told = np.zeros(len(groups), bool)
-        for index, mean, covariance in self._each(groups):
-            models = np.unique(self._sample.models[index])
-            seen = self._sample.models[index] == models[random.integers(len(models))]
-            told[index[seen]] = True
-            if seen.all():
-                continue
-            across = covariance[np.ix_(~seen, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
-            known = self._residual[index][seen] - mean[seen]
-            error[index[~seen]] = mean[~seen] + across @ known - self._residual[index][~seen]
-            spread = np.diag(covariance)[~seen] - np.einsum("ij,ij->i", across, covariance[np.ix_(~seen, seen)])
-            deviation[index[~seen]] = np.sqrt(np.maximum(spread, 1e-9))
-        return error, deviation, told
-
-    def _each(self, groups: Array) -> Iterator[tuple[Array, Array, Array]]:
-        for code in np.unique(groups):
-            index = np.flatnonzero(groups == code)
-            covariance = np.linalg.inv(self._inverse[np.ix_(index, index)])
-            yield index, self._residual[index] - covariance @ self._weights[index], covariance
+STEP, LEAST_STEP = 0.5, 0.04
+"""Of the search for scales, in their logarithm: the first, and what is too small to try."""
+MOST = 32
+"""Figures of one device, runtime and precision that the search for scales looks at."""
 
 
 def loss(error: Array) -> float:
@@ -202,19 +76,20 @@ def tune(
     names = [field.name for field in dataclasses.fields(Scales) if field.name != "constant"]
     names += [f"shares.{field.name}" for field in dataclasses.fields(Shares)]
     random = np.random.default_rng(seed)
-    steps = dict.fromkeys(names, STEP)
+    steps = dict.fromkeys(names, STEP)  # with the sign of the direction that helped last
     best = assess(sample, scales, shares)
     begun = time.monotonic()
-    while time.monotonic() - begun < seconds and max(steps.values()) > 0.04:
-        for name in random.permutation(names):
+    while active := [name for name in names if abs(steps[name]) > LEAST_STEP]:
+        for name in random.permutation(active):
             if time.monotonic() - begun > seconds:
-                break
+                return scales, shares
             better = False
-            for factor in (math.exp(steps[name]), math.exp(-steps[name])):
-                tried = _changed(scales, shares, name, factor)
+            for step in (steps[name], -steps[name]):
+                tried = _changed(scales, shares, name, math.exp(step))
                 found = assess(sample, *tried) if tried else math.inf
                 if found < best - 1e-4:
                     (scales, shares), best, better = tried or (scales, shares), found, True
+                    steps[name] = step
                     tell(f"{time.monotonic() - begun:.0f} s, {name}: {best:.4f}")
                     break
             steps[name] *= 1.3 if better else 0.6
@@ -245,8 +120,8 @@ def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[
     return found
 
 
-FEW = 12
-"""Scores from which a unit speaks for itself."""
+ALL_COUNT = 4
+"""Models or devices that all units together count for beside those of one unit: few of a unit say little."""
 
 
 @dataclass(frozen=True)
@@ -257,23 +132,25 @@ class Scores:
         values: (n,) for each published figure, several versions of a runtime apart.
         groups: (n,) what it was left out with.
         units: (n,) index into ``UNITS``.
+        draws: (n,) which draw it is of: a model, a device, a device with the model that calibrates it.
     """
 
     values: Array
     groups: Array
     units: Array
+    draws: Array
 
     @staticmethod
-    def of(sample: Sample, error: Array, deviation: Array, groups: Array) -> Scores:
-        """Return the scores of every row of a sample."""
+    def of(sample: Sample, error: Array, deviation: Array, groups: Array, draws: Array | None = None) -> Scores:
+        """Return the scores of every row of a sample; each group is a draw when nothing else is said."""
         place = sample.figures
         values = np.abs(error[place] + sample.logs[place] - sample.published) / deviation[place]
-        return Scores(values, groups[place], sample.units[place])
+        return Scores(values, groups[place], sample.units[place], (groups if draws is None else draws)[place])
 
     @staticmethod
     def calibrated(sample: Sample, folds: Folds) -> Scores:
         """Return the scores of devices of which one model is known, for many of their models."""
-        error, deviation, places = folds.calibrated(sample.devices)
+        error, deviation, places, draws = folds.calibrated(sample.devices)
         order = np.argsort(sample.figures, kind="stable")
         starts = np.searchsorted(sample.figures[order], np.arange(len(sample.logs) + 1))
         copies = np.diff(starts)[places]  # versions of each row
@@ -281,10 +158,10 @@ class Scores:
         figure = order[np.repeat(starts[places] - np.append(0, np.cumsum(copies)[:-1]), copies) + np.arange(len(each))]
         at = places[each]
         values = np.abs(error[each] + sample.logs[at] - sample.published[figure]) / deviation[each]
-        return Scores(values, sample.devices[at], sample.units[at])
+        return Scores(values, sample.devices[at], sample.units[at], draws[each])
 
     def reach(self, unit: int, but: int | None = None) -> float:
-        """Return the score that ``LEVEL`` do not exceed, from this unit's (all units' when there are few).
+        """Return the score that ``LEVEL`` do not exceed: this unit's, drawn towards all units' where it has few groups.
 
         Args:
             unit: Index into ``UNITS``.
@@ -292,15 +169,21 @@ class Scores:
         """
         others = np.ones(len(self.values), bool) if but is None else self.groups != but
         alike = others & (self.units == unit)
-        speak = alike if alike.sum() >= FEW else others
-        if not speak.any():
+        if not others.any():
             return math.inf
-        values, groups = self.values[speak], self.groups[speak]
+        apart = len(np.unique(self.groups[alike]))
+        own = self._share(alike) if apart else 0.0
+        return (apart * own + ALL_COUNT * self._share(others)) / (apart + ALL_COUNT)
+
+    def _share(self, rows: Array) -> float:
+        """Return the score that ``LEVEL`` of some rows do not exceed."""
+        values, groups, draws = self.values[rows], self.groups[rows], len(np.unique(self.draws[rows]))
         _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
         weights = counts[inverse] ** -0.5  # figures of one group are no independent witnesses
         order = np.argsort(values)
         share = np.cumsum(weights[order]) / weights.sum()
-        return float(values[order][min(len(order) - 1, int(np.searchsorted(share, LEVEL)))])
+        level = LEVEL * (draws + 1) / draws  # what comes is one draw more (Lei et al., JASA 2018, section 2)
+        return float(values[order][min(len(order) - 1, int(np.searchsorted(share, level)))])
 
 
 PARTS = ("processors", "npu")
@@ -323,42 +206,75 @@ def by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
     return {part: [point for point in kept if (point.kind == "npu") == (part == "npu")] for part in PARTS}
 
 
-def fit_files(path: Path, out: Path, seconds: float, seed: int, anew: bool = False) -> Iterator[str]:
-    """Fit on a file and write the model's data; yields what is done.
+def thinned(points: Sequence[Point], most: int = MOST, seed: int = 0) -> list[Point]:
+    """Return at most so many figures of a device, runtime and precision, drawn at random.
+
+    The search for scales needs no more of them, and its work grows with the third power.
+    """
+    random = np.random.default_rng(seed)
+    alike: dict[tuple[str, ...], list[Point]] = {}
+    for point in merged(points):
+        asked = point.question
+        assert asked is not None
+        alike.setdefault((point.group, asked.place.unit, asked.runtime, asked.precision), []).append(point)
+    drawn = (random.permutation(len(same))[:most] for same in alike.values())
+    return [same[place] for same, places in zip(alike.values(), drawn, strict=True) for place in sorted(places)]
+
+
+def fit(
+    points: Sequence[Point], before: LatencyModel | None, seconds: float, seed: int, tell: Callable[[str], None]
+) -> LatencyModel:
+    """Return the model of some figures.
+
+    Args:
+        before: Where the search for scales begins; at ``Scales()`` and ``Shares()`` when None.
+        seconds: For the search; 0 keeps the scales.
+        seed: Of the search.
+        tell: Called with what is done.
+    """
+    parts: dict[str, Known] = {}
+    shares: dict[str, Shares] = {}
+    bounds: dict[str, dict[str, dict[str, float]]] = {}
+    usable = {part: mine for part, mine in by_part(points).items() if mine}
+    few = {part: thinned(mine, seed=seed) for part, mine in usable.items()}
+    work = {part: float(len(mine)) ** 3 for part, mine in few.items()}  # of one assessment
+    for part, mine in usable.items():
+        sample = Sample.of(mine)
+        groups = f"{len(set(sample.devices))} devices and {len(set(sample.models))} models"
+        tell(f"{part}: {len(sample.published)} figures of {groups}")
+        begin = (Scales(), Shares())
+        if before is not None and part in before.parts:
+            begin = (before.parts[part].scales, before.shares[part])
+        told: list[str] = []
+        share = seconds * work[part] / sum(work.values())
+        scales, shares[part] = tune(Sample.of(few[part]), *begin, share, seed, told.append)
+        for line in told[-3:]:
+            tell(line)
+        bounds[part] = conformal(sample, scales, shares[part])
+        parts[part] = Known(rows_of(sample.questions, shares[part]), sample.logs, scales)
+    about = {"figures": sum(len(known.rows) for known in parts.values()), "seed": seed, "level": LEVEL}
+    return LatencyModel(parts, shares, bounds, about)
+
+
+def fit_files(
+    path: Path, out: Path, seconds: float, seed: int, anew: bool = False, tell: Callable[[str], None] = lambda _: None
+) -> None:
+    """Fit on a file and write the model's data.
 
     Args:
         anew: Begin the search for scales at ``Scales()`` and ``Shares()``, and not at those of the shipped model, which
             saw all that was published.
+        tell: Called with what is done.
 
     Raises:
-        DataError: when the file is malformed.
+        DataError: when the file is malformed, or has no row to fit on.
     """
     points = read_points(path)
-    parts: dict[str, Known] = {}
-    shares: dict[str, Shares] = {}
-    bounds: dict[str, dict[str, dict[str, float]]] = {}
-    told: list[str] = []
-    usable = {part: mine for part, mine in by_part(points).items() if mine}
-    if not usable:
-        why = next((point.why for point in points if point.why), "no row")
-        raise DataError(f"{path} has no row to fit on: {why}.")
-    out.mkdir(parents=True, exist_ok=True)
-    for part, mine in usable.items():
-        sample = Sample.of(mine)
-        before = _before(part, anew)
-        groups = f"{len(set(sample.devices))} devices and {len(set(sample.models))} models"
-        yield f"{part}: {len(sample.published)} figures of {groups}"
-        scales, shares[part] = tune(sample, *before, seconds / len(usable), seed, told.append)
-        yield from told[-3:]
-        bounds[part] = conformal(sample, scales, shares[part])
-        parts[part] = Known(rows_of(sample.questions, shares[part]), sample.logs, scales)
-    about = {"figures": sum(len(known.rows) for known in parts.values()), "seed": seed, "level": LEVEL}
-    write(LatencyModel(parts, shares, bounds, about), out)
-    yield f"written: {out / 'latency.npz'}, {out / 'latency.json'}"
-
-
-def _before(part: str, anew: bool) -> tuple[Scales, Shares]:
-    if anew or not (DATA / "latency.json").is_file():
-        return Scales(), Shares()
-    model = read_model(DATA)  # and not the user's own: the search begins at what was shipped
-    return (model.parts[part].scales, model.shares[part]) if part in model.parts else (Scales(), Shares())
+    shipped = not anew and (DATA / "latency.json").is_file()
+    before = read_model(DATA) if shipped else None  # and not the user's own: the search begins at what was shipped
+    if not any(point.question for point in points):
+        raise DataError(f"{path} has no row to fit on: {next(point.why for point in points)}.")
+    out.mkdir(parents=True, exist_ok=True)  # before the search: its minutes are not to be lost
+    found = fit(points, before, seconds, seed, tell)
+    write(found, out)
+    tell(f"written: {out / 'latency.npz'}, {out / 'latency.json'}")

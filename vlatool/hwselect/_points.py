@@ -30,12 +30,15 @@ PRECISIONS = {
 }  # fmt: skip
 RUNTIMES = (
     ("ncnn-vulkan", "ncnn-vulkan"), ("ncnn", "ncnn-cpu"), ("tflite", "tflite-cpu"), ("xnnpack", "tflite-cpu"),
-    ("armnn", "armnn-cpu"), ("tensorrt", "tensorrt"), ("whisper_trt", "tensorrt"), ("openvino.*igpu", "openvino-igpu"),
-    ("openvino.*npu", "openvino-npu"), ("openvino", "openvino-cpu"), (".*inductor cpu", "inductor-cpu"),
+    ("armnn", "armnn-cpu"), ("tensorrt dit_only.*backbone", "torch-cuda"), ("tensorrt", "tensorrt"),
+    ("whisper_trt", "tensorrt"), ("openvino.*igpu", "openvino-igpu"), ("openvino.*npu", "openvino-npu"),
+    ("openvino", "openvino-cpu"), (".*inductor cpu", "inductor-cpu"), ("torch.compile", "torch-cuda, compiled"),
     ("torch|pytorch", "torch-cuda"), ("mlc|nanollm", "mlc"), ("hailort", "hailort"), ("mnn", "mnn-cpu"),
-    ("executorch", "executorch-cpu"), ("onnxruntime-(gpu|cuda)", "onnxruntime-gpu"), ("onnxruntime", "onnxruntime-cpu"),
+    ("executorch", "executorch-cpu"), ("onnxruntime-(gpu|cuda)", "onnxruntime-gpu"),
+    ("onnxruntime", "onnxruntime-cpu"),
 )  # fmt: skip
-"""Beginning of a published runtime's name -> the runtime that its figures count for."""
+"""Beginning of a published runtime's name and the model -> the runtime that its figures count for. "dit_only" leaves
+the backbone to PyTorch, and the 127 ms that are published are PyTorch's."""
 TRAIT_NAMES = (
     ("depthwise", "mobile|shuffle|mnas|efficientnet|ghost|proxyless|blazeface|fastestdet|yolo-fastest|mixnet|fbnet"
                   "|lcnet|tinynet|edgenext|repvit|hardcore|fastvit|convnext|efficientformer|rexnet|semnas|mobilevit|convmixer"
@@ -59,8 +62,9 @@ class Point:
     Args:
         question: What was measured; None when there is no ground to predict it.
         log_ms: Natural logarithm of the milliseconds of one item.
-        group: Name of the device, as held out.
+        group: Name of the board, as held out: see ``TWINS``.
         kind: ``device_class``: cpu, gpu, igpu, npu.
+        model: Name of the model, as held out.
         why: Why there is no question.
     """
 
@@ -111,17 +115,20 @@ def _point(row: Mapping[str, str], where: str) -> Point:
         raise DataError(f"{where}: the metric '{metric}' is unknown; allowed: latency_ms, fps, tokens_per_s.")
     if kind not in ("cpu", "gpu", "igpu", "npu"):
         raise DataError(f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.")
-    blank = Point(None, math.nan, _name(row["device"]), kind, row["model"])
+    board = _name(row["device"])
+    blank = Point(None, math.nan, TWINS.get(board, board), kind, PART.sub("", row["model"]))
     if not (value > 0 and math.isfinite(value)):
         return replace(blank, why="its value is 0, endless or missing: nothing was measured")
     blank = replace(blank, log_ms=math.log(value if metric == "latency_ms" else 1000 / value))
     precision = PRECISIONS.get(row["precision"])
     place = place_of(row)
-    runtime = runtime_of(row["runtime"])
+    runtime = runtime_of(f"{row['runtime']} {row['model']}")
+    if on_processor(row):
+        blank, runtime = replace(blank, kind="cpu"), "ncnn-cpu"
     if precision is None:
         return replace(blank, why=f"the precision '{row['precision']}' is unknown")
     if place is None:
-        return replace(blank, why=f"nothing is known of the device '{row['device']}' ({kind})")
+        return replace(blank, why=f"nothing is known of the device '{row['device']}' ({blank.kind})")
     if not runtime:
         return replace(blank, why=f"the runtime '{row['runtime']}' is unknown")
     if metric == "tokens_per_s" and precision == "int8":
@@ -137,7 +144,7 @@ def _point(row: Mapping[str, str], where: str) -> Point:
 
 
 def runtime_of(name: str) -> str:
-    """Return the runtime that a published name counts for, empty when it is unknown."""
+    """Return the runtime that a published name (and its model) counts for, empty when it is unknown."""
     return next((known for pattern, known in RUNTIMES if re.match(pattern, name.lower())), "")
 
 
@@ -191,22 +198,44 @@ def place_of(row: Mapping[str, str]) -> Place | None:
     """Return what a row was measured on; None when the device is not known."""
     name = _name(row["device"])
     devices = known_devices()
-    found = devices.get((name, row["device_class"])) or devices.get(
-        (name, "gpu" if row["device_class"] == "igpu" else "igpu")
-    )
+    unit = "cpu" if on_processor(row) else row["device_class"]
+    threads = re.search(r"(\d+)t\b", row["runtime"].lower())
+    cluster = re.search(r"powersave=\d", row["runtime"])
+    part = CLUSTERS.get(cluster[0], "") if cluster else ""
+    other = "gpu" if unit == "igpu" else "igpu"
+    places = ((f"{name} {part}", unit), (name, unit), (name, other))
+    found = next((devices[place] for place in places if place in devices), None)
     if found is None:
         return None
     cores, peaks = found.cores, dict(found.peaks)
-    threads = re.search(r"(\d+)t\b", row["runtime"].lower())
-    cluster = re.search(r"powersave=\d", row["runtime"])
     parts = (row.get("power_mode", ""), threads and threads[0], cluster and cluster[0], row.get("batch", ""))
     setting = " ".join(part for part in parts if part)
-    if threads and row["device_class"] == "cpu" and int(threads[1]) < cores:
+    if threads and unit == "cpu" and int(threads[1]) < cores:
         share = int(threads[1]) / cores
         cores, peaks = float(threads[1]), {dtype: peak * share for dtype, peak in peaks.items()}
     if row.get("power_mode") == "MaxQ":
         peaks = {dtype: peak * MAX_Q for dtype, peak in peaks.items()}
-    return replace(found, unit=row["device_class"], cores=cores, peaks=peaks, setting=setting)
+    return replace(found, device=name, unit=unit, cores=cores, peaks=peaks, setting=setting)
+
+
+PART = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
+"""What a name says beside the model's: figures of its parts are held out with it."""
+TWINS = {
+    "jetson-agx-orin": "jetson-agx-orin-64gb", "jetson-orin-nano-8gb-super": "jetson-orin-nano-8gb",
+    "raspberry-pi-5-2.9ghz": "raspberry-pi-5",
+}  # fmt: skip
+"""Name -> the board that it is, overclocked, in another power mode, or named in another way: held out with it."""
+CLUSTERS = {"powersave=1": "little", "powersave=2": "big"}
+"""ncnn's ``powersave`` -> which cores of a processor with two kinds compute (ncnn, ``set_cpu_powersave``)."""
+
+
+def on_processor(row: Mapping[str, str]) -> bool:
+    """Say whether a figure of a GPU is one of the processor.
+
+    ncnn has no Vulkan kernels for int8: the layers run on the processor, and the published figures of both are equal
+    (ResNet-50 with one thread: 107.0 and 106.8 ms on AGX Orin, 374.8 and 370.6 on AGX Xavier, 516 and 517 on Nano).
+    """
+    return row["runtime"].lower().startswith("ncnn-vulkan") and row["precision"] == "int8"
 
 
 MAX_Q = 0.5
@@ -221,7 +250,7 @@ def known_devices() -> dict[tuple[str, str], Place]:
         peaks = {dtype: float(row[dtype]) for dtype in ("float32", "float16", "int8") if row[dtype]}
         found[row["device"].lower(), row["unit"]] = Place(
             row["device"].lower(), row["unit"], float(row["cores"]), float(row["clock_ghz"]), peaks,
-            float(row["bandwidth_gb_s"]),
+            float(row["bandwidth_gb_s"]), isa=row["isa"],
         )  # fmt: skip
     return found
 

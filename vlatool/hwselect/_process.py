@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-KEYS = ("unit", "device", "runtime", "kind", "pair", "setting", "model", "known")
-"""Categories of a row: class of unit; device and unit; runtime; runtime and precision; device, unit, runtime and
-precision; all that and power mode, threads, version; model; model, runtime and precision."""
+KEYS = ("unit", "core", "device", "runtime", "kind", "made", "line", "pair", "setting", "model", "known")
+"""Categories of a row: class of unit; instruction set of its cores; device and unit; runtime; runtime and precision;
+instruction set, runtime and precision; device, unit and runtime; these and precision; all that and power mode, threads,
+version; model; model, runtime and precision."""
 
 
 @dataclass(frozen=True)
@@ -64,19 +65,24 @@ PARTS = tuple(field.name for field in fields(Rows))[1:]
 class Scales:
     """What the fit chooses: standard deviations of the components in log(ms), and lengths.
 
-    The ``*_m`` components vary with the model (its features, ``lengths`` apart), ``unit_d`` with the device.
+    The ``*_m`` components vary with the model (its features, ``lengths`` apart), the ``*_d`` ones with the device.
     """
 
     constant: float = 1.0
     runtime: float = 0.5
     kind: float = 0.3
+    core: float = 0.2
+    made: float = 0.2
     device: float = 0.2
+    line: float = 0.15
     pair: float = 0.15
     setting: float = 0.15
     all_m: float = 0.5
     kind_m: float = 0.4
     unit_d: float = 0.4
+    kind_d: float = 0.2
     unit_m: float = 0.2
+    made_m: float = 0.2
     pair_m: float = 0.2
     setting_m: float = 0.15
     model: float = 0.1
@@ -87,26 +93,49 @@ class Scales:
     length_weights: float = 1.0
     length_layers: float = 1.0
     length_traits: float = 1.0
-    length_device: float = 1.0
+    length_device: float = 3.0
+    length_kind: float = 1.0
+
+
+BLOCK = 32
+"""Rows of the covariance that are made at a time: they stay in the processor's cache."""
 
 
 def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
     """Return the covariance of two sets of rows without noise, (n, m)."""
-
-    def same(name: str) -> Array:
-        return np.asarray(first.keys[name][:, None] == second.keys[name][None])
-
     lengths = np.array([scales.length_macs, scales.length_activations, scales.length_weights, scales.length_layers])
-    distance = _squares(first.model / lengths, second.model / lengths)
-    distance += _squares(first.traits / scales.length_traits, second.traits / scales.length_traits)
-    smooth = 1 / (1 + distance / 2)
-    near = np.exp(-distance / 2)
-    alike = np.exp(-_squares(first.device, second.device) / (2 * scales.length_device**2))
+    models = [np.hstack([rows.model / lengths, rows.traits / scales.length_traits]) for rows in (first, second)]
+    found = np.empty((len(first), len(second)))
+    for begin in range(0, len(first), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        keys = {name: values[part] for name, values in first.keys.items()}
+        smooth, near = _alike(_squares(models[0][part], models[1]))
+        places = _squares(first.device[part], second.device)
+        found[part] = _covariance(keys, second.keys, smooth, near, places, scales)
+    return found
+
+
+def _alike(squares: Array) -> tuple[Array, Array]:
+    """Return how alike models are, with a long tail and with a short one."""
+    return 1 / (1 + squares / 2), np.exp(-squares / 2)
+
+
+def _covariance(
+    first: Mapping[str, Array], second: Mapping[str, Array], smooth: Array, near: Array, places: Array, scales: Scales
+) -> Array:
+    def same(name: str) -> Array:
+        return np.asarray(first[name][:, None] == second[name][None])
+
     found = scales.constant**2 + scales.all_m**2 * smooth
     found += same("runtime") * scales.runtime**2
-    found += same("kind") * (scales.kind**2 + scales.kind_m**2 * smooth)
+    twins = np.exp(places / (-2 * scales.length_kind**2))
+    found += same("kind") * (scales.kind**2 + scales.kind_m**2 * smooth + scales.kind_d**2 * twins)
+    alike = np.exp(places / (-2 * scales.length_device**2))
     found += same("unit") * (scales.unit_d**2 * alike + scales.unit_m**2 * smooth)
+    found += same("core") * scales.core**2
+    found += same("made") * (scales.made**2 + scales.made_m**2 * smooth)
     found += same("device") * scales.device**2
+    found += same("line") * scales.line**2
     found += same("pair") * (scales.pair**2 + scales.pair_m**2 * smooth)
     found += same("setting") * (scales.setting**2 + scales.setting_m**2 * near)
     found += same("model") * scales.model**2

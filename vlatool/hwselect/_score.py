@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError, UsageError
 from vlatool.hwselect._features import rows_of
-from vlatool.hwselect._fit import UNITS, Folds, Sample, Scores, by_part
+from vlatool.hwselect._fit import Scores, by_part
+from vlatool.hwselect._folds import UNITS, Folds, Sample
 from vlatool.hwselect._latency import LEVEL, PLACE, WIDEST, Predicted, no_ground, shipped
 from vlatool.hwselect._points import Point, read_points
 
@@ -44,7 +45,7 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
     whose = f"the model of {own}" if own else "the shipped model"
     if held_out is None:
         found = shipped().predict([point.question for point in points if point.question])
-        return _summary(points, found, whose)
+        return summary(points, found, whose)
     if held_out not in SPLITS:
         raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.")
     shown: list[Point] = []
@@ -57,12 +58,16 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
         drawn = [point for point in points if not point.question or known[point.question].regime != "told"]
         answers += [known[point.question] for point in drawn if point.question]
         shown += drawn
-    how = {
+    return summary(shown, answers, f"{told_as(held_out, seed)}; scales of {whose}")
+
+
+def told_as(held_out: str, seed: int) -> str:
+    """Return what is left out, in words."""
+    return {
         "models": f"{FOLDS} folds of whole models, dealt with seed {seed}",
         "devices": "each device left out whole",
         "calibrated": f"each device left out but for one model, {DRAWS} times, chosen with seed {seed}",
-    }
-    return _summary(shown, answers, f"{how[held_out]}; scales of {whose}")
+    }[held_out]
 
 
 def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, Predicted]:
@@ -81,7 +86,7 @@ def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, 
         scores = Scores.calibrated(sample, folds)
     else:
         error, deviation = folds.without(groups)
-        scores = Scores.of(sample, error, deviation, groups)
+        scores = Scores.of(sample, error, deviation, groups, sample.models if held_out == "models" else None)
     regime = {"models": "known", "devices": "unseen", "calibrated": "calibrated"}[held_out]
     reach = {pair: scores.reach(pair[1], pair[0]) for pair in set(zip(groups, sample.units, strict=True))}
     lonely = _lonely(sample, groups, told)
@@ -109,7 +114,7 @@ def _lonely(sample: Sample, groups: Array, told: Array) -> Array:
     return found
 
 
-def _summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> dict[str, Any]:
+def summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> dict[str, Any]:
     asked = [point for point in points if point.question]
     why: dict[str, int] = {}
     for reason in [point.why for point in points if not point.question] + [each.why for each in answers if each.why]:

@@ -1,0 +1,120 @@
+"""Score the whole way of fitting: scales, figures and intervals are found without what is then predicted."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.errors import DataError, UsageError
+from vlatool.hwselect._fit import fit
+from vlatool.hwselect._latency import LatencyModel, Predicted
+from vlatool.hwselect._points import Point, merged, read_points
+from vlatool.hwselect._score import DRAWS, FOLDS, summary, told_as
+
+Answered = list[tuple[Point, Predicted]]
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def refit_points(
+    path: Path, held_out: str | None, seed: int, seconds: float, tell: Callable[[str, float | None], None]
+) -> dict[str, dict[str, Any]]:
+    """Predict a file's rows with models that were fitted anew without them, in a process for each processor.
+
+    Nothing of what is left out takes part: not in the scales, which begin at built-in values, not in the figures, and
+    not in the intervals.
+
+    Args:
+        path: Published latencies.
+        held_out: ``models``: a tenth of the models at a time; ``devices``: each board.
+        seed: Of the dealing of models, of the search, and of the choice of the models that calibrate.
+        seconds: For the search of each part.
+        tell: Called with what is done and the share of it.
+
+    Returns:
+        ``models``; or ``devices`` and ``calibrated``, where a board is left out but for one of its models.
+
+    Raises:
+        UsageError: when ``held_out`` is none of these.
+        DataError: when the file is malformed, or nothing of it is left to fit on.
+    """
+    if held_out not in KINDS:
+        raise UsageError(f"--held-out is '{held_out}'; with --refit, allowed: {', '.join(KINDS)} (and calibrated).")
+    points = read_points(path)
+    folds = dealt([point for point in points if point.question], held_out, seed)
+    if len(folds) < 2:
+        raise DataError(f"{path} has no two {held_out}: nothing is left to fit on.")
+    answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
+    with single_threads(), ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
+        jobs = [workers.submit(one_fold, points, held, held_out, seed, seconds) for held in folds]
+        for done, job in enumerate(as_completed(jobs), 1):
+            for kind, answers in job.result().items():
+                answered[kind] += answers
+            tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
+    found = {}
+    for kind, answers in answered.items():
+        shown = [point for point, _ in answers] + [point for point in points if not point.question]
+        how = f"{told_as(kind, seed)}; all fitted anew without it, {seconds:g} s each"
+        found[kind] = summary(shown, [answer for _, answer in answers], how)
+    return found
+
+
+KINDS = {"models": ("models",), "devices": ("devices", "calibrated")}
+
+
+@contextlib.contextmanager
+def single_threads() -> Iterator[None]:
+    """Let processes that are started meanwhile compute in one thread: they are as many as there are processors."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def dealt(points: Sequence[Point], held_out: str, seed: int) -> list[frozenset[str]]:
+    """Return the names of the models, or of the boards, that are left out together."""
+    if held_out != "models":
+        return [frozenset({name}) for name in sorted({point.group for point in points})]
+    names = sorted({point.model for point in points})
+    order = np.random.default_rng(seed).permutation(len(names))
+    parts = [frozenset(names[place] for place in order[number::FOLDS]) for number in range(FOLDS)]
+    return [part for part in parts if part]
+
+
+def one_fold(
+    points: Sequence[Point], held: frozenset[str], held_out: str, seed: int, seconds: float
+) -> dict[str, Answered]:
+    """Return what a model that was fitted without some models or boards says of them."""
+
+    def out(point: Point) -> bool:
+        return (point.model if held_out == "models" else point.group) in held
+
+    mine = [point for point in points if out(point) and point.question]
+    model = fit([point for point in points if not out(point)], None, seconds, seed, lambda _: None)
+    found = {held_out: answers(model, mine)}
+    if held_out == "devices":
+        random = np.random.default_rng(seed)
+        names = sorted({point.model for point in mine})
+        found["calibrated"] = []
+        for _ in range(DRAWS):
+            known = names[random.integers(len(names))]
+            measured = merged(point for point in mine if point.model == known)
+            taught = model.conditioned(
+                [(each.question, float(np.exp(each.log_ms))) for each in measured if each.question]
+            )
+            found["calibrated"] += answers(taught, [point for point in mine if point.model != known])
+    return found
+
+
+def answers(model: LatencyModel, points: Sequence[Point]) -> Answered:
+    """Return what a model says of some points."""
+    return list(zip(points, model.predict([point.question for point in points if point.question]), strict=True))
