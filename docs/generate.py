@@ -13,7 +13,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vlatool import errors, manifest, registry, report, spec
+from pydantic import BaseModel
+
+from vlatool import errors, gate, manifest, registry, report, spec
 from vlatool.profile import load_profile, names
 from vlatool.stage import Stage, stage_kinds
 
@@ -31,6 +33,7 @@ def main() -> None:
         "report.md": fields_page("report.json", [report.Report, report.Row, report.Measurement]),
         "errors.md": errors_page(),
         "profiles.md": profiles_page(),
+        "gate.md": gate_page(),
     }  # fmt: skip
     if "--check" not in sys.argv:
         REFERENCE.mkdir(exist_ok=True)
@@ -53,7 +56,20 @@ def stages_page() -> str:
     return "\n".join(parts)
 
 
-def _options(stage: type[Stage]) -> str:
+def gate_page() -> str:
+    """Return a section for each claim of a gate file."""
+    top = "What `vlatool gate` examines ([guide](../guides/gate.md)): `schema: 1`, `baseline: PATH`, and these claims;"
+    off = [
+        f"`{name}`" for name, field in gate.Gate.model_fields.items() if field.default is None and name != "baseline"
+    ]
+    parts = [f"# gate.yaml\n\n{top}\none that is null is not examined. Null when nothing is said: {', '.join(off)}.\n"]
+    for claim in (gate.LatencyClaim, gate.AccuracyClaim, gate.GrowthClaim, gate.DeadlineClaim):
+        names = [name for name, field in gate.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
+        parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")
+    return "\n".join(parts)
+
+
+def _options(stage: type[BaseModel]) -> str:
     rows = ["| option | type | default | meaning |", "|---|---|---|---|"]
     for name, field in stage.model_fields.items():
         kind = str(field.annotation).replace("typing.", "").replace("pathlib._local.", "").replace("pathlib.", "")

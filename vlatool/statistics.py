@@ -80,7 +80,7 @@ def quantile_interval(
         raise ValueError("no samples")
     value = float(ordered[min(count - 1, max(0, math.ceil(quantile * count) - 1))])
     tail = (1 - confidence) / 2
-    below = np.cumsum(_binomial(count, quantile))
+    below = binomial_tail(count, quantile)
     low_rank = int(np.searchsorted(below, tail, side="right")) - 1
     high_rank = int(np.searchsorted(below, 1 - tail, side="left")) + 1
     low = float(ordered[low_rank]) if low_rank >= 0 else None
@@ -88,8 +88,13 @@ def quantile_interval(
     return value, low, high
 
 
-def _binomial(count: int, chance: float) -> NDArray[np.float64]:
-    """Probabilities of 0..count successes, by logarithms so that large counts do not underflow to nothing."""
+def binomial_tail(count: int, chance: float) -> NDArray[np.float64]:
+    """Return the probabilities of at most 0, 1, ... ``count`` successes in ``count`` trials, (count + 1,).
+
+    By logarithms, so that large counts do not underflow to nothing.
+    """
+    steps = np.log(np.arange(1, count + 1))
+    logs = np.concatenate([[0.0], np.cumsum(steps)])  # of the factorials
     ranks = np.arange(count + 1)
-    logs = np.array([math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in ranks])
-    return np.asarray(np.exp(logs + ranks * math.log(chance) + (count - ranks) * math.log1p(-chance)))
+    ways = logs[-1] - logs - logs[::-1]
+    return np.asarray(np.cumsum(np.exp(ways + ranks * math.log(chance) + (count - ranks) * math.log1p(-chance))))

@@ -14,6 +14,7 @@ from vlatool.cli._stages import StageGroup
 from vlatool.cli.compare import compare
 from vlatool.cli.doctor import doctor
 from vlatool.cli.explain import explain
+from vlatool.cli.gate import app as gate
 from vlatool.cli.hwselect import app as hwselect
 from vlatool.cli.inspect import inspect
 from vlatool.cli.optimize import optimize
@@ -67,6 +68,7 @@ app.command("explain")(explain)
 app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
 app.command("simulate")(simulate)
+app.add_typer(gate, name="gate")
 app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")
 app.add_typer(samples, name="samples")

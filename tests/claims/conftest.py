@@ -1,0 +1,33 @@
+"""Processes that are made up: a claim is examined on the log ratios and calls that a test wants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vlatool.benchmark._pairs import Job, Pairs
+from vlatool.claims import _timed
+from vlatool.claims._timed import Timed
+from vlatool.stage import Context
+
+MakeTimed = Callable[..., Timed]
+
+
+@pytest.fixture
+def timed(monkeypatch: pytest.MonkeyPatch) -> MakeTimed:
+    """A function that makes processes: slowdown of the candidate, its milliseconds, spread between processes."""
+
+    def make(slowdown: float = 0.0, ms: float = 5.0, spread: float = 0.02, calls: int = 150) -> Timed:
+        def measured(job: Job) -> Pairs:
+            random = np.random.default_rng(job.seed)
+            base = ms * np.exp(0.05 * random.normal(size=calls))
+            ratio = (1 + slowdown) * math.exp(spread * random.normal())
+            return Pairs(tuple(base.tolist()), tuple((ratio * random.permutation(base)).tolist()), 3)
+
+        monkeypatch.setattr(_timed, "measure_pairs", measured)
+        return Timed(Job("a", "b"), Context())
+
+    return make

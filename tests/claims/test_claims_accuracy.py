@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.claims import accuracy
+from vlatool.claims.accuracy import data_of, examine
+from vlatool.errors import DataError
+from vlatool.gate import AccuracyClaim
+from vlatool.stage import Context
+
+
+def test_a_bundle_is_no_worse_than_itself(float_bundle: Bundle) -> None:
+    found = examine(float_bundle, float_bundle, AccuracyClaim(max_drop=0.0), Context())
+    assert found.verdict == "pass"
+    (measured,) = found.measurements
+    assert (measured.name, measured.value, measured.low, measured.high) == ("recorded_drop", 0, 0, 0)
+    assert "actions away from the expert's: +0.00%" in found.sentence
+
+
+@pytest.mark.parametrize(("off", "verdict"), [(0.0, "pass"), (3.0, "fail")])
+def test_actions_that_leave_the_experts_fail(
+    float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, off: float, verdict: str
+) -> None:
+    real = accuracy.run_recorded
+
+    def run(bundle, recording, indices, engine, context):
+        found = real(float_bundle, recording, indices, engine, context)
+        return found + off if bundle is worse else found
+
+    monkeypatch.setattr(accuracy, "run_recorded", run)
+    worse = Bundle.open(float_bundle.path)
+    assert examine(worse, float_bundle, AccuracyClaim(), Context()).verdict == verdict
+
+
+def test_without_an_expert_the_baselines_actions_are_right(
+    float_bundle: Bundle, int8_bundle: Bundle, tmp_path: Path
+) -> None:
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        np.savez(tmp_path / "own.npz", **{name: stored[name] for name in stored.files if name != "action"})
+    claim = AccuracyClaim(max_drop=1.0, data=tmp_path / "own.npz")
+    found = examine(int8_bundle, float_bundle, claim, Context())
+    assert "actions away from the baseline's:" in found.sentence
+    assert found.measurements[0].value > 0
+    assert examine(float_bundle, float_bundle, claim, Context()).measurements[0].value == 0
+
+
+def test_episodes_are_paired(float_bundle: Bundle, int8_bundle: Bundle, policy_dir: Path) -> None:
+    claim = AccuracyClaim(max_drop=0.5, episodes=8, policy=policy_dir)
+    found = examine(int8_bundle, float_bundle, claim, Context())
+    recorded, loop = found.measurements
+    assert (recorded.name, loop.name, loop.samples) == ("recorded_drop", "success_drop", 8)
+    assert "episodes that fail: +0.00%" in found.sentence
+    strict = examine(int8_bundle, float_bundle, claim.model_copy(update={"max_drop": 0.01}), Context())
+    assert strict.verdict in ("inconclusive", "fail"), "eight episodes do not show that at most 1 % more fail"
+
+
+def test_without_data_and_episodes_there_is_nothing_to_examine(float_bundle: Bundle, tmp_path: Path, resealed) -> None:
+    bare = Bundle.open(shutil.copytree(float_bundle.path, tmp_path / "bare"))
+    shutil.rmtree(bare.path / "data")
+    bare = resealed(bare)
+    with pytest.raises(DataError, match="carries no evaluation data and no episodes") as caught:
+        data_of(bare, AccuracyClaim())
+    assert "accuracy: null" in caught.value.fix
+    assert data_of(bare, AccuracyClaim(episodes=5)) is None
+    assert data_of(bare, AccuracyClaim(data=tmp_path)) == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "wanted"), [(0.0, -0.02, 0.02, 400), (0.02, 0.0, 0.04, 400), (0, 0, 0.1, 10_000)]
+)
+def test_it_says_how_many_would_decide(value: float, low: float, high: float, wanted: int) -> None:
+    told = accuracy._Drop("recorded_drop", "away:", value, low, high, 100).told(0.01)
+    assert told.endswith(f", about {wanted:,} would decide")
+
+
+def test_what_is_decided_needs_no_more() -> None:
+    assert "would decide" not in accuracy._Drop("recorded_drop", "away:", 0.0, -0.01, 0.01, 100).told(0.01)
+    assert "would decide" not in accuracy._Drop("recorded_drop", "away:", 0.01, -0.01, 0.03, 100).told(0.01)

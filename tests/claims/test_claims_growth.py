@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.claims import growth
+from vlatool.claims.growth import examine_memory, examine_size, judged
+from vlatool.gate import GrowthClaim, LatencyClaim
+from vlatool.report import Measurement
+from vlatool.stage import Context
+
+
+@pytest.mark.parametrize(
+    ("mine", "margin", "verdict"), [(110, 0.1, "pass"), (111, 0.1, "fail"), (50, 0.0, "pass"), (100, 0.0, "pass")]
+)
+def test_growth_up_to_the_margin_passes(mine: float, margin: float, verdict: str) -> None:
+    found = judged("memory", 100.0, Measurement("peak_rss", mine, "MB"), GrowthClaim(margin=margin))
+    assert found.verdict == verdict
+    assert found.sentence == f"{mine:.1f} MB, the baseline 100.0 MB ({mine - 100:+.1f}%; allowed: {margin:+.1%})"
+
+
+def test_the_size_is_that_of_the_graphs(float_bundle: Bundle, int8_bundle: Bundle) -> None:
+    sizes = [(bundle.path / "graphs/main.onnx").stat().st_size / 1e6 for bundle in (float_bundle, int8_bundle)]
+    found = examine_size(int8_bundle, float_bundle, GrowthClaim(margin=10))
+    assert found.measurements[0].value == pytest.approx(sizes[1])
+    assert found.verdict == "pass"
+    assert examine_size(float_bundle, float_bundle, GrowthClaim(margin=0)).verdict == "pass"
+
+
+def test_the_memory_is_that_of_fresh_processes(
+    float_bundle: Bundle, int8_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def probed(path, engine, threads):
+        asked.append((path, threads))
+        return {"peak_rss_mb": 90.0 if path == float_bundle.path else 120.0 + len(asked)}
+
+    monkeypatch.setattr(growth, "cold_start", probed)
+    found = examine_memory(int8_bundle, float_bundle, GrowthClaim(margin=0.1), LatencyClaim(threads=2), Context())
+    assert (found.verdict, found.measurements[0].value) == ("fail", 123.0)
+    assert asked == [(path, 2) for _ in range(3) for path in (int8_bundle.path, float_bundle.path)]
+
+
+def test_a_bundle_takes_as_much_as_itself(float_bundle: Bundle) -> None:
+    found = examine_memory(float_bundle, float_bundle, GrowthClaim(margin=0.5), LatencyClaim(), Context())
+    assert found.verdict == "pass"
+    assert found.measurements[0].value > 10

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from vlatool.benchmark._pairs import Pairs
+from vlatool.claims import _timed
+
+QUICK = "{latency: {looks: [10]}, memory: null}"
+
+
+@pytest.fixture
+def slowdown(monkeypatch: pytest.MonkeyPatch):
+    """A function that sets how much slower the candidate seems to be; no process is started."""
+
+    def make(share: float) -> None:
+        monkeypatch.setattr(
+            _timed, "measure_pairs", lambda job: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * job.seed,) * 50, 0)
+        )
+
+    return make
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "own.yaml"
+    path.write_text(QUICK)
+    return path
+
+
+@pytest.mark.parametrize(("share", "code", "word"), [(0.0, 0, "PASS"), (0.3, 1, "FAIL"), (0.0499, 5, "INCONCLUSIVE")])
+def test_the_exit_code_is_the_verdicts(vlatool, float_bundle, slowdown, config, share, code, word) -> None:
+    slowdown(share)
+    got, out, err = vlatool("gate", float_bundle.path, "--baseline", float_bundle.path, "--config", config)
+    assert got == code, err
+    assert out.startswith(word)
+    assert all(len(line) <= 80 for line in out.splitlines())
+    assert "latency: " in out
+
+
+def test_json_junit_and_a_directory_of_reports(vlatool, float_bundle, slowdown, config, tmp_path) -> None:
+    slowdown(0.3)
+    line = ["gate", float_bundle.path, "--baseline", float_bundle.path, "--config", config, "--json",
+            "--junit", tmp_path / "deep/gate.xml", "-o", tmp_path / "out"]  # fmt: skip
+    code, out, _ = vlatool(*line)
+    assert code == 1
+    found = json.loads(out)
+    assert (found["kind"], found["verdict"]) == ("gate", "fail")
+    assert found["command"].startswith("vlatool")
+    assert ElementTree.parse(tmp_path / "deep/gate.xml").getroot().get("failures") == "1"
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.html", "report.md"}
+
+
+def test_a_job_of_github_gets_annotations_and_a_summary(
+    vlatool, float_bundle, slowdown, config, tmp_path, monkeypatch
+) -> None:
+    slowdown(0.3)
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary.md"))
+    (tmp_path / "summary.md").write_text("before\n")
+    code, out, _ = vlatool("gate", float_bundle.path, "--baseline", float_bundle.path, "--config", config)
+    assert code == 1
+    assert out.startswith("::error title=Gate of tiny%3A latency fail::30.0%25 slower")
+    summary = (tmp_path / "summary.md").read_text()
+    assert summary.startswith("before\n### ❌ FAIL: tiny does not keep to: latency.")
+
+
+def test_the_margin_and_the_gate_of_the_directory(vlatool, float_bundle, slowdown, tmp_path, monkeypatch) -> None:
+    slowdown(0.3)
+    monkeypatch.chdir(tmp_path)
+    Path("gate.yaml").write_text(f"{{baseline: {float_bundle.path}, latency: {{looks: [10]}}, memory: null}}")
+    assert vlatool("gate", float_bundle.path)[0] == 1
+    assert vlatool("gate", float_bundle.path, "--margin", 0.5)[0] == 0
+
+
+def test_init_writes_what_the_gate_then_reads(vlatool, float_bundle, slowdown, tmp_path, monkeypatch) -> None:
+    slowdown(0.0)
+    code, out, _ = vlatool("gate", "init", tmp_path, "--baseline", "base", "--candidate", "pol")
+    assert code == 0
+    assert out.splitlines() == [
+        f"written: {tmp_path / 'gate.yaml'}", f"written: {tmp_path / '.github/workflows/policy-gate.yml'}",
+        f"written: {tmp_path / '.gitlab/policy-gate.yml'}",
+        f"next: vlatool gate pol --config {tmp_path / 'gate.yaml'}",
+    ]  # fmt: skip
+    (tmp_path / "base").symlink_to(float_bundle.path)
+    assert vlatool("gate", float_bundle.path, "--config", tmp_path / "gate.yaml")[0] == 0
+    code, _, err = vlatool("gate", "init", tmp_path)
+    assert code == 3
+    assert "gate.yaml exists already" in err
+    assert vlatool("gate", "init", tmp_path, "--force")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "says"),
+    [
+        (["{bundle}"], 2, "There is no baseline."),
+        (["{bundle}", "--baseline", "{tmp}/none"], 3, "none"),
+        (["{tmp}/none", "--baseline", "{bundle}"], 3, "none"),
+        (["{bundle}", "--baseline", "{bundle}", "--config", "{tmp}/none.yaml"], 3, "There is no gate"),
+        (["{bundle}", "--baseline", "{bundle}", "--margin=-1"], 2, "--margin"),
+        (["{bundle}", "--baseline", "{bundle}", "--seed=-1"], 2, "--seed"),
+        (["{bundle}", "--baseline", "{bundle}", "-o", "{tmp}"], 3, "exists already"),
+        (["{bundle}", "--baseline", "{tmp}"], 3, "manifest"),
+        (["{bundle}", "--baselin", "{bundle}"], 2, "--baseline"),
+    ],
+)
+def test_what_is_wrong_is_said(vlatool, float_bundle, tmp_path, monkeypatch, line, code, says) -> None:
+    monkeypatch.chdir(tmp_path)
+    got, out, err = vlatool("gate", *(part.format(bundle=float_bundle.path, tmp=tmp_path) for part in line))
+    assert (got, out) == (code, "")
+    assert says in err
+    assert "Traceback" not in err

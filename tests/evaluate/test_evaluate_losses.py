@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vlatool.evaluate._losses import drop, losses
+from vlatool.spec import TensorSpec
+
+CONTINUOUS = TensorSpec("action", (1, 2, 2), "float32")
+DISCRETE = TensorSpec("action", (1, 10), "int64", kind="discrete", labels=tuple("abcdefghij"))
+
+
+def test_continuous_losses_by_hand() -> None:
+    wanted = np.zeros((2, 2, 2))
+    wanted[..., 0] = [[0, 2], [0, 2]]
+    got = wanted + np.array([0.5, 7.0])
+    assert losses(CONTINUOUS, got, wanted).tolist() == [0.5, 0.5], "an element that never changes does not count"
+    assert losses(CONTINUOUS, np.ones((2, 2, 2)), np.zeros((2, 2, 2))).tolist() == [1, 1], "unless none does"
+
+
+def test_a_longer_chunk_is_compared_as_far_as_both_go() -> None:
+    wanted = np.random.default_rng(0).normal(size=(5, 2, 3))
+    longer = np.concatenate([wanted, np.full((5, 4, 3), 99.0)], axis=1)
+    assert losses(CONTINUOUS, longer, wanted).tolist() == [0] * 5
+
+
+def test_discrete_losses_are_the_share_that_differs() -> None:
+    assert losses(DISCRETE, np.array([1, 2, 3]), np.array([1, 0, 3])).tolist() == [0, 1, 0]
+    pairs = losses(DISCRETE, np.array([[1, 2], [3, 4]]), np.array([[1, 9], [3, 4]]))
+    assert pairs.tolist() == [0.5, 0]
+
+
+def test_the_same_losses_are_no_drop() -> None:
+    off = np.random.default_rng(1).random(50)
+    assert drop(off, off, None, 0.98) == (0, 0, 0)
+
+
+def test_a_drop_has_an_interval_that_holds_it() -> None:
+    random = np.random.default_rng(2)
+    inside = 0
+    for seed in range(100):
+        before = random.random(60)
+        value, low, high = drop(before + 0.1 + 0.2 * random.normal(size=60), before, None, 0.9, seed)
+        assert low <= value <= high
+        inside += low <= 0.1 <= high
+    assert 80 <= inside <= 97
+
+
+def test_samples_of_one_episode_are_no_independent_witnesses() -> None:
+    random = np.random.default_rng(3)
+    episodes = np.repeat(np.arange(6), 50)
+    after = np.repeat(random.normal(size=6), 50)
+    apart, whole = (drop(after, np.zeros(300), groups, 0.95) for groups in (None, episodes))
+    assert whole[2] - whole[1] > 3 * (apart[2] - apart[1])
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_few_wrong_answers_leave_room_for_more(lost: int) -> None:
+    before, after = np.zeros(40), np.zeros(40)
+    after[:lost] = 1
+    value, low, high = drop(after, before, None, 0.98)
+    assert value == lost / 40
+    assert low < value < high, "no change in forty answers is not none in a thousand"

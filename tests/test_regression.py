@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vlatool.regression import LOOKS, Decision, judged, sequential
+
+Source = Callable[[int], float]
+
+
+def noisy(shift: float, seed: int, spread: float = 0.022) -> Source:
+    random = np.random.default_rng(seed)
+    return lambda number: shift + spread * random.standard_t(4) / math.sqrt(2)
+
+
+def verdicts(shift: float, margin: float = 0.05, runs: int = 200) -> dict[str, int]:
+    found = [sequential(noisy(shift, seed), margin)[0].verdict for seed in range(runs)]
+    return {verdict: found.count(verdict) for verdict in ("pass", "fail", "inconclusive")}
+
+
+def test_the_same_thing_twice_passes() -> None:
+    found = verdicts(0.0)
+    assert found["fail"] == 0
+    assert found["inconclusive"] <= 2
+
+
+def test_a_slowdown_beyond_the_margin_fails() -> None:
+    assert verdicts(math.log(1.10))["fail"] >= 198
+    assert verdicts(math.log(1.20)) == {"pass": 0, "fail": 200, "inconclusive": 0}
+
+
+def test_on_the_margin_hardly_anything_is_decided() -> None:
+    found = verdicts(math.log(1.05))
+    assert found["fail"] <= 6, "1 % of 200, and some luck"
+    assert found["pass"] <= 6
+    assert found["inconclusive"] >= 190
+
+
+def test_no_more_processes_are_measured_than_needed() -> None:
+    decision, ratios = sequential(noisy(0.0, 1), 0.05)
+    assert decision.processes == len(ratios) == LOOKS[0]
+    decision, ratios = sequential(noisy(math.log(1.05), 2), 0.05)
+    assert decision.processes == len(ratios) == LOOKS[-1]
+
+
+def test_a_decision_by_hand() -> None:
+    ratios = [0.01 * number for number in range(1, 11)]
+    found = judged(ratios, 0.05)
+    averages = sorted((ratios[i] + ratios[j]) / 2 for i in range(10) for j in range(i, 10))
+    assert found.low == pytest.approx(math.exp(averages[2]))
+    assert found.high == pytest.approx(math.exp(averages[-3]))
+    assert found.ratio == pytest.approx(math.exp(0.055))
+    assert found.spread == pytest.approx(np.std(ratios, ddof=1))
+    assert found.verdict == "inconclusive"
+    assert judged(ratios, 0.2).verdict == "pass"
+    assert judged(ratios, 0.005).verdict == "fail"
+
+
+def test_the_same_ratio_every_time_is_decided_exactly() -> None:
+    same = judged([math.log(1.02)] * 10, 0.05)
+    assert (same.verdict, same.spread) == ("pass", 0)
+    assert same.detectable == pytest.approx(0.05)
+    assert same.wanted == 0
+
+
+def test_it_says_what_it_could_have_found() -> None:
+    wide, narrow = (Decision("pass", 1.0, 0.98, 1.02, 0.05, 10, spread) for spread in (0.05, 0.01))
+    assert wide.detectable > narrow.detectable > 0.05
+    more = Decision("pass", 1.0, 0.98, 1.02, 0.05, 40, 0.05)
+    assert more.detectable < wide.detectable
+    caught = sum(
+        judged([noisy(math.log1p(narrow.detectable), seed, 0.01)(0) for seed in range(k, k + 10)], 0.05).verdict
+        == "fail"
+        for k in range(0, 2000, 10)
+    )
+    assert caught > 160, "nearly as often as it says"
+
+
+def test_it_says_how_many_processes_would_decide() -> None:
+    near, far = (Decision("inconclusive", ratio, 0.9, 1.2, 0.05, 40, 0.03) for ratio in (1.045, 1.02))
+    assert near.wanted > far.wanted > 40
+    assert Decision("inconclusive", 1.05, 0.9, 1.2, 0.05, 40, 0.03).wanted == 1_000_000
+    assert Decision("fail", 1.2, 1.1, 1.3, 0.05, 40, 0.03).wanted == 0
+
+
+@pytest.mark.parametrize("looks", [(), (5,), (20, 10), (10, 10), (8, 20, 40)])
+def test_looks_that_decide_nothing_are_refused(looks: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="allowed: ascending numbers from"):
+        sequential(noisy(0, 0), 0.05, looks)
+
+
+@pytest.mark.parametrize("margin", [-1, -2, math.nan])
+def test_a_margin_that_is_none_is_refused(margin: float) -> None:
+    with pytest.raises(ValueError, match="the margin is"):
+        judged([0.0] * 10, margin)

@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+
+from vlatool.benchmark._pairs import Job, Pairs
+from vlatool.bundle import Bundle
+from vlatool.claims import _timed
+from vlatool.errors import BundleError, DataError
+from vlatool.gate import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
+from vlatool.report import Report
+from vlatool.run_gate import run_gate
+from vlatool.stage import Context
+
+QUICK = Gate(memory=None, latency=LatencyClaim(looks=(10,)))
+
+
+@pytest.fixture
+def as_fast(monkeypatch: pytest.MonkeyPatch):
+    """A function that sets how much slower the candidate seems to be; no process is started."""
+
+    def make(slowdown: float) -> list[Job]:
+        jobs: list[Job] = []
+
+        def measured(job: Job) -> Pairs:
+            jobs.append(job)
+            shift = math.exp(0.001 * (job.seed % 5 - 2))
+            return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80, 0)
+
+        monkeypatch.setattr(_timed, "measure_pairs", measured)
+        return jobs
+
+    return make
+
+
+@pytest.mark.parametrize(("slowdown", "verdict"), [(0.0, "pass"), (0.2, "fail"), (0.05, "inconclusive")])
+def test_the_worst_claim_decides(float_bundle: Bundle, as_fast, slowdown: float, verdict: str) -> None:
+    as_fast(slowdown)
+    report = run_gate(float_bundle, float_bundle, QUICK, Context(command="vlatool gate x"))
+    assert (report.kind, report.verdict) == ("gate", verdict)
+    claims = {each["claim"]: each["verdict"] for each in report.rows[1].details["claims"]}
+    assert claims == {"size": "pass", "accuracy": "pass", "latency": verdict}
+    assert [row.name for row in report.rows] == ["baseline", "candidate"]
+    assert len(report.rows[1].raw["log_ratio"]) == 10
+    assert len(report.rows[0].raw["latency_ms"]) == 800
+    assert report.command == "vlatool gate x"
+    assert Report.from_json(report.to_json()) == report
+
+
+def test_the_summary_begins_with_what_failed(float_bundle: Bundle, int8_bundle: Bundle, as_fast) -> None:
+    as_fast(0.5)
+    gate = QUICK.model_copy(update={"size": GrowthClaim(margin=0), "accuracy": None, "memory": GrowthClaim(margin=9)})
+    report = run_gate(float_bundle, int8_bundle, gate, Context())
+    assert report.summary[0] == "tiny does not keep to: size, latency."
+    assert [line.split(":")[:2] for line in report.summary[1:]] == [
+        ["size", " fail"], ["latency", " fail"], ["memory", " pass"],
+    ]  # fmt: skip
+
+
+def test_every_process_has_its_own_seed_and_both_bundles(float_bundle: Bundle, int8_bundle: Bundle, as_fast) -> None:
+    jobs = as_fast(0.0)
+    claim = LatencyClaim(looks=(10,), pairs=33, threads=2, warmup=3, seconds=4)
+    run_gate(int8_bundle, float_bundle, QUICK.model_copy(update={"latency": claim}), Context(), seed=7)
+    assert [job.seed for job in jobs] == list(range(7, 17))
+    job = jobs[0]
+    assert (job.baseline, job.candidate) == (str(float_bundle.path), str(int8_bundle.path))
+    assert (job.pairs, job.threads, job.warmup, job.seconds) == (33, 2, 3, 4)
+
+
+def test_a_deadline_needs_no_claim_about_the_median(float_bundle: Bundle, as_fast) -> None:
+    as_fast(0.0)
+    gate = Gate(latency=None, accuracy=None, memory=None, size=None, deadline=DeadlineClaim(ms=3, percent=90))
+    report = run_gate(float_bundle, float_bundle, gate, Context())
+    assert report.verdict == "pass"
+    assert len(report.rows[1].raw["latency_ms"]) == 80
+
+
+def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
+    """Ten processes, each with the same bundle twice; no verdict is asked for, for this machine may be busy."""
+    gate = Gate(latency=LatencyClaim(looks=(10,), pairs=30, margin=1.0), memory=GrowthClaim(margin=1.0))
+    report = run_gate(float_bundle, float_bundle, gate, Context())
+    measured = {each.name: each for each in report.rows[1].measurements}
+    assert set(measured) == {"latency_p50", "peak_rss", "size", "recorded_drop", "latency_ratio"}
+    assert measured["latency_ratio"].low <= measured["latency_ratio"].value <= measured["latency_ratio"].high
+    assert report.verdict in ("pass", "inconclusive", "fail")
+    json.loads(report.to_json())
+
+
+def test_bundles_of_other_policies_are_refused(float_bundle: Bundle, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(float_bundle.path, tmp_path / "other"))
+    manifest = json.loads((other / "manifest.json").read_text())
+    manifest["spec"]["inputs"][0]["shape"] = [1, 9, 8, 3]
+    (other / "manifest.json").write_text(json.dumps(manifest))
+    changed = Bundle.open(other, verify=False)
+    with pytest.raises(BundleError, match=r"image is \[1, 9, 8, 3\] in the candidate and \[1, 8, 8, 3\] in"):
+        run_gate(changed, float_bundle, QUICK, Context())
+
+
+def test_a_source_without_graphs_is_refused(source_bundle: Bundle, float_bundle: Bundle) -> None:
+    with pytest.raises(BundleError, match="has no graph to run"):
+        run_gate(source_bundle, float_bundle, QUICK, Context())
+
+
+def test_what_cannot_be_examined_is_said_before_anything_is_measured(
+    float_bundle: Bundle, tmp_path: Path, resealed, as_fast
+) -> None:
+    jobs = as_fast(0.0)
+    bare = Bundle.open(shutil.copytree(float_bundle.path, tmp_path / "bare"))
+    shutil.rmtree(bare.path / "data")
+    with pytest.raises(DataError, match="Accuracy is claimed"):
+        run_gate(resealed(bare), float_bundle, QUICK, Context())
+    assert jobs == []

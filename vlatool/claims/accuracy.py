@@ -1,0 +1,106 @@
+"""The candidate is not worse than the baseline on the same recorded observations, or in the same episodes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vlatool.bundle import Bundle
+from vlatool.claims._found import CONFIDENCE, Found, worst
+from vlatool.data import read_recording
+from vlatool.errors import DataError
+from vlatool.evaluate._losses import drop, losses
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.evaluate.recorded import EVALUATION, run_recorded
+from vlatool.gate import AccuracyClaim
+from vlatool.report import Measurement
+from vlatool.stage import Context
+from vlatool.statistics import paired_drop
+
+MOST_SAMPLES = 100_000
+
+
+@dataclass(frozen=True)
+class _Drop:
+    name: str
+    words: str
+    value: float
+    low: float
+    high: float
+    samples: int
+
+    def verdict(self, allowed: float) -> str:
+        return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
+
+    def told(self, allowed: float) -> str:
+        words = f"{self.words} {self.value:+.2%} ({self.low:+.2%} to {self.high:+.2%}, {self.samples} of them; "
+        words += f"allowed: {allowed:+.2%})"
+        gap = abs(allowed - self.value)
+        if self.verdict(allowed) == "inconclusive" and gap:  # an interval narrows with the root of the number
+            reach = (self.high - self.value) if self.value < allowed else (self.value - self.low)
+            words += f", about {max(self.samples + 1, math.ceil(self.samples * (reach / gap) ** 2)):,} would decide"
+        return words
+
+
+def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context) -> Found:
+    """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
+
+    Raises:
+        DataError: when there is neither.
+    """
+    drops: list[_Drop] = []
+    if (data := data_of(candidate, claim)) is not None:
+        drops.append(_recorded(candidate, baseline, data, context))
+    if claim.episodes:
+        drops.append(_closed_loop(candidate, baseline, claim, context))
+    said = [each.told(claim.max_drop) for each in drops]
+    measured = tuple(
+        Measurement(each.name, each.value, "1", samples=each.samples, low=each.low, high=each.high,
+                    confidence=CONFIDENCE, note=each.words)
+        for each in drops
+    )  # fmt: skip
+    return Found("accuracy", worst(each.verdict(claim.max_drop) for each in drops), "; ".join(said), measured)
+
+
+def data_of(candidate: Bundle, claim: AccuracyClaim) -> Path | None:
+    """Return the recorded observations that the claim is examined on, None for the closed loop alone.
+
+    Raises:
+        DataError: when there are none and no episodes are asked for.
+    """
+    own = candidate.path / EVALUATION if EVALUATION in candidate.manifest.files else None
+    if (found := claim.data or own) is None and not claim.episodes:
+        raise DataError(
+            f"Accuracy is claimed, but {candidate.path} carries no evaluation data and no episodes are asked for.",
+            "name recorded data (accuracy: data) or episodes in the gate, or set accuracy: null",
+        )
+    return found
+
+
+def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context) -> _Drop:
+    stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy)
+    stage.check(candidate, None)
+    before, after = (row.raw["success"] for row in stage.run(candidate, context).rows)
+    lost = sum(one > two for one, two in zip(before, after, strict=True))
+    won = sum(one < two for one, two in zip(before, after, strict=True))
+    value, low, high = paired_drop(lost, won, len(before), CONFIDENCE)
+    return _Drop("success_drop", "episodes that fail:", value, low, high, len(before))
+
+
+def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context) -> _Drop:
+    recording = read_recording(data, candidate.manifest.spec)
+    indices = recording.spread(MOST_SAMPLES)
+    action = candidate.manifest.spec.action
+    mine, theirs = (run_recorded(bundle, recording, indices, "", context) for bundle in (candidate, baseline))
+    episodes = None if recording.episodes is None else recording.episodes[indices]
+    if recording.actions is None:  # nobody says what is right: the baseline's own actions are
+        off, before = losses(action, mine, theirs), np.zeros(len(indices))
+        words = "actions away from the baseline's:"
+    else:
+        expert = recording.actions[indices]
+        off, before = losses(action, mine, expert), losses(action, theirs, expert)
+        words = "actions away from the expert's:"
+    return _Drop("recorded_drop", words, *drop(off, before, episodes, CONFIDENCE), len(indices))

@@ -1,0 +1,124 @@
+"""``vlatool gate``."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vlatool.bundle import Bundle
+from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
+from vlatool.cli._default import group_with
+from vlatool.cli._run import is_bundle
+from vlatool.errors import OutputError, UsageError
+from vlatool.files import whole_file
+
+if TYPE_CHECKING:
+    from vlatool.gate import Gate
+    from vlatool.report import Report
+
+app = typer.Typer(
+    cls=group_with("run"), no_args_is_help=True, rich_markup_mode=None,
+    help="Hold a candidate against a baseline, both measured side by side: vlatool gate CANDIDATE --baseline BUNDLE.",
+)  # fmt: skip
+CONFIG = Path("gate.yaml")
+
+
+@app.command("run")
+def run(
+    candidate: Annotated[str, typer.Argument(help="a bundle, or a policy that is exported first", show_default=False)],
+    baseline: Annotated[Path | None, typer.Option(help="bundle to compare with; the one in the gate if unset")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="the gate (see: vlatool gate init); gate.yaml here, or the defaults, if unset")
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option(min=0, help="largest slowdown of the median, a share (0.05 = 5 %)")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="of the order of loading and calling")] = 0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Measure the baseline anew beside the candidate, and leave with 0 (pass), 1 (fail) or 5 (inconclusive).
+
+    In a job of GitHub Actions it also prints annotations and writes the step summary.
+    """
+    from vlatool.run_gate import run_gate
+
+    gate = _gate(config, margin)
+    base = baseline or gate.baseline
+    if base is None:
+        raise UsageError("There is no baseline.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)")
+    refuse_existing(output, force)
+    with progress(workers or default_workers()) as context:
+        bundle = _opened(candidate, context)
+        report = run_gate(bundle, Bundle.open(base), gate, context, seed)
+    report = replace(report, command=command_line(), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    if junit is not None:
+        _write_junit(report, junit)
+    if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
+        _tell_github(report)
+    show(report, as_json=as_json, out=output, force=force)
+
+
+@app.command("init")
+def init(
+    directory: Annotated[Path, typer.Argument(help="of the repository")] = Path(),
+    baseline: Annotated[Path, typer.Option(help="bundle to compare with, relative to the repository")] = Path(
+        "models/baseline"
+    ),
+    candidate: Annotated[Path, typer.Option(help="what a change makes, relative to the repository")] = Path("policy"),
+    force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
+) -> None:
+    """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
+    from vlatool.gate_files import gate_files
+
+    files = {directory / name: text for name, text in gate_files(baseline.as_posix(), candidate.as_posix()).items()}
+    present = [path for path in files if path.exists()]
+    if present and not force:
+        raise OutputError(f"{present[0]} exists already.", "pass --force to replace it")
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as draft:
+            draft.write_text(text, encoding="utf-8")
+        emit(f"written: {path}\n")
+    emit(f"next: vlatool gate {candidate} --config {directory / CONFIG}\n")
+
+
+def _gate(config: Path | None, margin: float | None) -> Gate:
+    from vlatool.gate import Gate, LatencyClaim, read_gate
+
+    gate = read_gate(config or CONFIG) if config or CONFIG.is_file() else Gate()
+    if margin is None:
+        return gate
+    return gate.model_copy(update={"latency": (gate.latency or LatencyClaim()).model_copy(update={"margin": margin})})
+
+
+def _opened(candidate: str, context: object) -> Bundle:
+    from vlatool.launch import cache_directory
+    from vlatool.pipeline import exported
+
+    return Bundle.open(Path(candidate)) if is_bundle(candidate) else exported(candidate, cache_directory(), context)  # type: ignore[arg-type]
+
+
+def _write_junit(report: Report, path: Path) -> None:
+    from vlatool.render import render
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as draft:
+        draft.write_text(render(report, "junit"), encoding="utf-8")
+
+
+def _tell_github(report: Report) -> None:
+    from vlatool.render import render
+
+    emit(render(report, "github"))
+    if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
+        with Path(summary).open("a", encoding="utf-8") as stream:
+            stream.write(render(report, "markdown"))

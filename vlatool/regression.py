@@ -1,0 +1,129 @@
+"""Is B slower than A by more than a margin? Decided from processes that each time both, in as few as suffice.
+
+Each process gives one log ratio. Two questions are asked of their Hodges-Lehmann centre at each look: does its lower
+bound exceed the margin (then the candidate is slower: fail), does its upper bound stay below it (pass)? Neither: more
+processes. The error probability is shared out over the looks (Bonferroni), and the bounds are those of the exact
+signed-rank distribution, so the stated error holds for any symmetric noise however few processes there are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from vlatool.signed_rank import fewest, hodges_lehmann, lower_bound, upper_bound
+
+LOOKS = (10, 20, 40)
+ALPHA = 0.01
+"""Chance of a false verdict over all looks, on either side."""
+POWER = 0.95
+EFFICIENCY = 0.955
+"""Of the signed-rank test against the t-test where the noise is normal (3 / pi)."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the processes say.
+
+    Args:
+        verdict: ``pass``, ``fail`` or ``inconclusive``.
+        ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
+        low, high: What it lies between, each bound at the error of one look.
+        margin: The largest slowdown that passes, a share.
+        processes: How many were measured.
+        spread: Standard deviation of the log ratios of single processes.
+    """
+
+    verdict: str
+    ratio: float
+    low: float
+    high: float
+    margin: float
+    processes: int
+    spread: float
+
+    @property
+    def detectable(self) -> float:
+        """Slowdown, a share, that as many processes with this spread would fail with a chance of ``POWER``."""
+        if self.processes < 2:
+            return math.nan
+        reach = _reach(self.processes) * self.spread / math.sqrt(EFFICIENCY * self.processes)
+        return math.exp(math.log1p(self.margin) + reach) - 1
+
+    @property
+    def wanted(self) -> int:
+        """Processes, all in all, that would decide if the centre is where it seems to be; 0 when it is decided.
+
+        None would do where the centre lies on the margin: then it is a million.
+        """
+        if self.verdict != "inconclusive":
+            return 0
+        gap = abs(math.log(self.ratio) - math.log1p(self.margin))
+        reach = _reach(self.processes) * self.spread
+        return min(1_000_000, max(self.processes + 1, math.ceil((reach / gap) ** 2 / EFFICIENCY) if gap else 1_000_000))
+
+
+def _reach(processes: int) -> float:
+    """Return how many standard errors from the margin a centre is found with ``POWER``.
+
+    By Student's distribution, for the spread itself is estimated (Abramowitz and Stegun, 26.7.5).
+    """
+    z, free = NormalDist().inv_cdf(1 - ALPHA / len(LOOKS)), processes - 1
+    student = z + (z**3 + z) / (4 * free) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * free**2)
+    return student + NormalDist().inv_cdf(POWER)
+
+
+def judged(log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(LOOKS)) -> Decision:
+    """Judge the processes that there are.
+
+    Args:
+        log_ratios: Of each process, natural logarithm of candidate over baseline.
+        margin: The largest slowdown that passes, a share above -1.
+        alpha: Chance of a false verdict of this look, on either side.
+
+    Raises:
+        ValueError: when there is no ratio or one is not finite, or the margin is none.
+    """
+    if not margin > -1:
+        raise ValueError(f"the margin is {margin}; allowed: above -1")
+    low, high = lower_bound(log_ratios, alpha), upper_bound(log_ratios, alpha)
+    limit = math.log1p(margin)
+    verdict = "fail" if low > limit else "pass" if high < limit else "inconclusive"
+    count = len(log_ratios)
+    spread = float(np.std(log_ratios, ddof=1)) if count > 1 else math.nan
+    centre = hodges_lehmann(log_ratios)
+    return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread)
+
+
+def sequential(
+    measure: Callable[[int], float], margin: float, looks: Sequence[int] = LOOKS, alpha: float = ALPHA
+) -> tuple[Decision, list[float]]:
+    """Measure process after process until a look decides, or the last look is over.
+
+    Args:
+        measure: Called with the number of the process, from 0; returns its log ratio.
+        margin: The largest slowdown that passes, a share.
+        looks: After how many processes it is judged, ascending.
+        alpha: Chance of a false verdict over all looks, on either side.
+
+    Returns:
+        The decision, and the log ratio of every process.
+
+    Raises:
+        ValueError: when the looks do not ascend, or the first is too early to decide anything.
+    """
+    least = fewest(alpha / len(looks)) if looks else 1
+    if not looks or list(looks) != sorted(set(looks)) or looks[0] < least:
+        raise ValueError(f"the looks are {tuple(looks)}; allowed: ascending numbers from {least}")
+    found: list[float] = []
+    for look in looks:
+        while len(found) < look:
+            found.append(measure(len(found)))
+        decision = judged(found, margin, alpha / len(looks))
+        if decision.verdict != "inconclusive":
+            break
+    return decision, found

@@ -1,0 +1,107 @@
+"""Hold a candidate against a baseline: every claim of a gate, measured anew with both side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import median
+from typing import Any
+
+from vlatool.benchmark._pairs import Job
+from vlatool.benchmark.latency import busy_warning
+from vlatool.bundle import Bundle
+from vlatool.claims import accuracy, deadline, growth, latency
+from vlatool.claims._found import Found, worst
+from vlatool.claims._timed import Timed
+from vlatool.errors import BundleError
+from vlatool.gate import Gate, LatencyClaim
+from vlatool.host import fingerprint
+from vlatool.report import Measurement, Report, Row
+from vlatool.stage import Context
+
+KIND = "gate"
+
+
+def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, seed: int = 0) -> Report:
+    """Examine every claim of a gate; what is cheap first.
+
+    Args:
+        candidate, baseline: Bundles with graphs, of one spec.
+        gate: What is claimed.
+        context: Progress and workers.
+        seed: Of the order in which bundles are loaded and called.
+
+    Raises:
+        BundleError: when a bundle has no graph, or the two have other inputs or outputs.
+        DataError: when accuracy is claimed and there is nothing to measure it on.
+        GraphError: when a bundle cannot be run.
+    """
+    _check(candidate, baseline, gate)
+    host = fingerprint()  # before the run itself loads the machine
+    how = gate.latency or LatencyClaim()
+    paths = (str(baseline.path), str(candidate.path))
+    timed = Timed(Job(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed), context)
+    found: list[Found] = []
+    if gate.size:
+        found.append(growth.examine_size(candidate, baseline, gate.size))
+    if gate.memory:
+        found.append(growth.examine_memory(candidate, baseline, gate.memory, how, context))
+    if gate.accuracy:
+        found.append(accuracy.examine(candidate, baseline, gate.accuracy, context))
+    if gate.latency:
+        found.append(latency.examine(timed, gate.latency))
+    if gate.deadline:
+        found.append(deadline.examine(timed, gate.deadline))
+    name = candidate.manifest.name
+    rows = (_row("baseline", baseline, timed, ()), _row("candidate", candidate, timed, found))
+    return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found), _summary(name, found), rows,
+                  command=context.command, environment=host, warnings=busy_warning(host))  # fmt: skip
+
+
+def _check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
+    for bundle in (candidate, baseline):
+        if not bundle.manifest.graphs:
+            raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+    for kind in ("inputs", "outputs"):
+        mine, theirs = (
+            {each.name: (tuple(each.shape), each.kind) for each in getattr(bundle.manifest.spec, kind)}
+            for bundle in (candidate, baseline)
+        )
+        for name in {**theirs, **mine}:
+            if mine.get(name) != theirs.get(name):
+                one, two = (_told(found.get(name)) for found in (mine, theirs))
+                raise BundleError(
+                    f"{candidate.path} and {baseline.path} are no versions of one policy: {kind[:-1]} {name} is "
+                    f"{one} in the candidate and {two} in the baseline."
+                )
+    if gate.accuracy:
+        accuracy.data_of(candidate, gate.accuracy)
+
+
+def _told(tensor: tuple[tuple[Any, ...], str] | None) -> str:
+    return "absent" if tensor is None else f"{list(tensor[0])}"
+
+
+def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row:
+    calls = timed.calls(name)
+    measured = [Measurement("latency_p50", median(calls), "ms", samples=len(calls))] if calls else []
+    measured += [measurement for each in found for measurement in each.measurements]
+    raw = {"latency_ms": calls} if calls else {}
+    details = {}
+    if found:
+        raw |= {"log_ratio": [pairs.log_ratio for pairs in timed.pairs]} if calls else {}
+        details = {"claims": [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]}
+    role = "subject" if found else "baseline"
+    return Row(name, role, f"{bundle.manifest.name}, {bundle.hash[:19]}", tuple(measured), raw, details)
+
+
+def _summary(name: str, found: Sequence[Found]) -> tuple[str, ...]:
+    """Return the result, then every claim in a sentence, those that failed first."""
+    order = ("fail", "inconclusive", "pass")
+    named = {verdict: ", ".join(each.claim for each in found if each.verdict == verdict) for verdict in order}
+    first = {
+        "pass": f"{name} keeps to every claim: {named['pass']}.",
+        "fail": f"{name} does not keep to: {named['fail']}.",
+        "inconclusive": f"The samples cannot decide about {named['inconclusive']} of {name}.",
+    }[worst(each.verdict for each in found)]
+    said = sorted(found, key=lambda each: order.index(each.verdict))
+    return (first, *(f"{each.claim}: {each.verdict}: {each.sentence}." for each in said))
