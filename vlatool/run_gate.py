@@ -52,7 +52,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     if gate.deadline:
         found.append(deadline.examine(timed, gate.deadline))
     name = candidate.manifest.name
-    rows = (_row("baseline", baseline, timed, ()), _row("candidate", candidate, timed, found))
+    rows = (_row("baseline", baseline, timed, found), _row("candidate", candidate, timed, found))
     return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found), _summary(name, found), rows,
                   command=context.command, environment=host, warnings=busy_warning(host))  # fmt: skip
 
@@ -84,14 +84,15 @@ def _told(tensor: tuple[tuple[Any, ...], str] | None) -> str:
 def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row:
     calls = timed.calls(name)
     measured = [Measurement("latency_p50", median(calls), "ms", samples=len(calls))] if calls else []
-    measured += [measurement for each in found for measurement in each.measurements]
     raw = {"latency_ms": calls} if calls else {}
-    details = {}
-    if found:
-        raw |= {"log_ratio": [pairs.log_ratio for pairs in timed.pairs]} if calls else {}
-        details = {"claims": [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]}
-    role = "subject" if found else "baseline"
-    return Row(name, role, f"{bundle.manifest.name}, {bundle.hash[:19]}", tuple(measured), raw, details)
+    reason = f"{bundle.manifest.name}, {bundle.hash[:19]}"
+    if name == "baseline":
+        measured += [each for claim in found for each in claim.baseline]
+        return Row(name, "baseline", reason, tuple(measured), raw)
+    measured += [each for claim in found for each in claim.measurements]
+    raw |= {"log_ratio": [pairs.log_ratio for pairs in timed.pairs]} if calls else {}
+    claims = [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]
+    return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
 
 
 def _summary(name: str, found: Sequence[Found]) -> tuple[str, ...]:

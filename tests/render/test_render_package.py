@@ -154,3 +154,12 @@ def test_repeated_numbers_of_another_profile_stay_with_it() -> None:
     text = render(report, "markdown")
     assert text.index("1.00 ms") < text.index("Predicted for b") < text.index("2.00 ms")
     assert "Nothing was measured" in text
+
+
+def test_one_bound_alone_is_shown_as_one() -> None:
+    full = _format.full
+    assert full(Measurement("latency_p99", 10.2, "ms", samples=900, high=14.31, confidence=0.99)) == (
+        "10.2 ms (99 %: ≤ 14.3, n = 900)"
+    )
+    assert full(Measurement("success", 0.9, "1", low=0.85)) == "90.0 % (≥ 85.0)"
+    assert full(Measurement("latency_max", 10.2, "ms")) == "10.2 ms"

@@ -21,12 +21,14 @@ class Found:
         verdict: ``pass``, ``fail`` or ``inconclusive``.
         sentence: In words, without a full stop.
         measurements: For the candidate's row.
+        baseline: For the baseline's row.
     """
 
     claim: str
     verdict: str
     sentence: str
     measurements: tuple[Measurement, ...] = ()
+    baseline: tuple[Measurement, ...] = ()
 
 
 def worst(verdicts: Iterable[str]) -> str:

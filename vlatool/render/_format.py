@@ -152,11 +152,18 @@ def value(measurement: Measurement) -> str:
 
 
 def interval(measurement: Measurement) -> str:
-    """Return ``97.4–99.0``, in the unit and with the decimals of the value; nothing when there is no interval."""
+    """Return ``97.4–99.0``, ``≤ 99.0`` or ``≥ 97.4``, in the unit and with the decimals of the value.
+
+    Nothing when there is no bound.
+    """
     low, high = measurement.low, measurement.high
-    if low is None or high is None or not measurement.known:
+    if not measurement.known:
         return ""
     factor = _factor(measurement)
+    if low is None or high is None:
+        ends = [f"{sign} {fixed(bound * factor, _decimals(measurement, measurement.value * factor))}"
+                for sign, bound in (("≥", low), ("≤", high)) if bound is not None]  # fmt: skip
+        return "".join(ends)
     low, high = low * factor, high * factor
     decimals = _decimals(measurement, measurement.value * factor)
     while decimals < 6 and low != high and round(low, decimals) == round(high, decimals):
