@@ -62,6 +62,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
         ("{schema: 2}", "schema: Input should be less than or equal to 1"),
         ("{latency: {margin: fast}}", "latency.margin: Input should be a valid number"),
         ("{a: [", "is not valid YAML"),
+        ("baseline: 2024-02-30", "is not valid YAML: day is out of range"),
     ],
 )
 def test_what_is_impossible_is_named(tmp_path: Path, text: str, says: str) -> None:

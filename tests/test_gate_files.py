@@ -25,6 +25,8 @@ def test_the_jobs_are_yaml_and_run_the_gate() -> None:
     assert line.startswith("vlatool gate my/policy --config gate.yaml ")
     gitlab = yaml.safe_load(files[".gitlab/policy-gate.yml"])["policy gate"]
     assert line in gitlab["script"]
+    for lines in ([step.get("run", "") for step in steps], gitlab["script"]):
+        assert any(text.startswith('pip install "vlatool[ort,build]>=') for text in lines), "an engine, and YAML"
     assert gitlab["allow_failure"] == {"exit_codes": 5}
     assert gitlab["artifacts"]["reports"]["junit"] == "gate.xml"
 
@@ -36,3 +38,12 @@ def test_the_jobs_use_flags_that_exist() -> None:
     flags = {flag for parameter in group.commands["run"].params for flag in parameter.opts}
     line = next(each for each in gate_files("b", "c")[".gitlab/policy-gate.yml"].splitlines() if "vlatool gate" in each)
     assert {word for word in line.split() if word.startswith("-") and word != "-"} <= flags
+
+
+def test_paths_with_blanks_and_marks_stay_paths(tmp_path: Path) -> None:
+    files = gate_files("my models/a: b # c", "my policy")
+    (tmp_path / "gate.yaml").write_text(files["gate.yaml"])
+    assert read_gate(tmp_path / "gate.yaml").baseline == tmp_path / "my models/a: b # c"
+    gitlab = yaml.safe_load(files[".gitlab/policy-gate.yml"])["policy gate"]
+    assert any("vlatool gate 'my policy' --config" in line for line in gitlab["script"])
+    yaml.safe_load(files[".github/workflows/policy-gate.yml"])

@@ -7,7 +7,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from vlatool.latencies import exceeding, floor, independent, midranks, percentile, proven_above
+from vlatool.latencies import exceeding, floor, independent, intraclass, midranks, percentile, proven_above, worth_of
 
 
 def autoregressive(random: np.random.Generator, count: int, follow: float) -> np.ndarray:
@@ -117,3 +117,34 @@ def test_a_percentile_is_above_when_too_many_calls_are(over: int, percent: float
 def test_nonsense_is_refused(calls: list[float], percent: float) -> None:
     with pytest.raises(ValueError, match=r"sample|percentage"):
         percentile(calls, percent)
+
+
+def several(random: np.random.Generator, processes: int, between: float) -> tuple[np.ndarray, list[int]]:
+    """Calls of processes that are faster or slower altogether, and the process of each."""
+    shifts = np.repeat(between * random.normal(size=processes), 150)
+    return np.exp(shifts + 0.05 * random.normal(size=len(shifts))), np.repeat(np.arange(processes), 150).tolist()
+
+
+@pytest.mark.parametrize("between", [0.0, 0.02, 0.05])
+@pytest.mark.parametrize("percent", [50, 90])
+def test_the_bound_holds_where_processes_differ(between: float, percent: float) -> None:
+    """Of 300 runs 3 are expected to miss, and up to 9 as the effect of 20 processes is estimated; 18 are a fault."""
+    random = np.random.default_rng(7)
+    truth = math.exp(math.hypot(between, 0.05) * NormalDist().inv_cdf(percent / 100))
+    found = [several(random, 20, between) for _ in range(300)]
+    known = [each for calls, places in found if (each := percentile(calls, percent, processes=places)).known]
+    assert len(known) > 200 or between == 0.05, "calls of processes that differ much are worth little"
+    assert sum(each.bound < truth for each in known) < 18
+    assert sum(proven_above(calls, percent, truth, processes=places) for calls, places in found) < 18
+
+
+def test_calls_of_one_process_are_alike_where_processes_differ() -> None:
+    random = np.random.default_rng(8)
+    alike, places = several(random, 20, 0.0)
+    assert worth_of(alike, 0.9, places) == pytest.approx(3000, rel=0.35)
+    apart, places = several(random, 20, 0.2)
+    assert worth_of(apart, 0.5, places) < 60
+    assert worth_of(apart, 0.5, None) > worth_of(apart, 0.5, places)
+    assert intraclass(np.array([1.0, 1.0, 5.0, 5.0]), [0, 0, 1, 1]) == 1.0
+    assert intraclass(np.ones(4), [0, 0, 1, 1]) == 0.0
+    assert intraclass(np.array([1.0, 5.0, 1.0, 5.0]), [0, 0, 1, 1]) < 0

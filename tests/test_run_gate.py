@@ -29,7 +29,7 @@ def as_fast(monkeypatch: pytest.MonkeyPatch):
         def measured(job: Job) -> Pairs:
             jobs.append(job)
             shift = math.exp(0.001 * (job.seed % 5 - 2))
-            return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80, 0)
+            return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80)
 
         monkeypatch.setattr(_timed, "measure_pairs", measured)
         return jobs
@@ -73,10 +73,10 @@ def test_every_process_has_its_own_seed_and_both_bundles(float_bundle: Bundle, i
 
 def test_a_deadline_needs_no_claim_about_the_median(float_bundle: Bundle, as_fast) -> None:
     as_fast(0.0)
-    gate = Gate(latency=None, accuracy=None, memory=None, size=None, deadline=DeadlineClaim(ms=3, percent=90))
+    gate = Gate(latency=None, accuracy=None, memory=None, size=None, deadline=DeadlineClaim(ms=3, percent=50))
     report = run_gate(float_bundle, float_bundle, gate, Context())
     assert report.verdict == "pass"
-    assert len(report.rows[1].raw["latency_ms"]) == 80
+    assert len(report.rows[1].raw["latency_ms"]) >= 10 * 80, "ten processes at least"
 
 
 def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
@@ -91,14 +91,29 @@ def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
     json.loads(report.to_json())
 
 
-def test_bundles_of_other_policies_are_refused(float_bundle: Bundle, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("side", "field", "value", "says"),
+    [
+        ("inputs", "shape", [1, 9, 8, 3], r"input image: shape \[1, 9, 8, 3\] in the candidate, \[1, 8, 8, 3\] in"),
+        ("inputs", "unit", "bgr", r"input image: unit 'bgr' in the candidate, 'rgb' in the baseline"),
+        (
+            "outputs",
+            "labels",
+            ["dy", "dx"],
+            r"output action: labels \['dy', 'dx'\] in the candidate, \['dx', 'dy'\] in",
+        ),
+        ("outputs", "mode", "absolute", "output action: mode 'absolute' in the candidate, 'delta' in the baseline"),
+    ],
+)
+def test_bundles_that_mean_something_else_are_refused(
+    float_bundle: Bundle, tmp_path: Path, side: str, field: str, value: object, says: str
+) -> None:
     other = Path(shutil.copytree(float_bundle.path, tmp_path / "other"))
     manifest = json.loads((other / "manifest.json").read_text())
-    manifest["spec"]["inputs"][0]["shape"] = [1, 9, 8, 3]
+    manifest["spec"][side][0][field] = value
     (other / "manifest.json").write_text(json.dumps(manifest))
-    changed = Bundle.open(other, verify=False)
-    with pytest.raises(BundleError, match=r"image is \[1, 9, 8, 3\] in the candidate and \[1, 8, 8, 3\] in"):
-        run_gate(changed, float_bundle, QUICK, Context())
+    with pytest.raises(BundleError, match=says):
+        run_gate(Bundle.open(other, verify=False), float_bundle, QUICK, Context())
 
 
 def test_a_source_without_graphs_is_refused(source_bundle: Bundle, float_bundle: Bundle) -> None:

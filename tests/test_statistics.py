@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from vlatool.statistics import mcnemar_exact, paired_drop, quantile_interval, wilson
+from vlatool.statistics import mcnemar_exact, paired_drop, quantile_interval, student, wilson
 
 Z95 = 1.959963984540054
 
@@ -150,3 +150,12 @@ def test_a_large_count_does_not_underflow():
 def test_no_samples():
     with pytest.raises(ValueError, match="no samples"):
         quantile_interval([], 0.5)
+
+
+@pytest.mark.parametrize(
+    ("share", "freedom", "value"),
+    [(0.99, 1, 31.8205), (0.975, 2, 4.3027), (0.99, 7, 2.998), (0.995, 19, 2.8609), (0.975, 1000, 1.9623), (0.5, 3, 0)],
+)
+def test_students_quantiles_are_those_of_the_tables(share, freedom, value):
+    assert student(share, freedom) == pytest.approx(value, rel=2e-4, abs=1e-4)
+    assert student(1 - share, freedom) == pytest.approx(-student(share, freedom), abs=1e-3)

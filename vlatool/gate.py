@@ -102,7 +102,7 @@ def read_gate(path: Path) -> Gate:
         raise RecipeError(f"There is no gate {path}.", "write one: vlatool gate init") from error
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"The gate {path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:  # a date that is none is a ValueError
         raise RecipeError(f"The gate {path} is not valid YAML: {' '.join(str(error).split())}.") from error
     if not isinstance(data, dict):
         raise RecipeError(f"The gate {path} must be a mapping; got {type(data).__name__}.")

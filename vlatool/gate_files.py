@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shlex
+
 from vlatool import __version__
 
 GATE = """\
@@ -48,7 +51,9 @@ jobs:
       - uses: actions/setup-python@v5
         with:
           python-version: "3.11"
-      - run: pip install "vlatool[build]>={version}"
+      # ort: the engine; build: YAML and export; text, sim, metaworld: a tokenizer, episodes. From an index or a wheel.
+      - run: pip install "vlatool[ort,build]>={version}"
+      # exit code 5 (inconclusive) makes this job red, too; to let it pass, append: || [ $? -eq 5 ]
       - run: vlatool gate {candidate} --config gate.yaml -o gate-report --junit gate.xml
       - uses: actions/upload-artifact@v4
         if: always()
@@ -60,13 +65,15 @@ jobs:
 """
 
 GITLAB = """\
+# .gitlab-ci.yml must say: include: {{local: .gitlab/policy-gate.yml}}
 policy gate:
   image: python:3.11
   timeout: 1h
   rules:
     - if: $CI_PIPELINE_SOURCE == "merge_request_event"
   script:
-    - pip install "vlatool[build]>={version}"
+    # ort: the engine; build: YAML and export; text, sim, metaworld: a tokenizer, episodes. From your index or a wheel.
+    - pip install "vlatool[ort,build]>={version}"
     - vlatool gate {candidate} --config gate.yaml -o gate-report --junit gate.xml
   allow_failure:
     exit_codes: 5   # inconclusive: shown as a warning
@@ -80,7 +87,7 @@ policy gate:
 
 def gate_files(baseline: str, candidate: str) -> dict[str, str]:
     """Return path -> text of the files, for a baseline and a candidate as paths in the repository."""
-    values = {"baseline": baseline, "candidate": candidate, "version": __version__}
+    values = {"baseline": json.dumps(baseline), "candidate": shlex.quote(candidate), "version": __version__}
     return {
         "gate.yaml": GATE.format(**values),
         ".github/workflows/policy-gate.yml": GITHUB.format(**values),

@@ -55,11 +55,17 @@ class Percentile:
         return f"p{self.percent:g}"
 
 
-def percentile(samples: Sequence[float] | Array, percent: float, confidence: float = CONFIDENCE) -> Percentile:
+def percentile(
+    samples: Sequence[float] | Array,
+    percent: float,
+    confidence: float = CONFIDENCE,
+    processes: Sequence[int] | None = None,
+) -> Percentile:
     """Return a percentile with its upper confidence bound, from dependent calls.
 
     Args:
         samples: In the order in which they were taken, any unit.
+        processes: Which process each call was made in; all in one when None.
         percent: Above 0 and below 100.
         confidence: Of the bound, one-sided.
 
@@ -76,7 +82,7 @@ def percentile(samples: Sequence[float] | Array, percent: float, confidence: flo
     if not len(series) or not np.isfinite(series).all():
         raise ValueError("no sample, or one that is not finite")
     share = percent / 100
-    worth = independent(series)
+    worth = worth_of(series, share, processes)
     needed = floor(share, confidence)
     if worth < needed:
         return Percentile(percent, math.nan, math.nan, needed, worth, confidence)
@@ -89,7 +95,11 @@ def percentile(samples: Sequence[float] | Array, percent: float, confidence: flo
 
 
 def proven_above(
-    samples: Sequence[float] | Array, percent: float, limit: float, confidence: float = CONFIDENCE
+    samples: Sequence[float] | Array,
+    percent: float,
+    limit: float,
+    confidence: float = CONFIDENCE,
+    processes: Sequence[int] | None = None,
 ) -> bool:
     """Say whether a percentile of all calls is above a limit, with confidence: too many of these calls were.
 
@@ -98,7 +108,7 @@ def proven_above(
         (True, False)
     """
     series = np.asarray(samples, np.float64)
-    worth = int(independent(series))
+    worth = int(worth_of(series, percent / 100, processes))
     over = math.floor(float((series > limit).mean()) * worth)
     if not over:
         return False
@@ -146,6 +156,34 @@ def independent(series: Array) -> float:
     if follow < CHANCE / math.sqrt(count):  # as independent calls give it, too
         return float(count)
     return count * (1 - follow) / (1 + follow)
+
+
+def worth_of(series: Array, share: float, processes: Sequence[int] | None) -> float:
+    """Return how many independent calls a series of several processes is worth, for a percentile.
+
+    The smaller of two: by how calls follow each other, and by how far whole processes are apart, which a call's
+    neighbours do not show (Kish's design effect 1 + (m - 1) rho; rho by one-way analysis of variance of which calls
+    exceed the percentile).
+    """
+    worth = independent(series)
+    if processes is None or len(set(processes)) < 2:
+        return worth
+    exceeds = (series > np.quantile(series, share)).astype(np.float64)
+    alike = max(0.0, intraclass(exceeds, processes))
+    each = len(series) / len(set(processes))
+    return min(worth, len(series) / (1 + (each - 1) * alike))
+
+
+def intraclass(values: Array, processes: Sequence[int]) -> float:
+    """Return the intraclass correlation: which share of the variance lies between processes (Fisher 1925)."""
+    _, place, counts = np.unique(np.asarray(processes), return_inverse=True, return_counts=True)
+    groups, total = len(counts), len(values)
+    means = np.bincount(place, values) / counts
+    within = float(((values - means[place]) ** 2).sum()) / max(1, total - groups)
+    between = float((counts * (means - values.mean()) ** 2).sum()) / (groups - 1)
+    each = (total - float((counts**2).sum()) / total) / (groups - 1)
+    spread = between + (each - 1) * within
+    return (between - within) / spread if spread > 0 else 0.0
 
 
 def midranks(series: Array) -> Array:

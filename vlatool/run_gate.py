@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from statistics import median
-from typing import Any
 
 from vlatool.benchmark._pairs import Job
 from vlatool.benchmark.latency import busy_warning
@@ -16,6 +15,7 @@ from vlatool.errors import BundleError
 from vlatool.gate import Gate, LatencyClaim
 from vlatool.host import fingerprint
 from vlatool.report import Measurement, Report, Row
+from vlatool.spec import TensorSpec
 from vlatool.stage import Context
 
 KIND = "gate"
@@ -63,22 +63,28 @@ def _check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
             raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
     for kind in ("inputs", "outputs"):
         mine, theirs = (
-            {each.name: (tuple(each.shape), each.kind) for each in getattr(bundle.manifest.spec, kind)}
-            for bundle in (candidate, baseline)
+            {each.name: each for each in getattr(bundle.manifest.spec, kind)} for bundle in (candidate, baseline)
         )
         for name in {**theirs, **mine}:
-            if mine.get(name) != theirs.get(name):
-                one, two = (_told(found.get(name)) for found in (mine, theirs))
-                raise BundleError(
-                    f"{candidate.path} and {baseline.path} are no versions of one policy: {kind[:-1]} {name} is "
-                    f"{one} in the candidate and {two} in the baseline."
-                )
+            if differs := _differs(mine.get(name), theirs.get(name)):
+                both = f"{candidate.path} and {baseline.path} are no versions of one policy"
+                raise BundleError(f"{both}: {kind[:-1]} {name}: {differs}.")
     if gate.accuracy:
         accuracy.data_of(candidate, gate.accuracy)
 
 
-def _told(tensor: tuple[tuple[Any, ...], str] | None) -> str:
-    return "absent" if tensor is None else f"{list(tensor[0])}"
+MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode")
+"""What a robot relies on; files of statistics and tokenizers may differ."""
+
+
+def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
+    """Return in words how an input or output of the candidate differs from the baseline's; nothing when it does not."""
+    if mine is None or theirs is None:
+        return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
+    pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
+    return "; ".join(f"{name} {list(one) if isinstance(one, tuple) else one!r} in the candidate, "
+                     f"{list(two) if isinstance(two, tuple) else two!r} in the baseline"
+                     for name, one, two in pairs if one != two)  # fmt: skip
 
 
 def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row:

@@ -11,7 +11,7 @@ from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements,
 from vlatool.benchmark._probe import cold_start, main, peak_rss_mb
 from vlatool.benchmark.latency import Latency, busy_warning
 from vlatool.bundle import Bundle
-from vlatool.errors import BundleError, GraphError, UsageError
+from vlatool.errors import BundleError, UsageError
 from vlatool.hwselect._workload import workload
 from vlatool.stage import Context
 
@@ -176,7 +176,7 @@ def test_the_probe_prints_one_line_of_json(int8_bundle):
 
 
 def test_the_probe_says_why_a_bundle_does_not_run(tmp_path):
-    with pytest.raises(GraphError, match=r"cannot be run in a fresh process: .*There is no bundle"):
+    with pytest.raises(BundleError, match=r"There is no bundle at .*none"):
         cold_start(tmp_path / "none", "ort_cpu", 1)
 
 

@@ -9,7 +9,7 @@ import pytest
 from vlatool.benchmark import _pairs
 from vlatool.benchmark._pairs import FEWEST, Job, Pairs, measure_pairs, run_job
 from vlatool.bundle import Bundle
-from vlatool.errors import GraphError
+from vlatool.errors import BundleError, GraphError
 
 
 @pytest.fixture
@@ -24,7 +24,6 @@ def test_every_call_of_both_is_kept(job: Job) -> None:
     found = run_job(job)
     assert len(found.baseline_ms) == len(found.candidate_ms) == 40
     assert min(found.baseline_ms + found.candidate_ms) > 0
-    assert found.switches >= 0
 
 
 def test_a_slow_policy_is_called_less_often_but_often_enough(job: Job) -> None:
@@ -39,8 +38,8 @@ def test_a_fresh_process_measures_the_same(job: Job) -> None:
 
 
 def test_the_log_ratio_is_of_medians_and_positive_is_slower() -> None:
-    assert Pairs((1.0, 2.0, 90.0), (3.0, 4.0, 5.0), 0).log_ratio == pytest.approx(math.log(2))
-    assert Pairs((2.0,), (1.0,), 0).log_ratio < 0
+    assert Pairs((1.0, 2.0, 90.0), (3.0, 4.0, 5.0)).log_ratio == pytest.approx(math.log(2))
+    assert Pairs((2.0,), (1.0,)).log_ratio < 0
 
 
 def test_the_order_of_calls_is_drawn(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,7 +67,7 @@ def test_the_order_of_calls_is_drawn(job: Job, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_bundle_that_cannot_run_is_named(job: Job, tmp_path) -> None:
-    with pytest.raises(GraphError, match="cannot be run in a fresh process"):
+    with pytest.raises(BundleError, match=r"There is no bundle at .*none"):
         measure_pairs(Job(**{**vars(job), "candidate": str(tmp_path / "none")}))
 
 

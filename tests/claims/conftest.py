@@ -25,7 +25,7 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> MakeTimed:
             random = np.random.default_rng(job.seed)
             base = ms * np.exp(0.05 * random.normal(size=calls))
             ratio = (1 + slowdown) * math.exp(spread * random.normal())
-            return Pairs(tuple(base.tolist()), tuple((ratio * random.permutation(base)).tolist()), 3)
+            return Pairs(tuple(base.tolist()), tuple((ratio * random.permutation(base)).tolist()))
 
         monkeypatch.setattr(_timed, "measure_pairs", measured)
         return Timed(Job("a", "b"), Context())

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -19,7 +20,7 @@ def test_a_bundle_is_no_worse_than_itself(float_bundle: Bundle) -> None:
     assert found.verdict == "pass"
     (measured,) = found.measurements
     assert (measured.name, measured.value, measured.low, measured.high) == ("recorded_drop", 0, 0, 0)
-    assert "actions away from the expert's: +0.00%" in found.sentence
+    assert "more distance from the expert's actions than the baseline has: +0.00%" in found.sentence
 
 
 @pytest.mark.parametrize(("off", "verdict"), [(0.0, "pass"), (3.0, "fail")])
@@ -44,7 +45,7 @@ def test_without_an_expert_the_baselines_actions_are_right(
         np.savez(tmp_path / "own.npz", **{name: stored[name] for name in stored.files if name != "action"})
     claim = AccuracyClaim(max_drop=1.0, data=tmp_path / "own.npz")
     found = examine(int8_bundle, float_bundle, claim, Context())
-    assert "actions away from the baseline's:" in found.sentence
+    assert "distance from the baseline's actions:" in found.sentence
     assert found.measurements[0].value > 0
     assert examine(float_bundle, float_bundle, claim, Context()).measurements[0].value == 0
 
@@ -54,7 +55,7 @@ def test_episodes_are_paired(float_bundle: Bundle, int8_bundle: Bundle, policy_d
     found = examine(int8_bundle, float_bundle, claim, Context())
     recorded, loop = found.measurements
     assert (recorded.name, loop.name, loop.samples) == ("recorded_drop", "success_drop", 8)
-    assert "episodes that fail: +0.00%" in found.sentence
+    assert "more failed episodes: +0.00%" in found.sentence
     strict = examine(int8_bundle, float_bundle, claim.model_copy(update={"max_drop": 0.01}), Context())
     assert strict.verdict in ("inconclusive", "fail"), "eight episodes do not show that at most 1 % more fail"
 
@@ -81,3 +82,13 @@ def test_it_says_how_many_would_decide(value: float, low: float, high: float, wa
 def test_what_is_decided_needs_no_more() -> None:
     assert "would decide" not in accuracy._Drop("recorded_drop", "away:", 0.0, -0.01, 0.01, 100).told(0.01)
     assert "would decide" not in accuracy._Drop("recorded_drop", "away:", 0.01, -0.01, 0.03, 100).told(0.01)
+
+
+def test_one_recorded_episode_decides_nothing() -> None:
+    told = accuracy._Drop("recorded_drop", "away:", 0.2, -math.inf, math.inf, 60)
+    assert told.verdict(0.01) == "inconclusive"
+    assert told.told(0.01) == (
+        "away: +20.00% (unbounded to unbounded, 60 of them; allowed: +1.00%), of one episode alone, "
+        "which says nothing of others"
+    )
+    assert accuracy.finite(-math.inf) is None

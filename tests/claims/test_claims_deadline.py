@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from vlatool.claims.deadline import MOST, examine
+from vlatool.claims.deadline import LEAST, MOST, examine
 from vlatool.gate import DeadlineClaim
 
 
@@ -24,11 +24,11 @@ def test_near_the_deadline_nothing_is_decided(timed) -> None:
 
 
 def test_processes_are_measured_until_there_are_calls_enough(timed) -> None:
-    processes = timed(calls=150)
-    examine(processes, DeadlineClaim(ms=100, percent=90))
-    few = len(processes.pairs)
+    processes = timed(calls=60)
+    examine(processes, DeadlineClaim(ms=100, percent=50))
+    assert len(processes.pairs) == LEAST, "one process alone says nothing of others"
     examine(processes, DeadlineClaim(ms=100, percent=99))
-    assert few < len(processes.pairs) <= 10
+    assert len(processes.pairs) > LEAST
 
 
 def test_a_percentile_without_calls_enough_is_not_stated(timed) -> None:

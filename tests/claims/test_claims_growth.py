@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from vlatool.bundle import Bundle
 from vlatool.claims import growth
-from vlatool.claims.growth import examine_memory, examine_size, judged
+from vlatool.claims.growth import examine_memory, examine_size, graph_bytes, judged
 from vlatool.gate import GrowthClaim, LatencyClaim
 from vlatool.report import Measurement
 from vlatool.stage import Context
@@ -25,6 +27,14 @@ def test_the_size_is_that_of_the_graphs(float_bundle: Bundle, int8_bundle: Bundl
     assert found.measurements[0].value == pytest.approx(sizes[1])
     assert found.verdict == "pass"
     assert examine_size(float_bundle, float_bundle, GrowthClaim(margin=0)).verdict == "pass"
+
+
+def test_graphs_may_lie_anywhere_in_a_bundle(float_bundle: Bundle) -> None:
+    files = {path.replace("graphs/", "g/"): record for path, record in float_bundle.manifest.files.items()}
+    files["g/main.onnx.data"] = replace(files["g/main.onnx"], bytes=1000)
+    graphs = {"main": replace(float_bundle.manifest.graphs["main"], file="g/main.onnx")}
+    moved = replace(float_bundle, manifest=replace(float_bundle.manifest, files=files, graphs=graphs))
+    assert graph_bytes(moved) == graph_bytes(float_bundle) + 1000 > 1000
 
 
 def test_the_memory_is_that_of_fresh_processes(

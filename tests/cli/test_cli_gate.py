@@ -18,7 +18,7 @@ def slowdown(monkeypatch: pytest.MonkeyPatch):
 
     def make(share: float) -> None:
         monkeypatch.setattr(
-            _timed, "measure_pairs", lambda job: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * job.seed,) * 50, 0)
+            _timed, "measure_pairs", lambda job: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * job.seed,) * 50)
         )
 
     return make
@@ -54,6 +54,27 @@ def test_json_junit_and_a_directory_of_reports(vlatool, float_bundle, slowdown, 
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.html", "report.md"}
 
 
+def test_junit_may_lie_in_the_directory_of_reports(vlatool, float_bundle, slowdown, config, tmp_path) -> None:
+    slowdown(0.3)
+    for force in ([], ["--force"]):
+        line = ["gate", float_bundle.path, "--baseline", float_bundle.path, "--config", config, "-o", tmp_path / "out",
+                "--junit", tmp_path / "out/gate.xml", *force]  # fmt: skip
+        assert vlatool(*line)[0] == 1
+        assert ElementTree.parse(tmp_path / "out/gate.xml").getroot().get("failures") == "1"
+        assert (tmp_path / "out/report.html").is_file()
+
+
+def test_a_step_summary_that_cannot_be_written_is_a_warning(
+    vlatool, float_bundle, slowdown, config, tmp_path, monkeypatch
+) -> None:
+    slowdown(0.0)
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path))
+    code, _, err = vlatool("gate", float_bundle.path, "--baseline", float_bundle.path, "--config", config)
+    assert code == 0
+    assert "warning: the step summary" in err
+
+
 def test_a_job_of_github_gets_annotations_and_a_summary(
     vlatool, float_bundle, slowdown, config, tmp_path, monkeypatch
 ) -> None:
@@ -83,7 +104,8 @@ def test_init_writes_what_the_gate_then_reads(vlatool, float_bundle, slowdown, t
     assert out.splitlines() == [
         f"written: {tmp_path / 'gate.yaml'}", f"written: {tmp_path / '.github/workflows/policy-gate.yml'}",
         f"written: {tmp_path / '.gitlab/policy-gate.yml'}",
-        f"next: vlatool gate pol --config {tmp_path / 'gate.yaml'}",
+        "GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}",
+        f"next: vlatool gate pol   # in {tmp_path}",
     ]  # fmt: skip
     (tmp_path / "base").symlink_to(float_bundle.path)
     assert vlatool("gate", float_bundle.path, "--config", tmp_path / "gate.yaml")[0] == 0
@@ -97,7 +119,10 @@ def test_init_writes_what_the_gate_then_reads(vlatool, float_bundle, slowdown, t
     ("line", "code", "says"),
     [
         (["{bundle}"], 2, "There is no baseline."),
-        (["{bundle}", "--baseline", "{tmp}/none"], 3, "none"),
+        (["{bundle}", "--baseline", "{tmp}/none"], 3, "fix: make one: vlatool export POLICY -o"),
+        (["{bundle}", "--baseline", "{bundle}", "--margin", "inf"], 2, "--margin"),
+        (["{bundle}", "--baseline", "{bundle}", "--junit", "{tmp}"], 3, "is a directory"),
+        (["{bundle}", "--baseline", "{bundle}", "--junit", "{bundle}/manifest.json/g.xml"], 3, "cannot be written"),
         (["{tmp}/none", "--baseline", "{bundle}"], 3, "none"),
         (["{bundle}", "--baseline", "{bundle}", "--config", "{tmp}/none.yaml"], 3, "There is no gate"),
         (["{bundle}", "--baseline", "{bundle}", "--margin=-1"], 2, "--margin"),

@@ -12,8 +12,6 @@ import gc
 import json
 import math
 import random
-import resource
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -22,7 +20,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from vlatool.errors import GraphError
+from vlatool.benchmark._child import answer, ask
 
 WARMUP_MS = 200.0
 """How long each bundle runs before its first call that counts, at least ``Job.warmup`` calls."""
@@ -62,12 +60,10 @@ class Pairs:
 
     Args:
         baseline_ms, candidate_ms: Milliseconds of each call, in the order of the pairs.
-        switches: Involuntary context switches while the pairs ran.
     """
 
     baseline_ms: tuple[float, ...]
     candidate_ms: tuple[float, ...]
-    switches: int
 
     @property
     def log_ratio(self) -> float:
@@ -79,19 +75,11 @@ def measure_pairs(job: Job, timeout: float | None = None) -> Pairs:
     """Measure in a fresh process.
 
     Raises:
-        GraphError: when the process fails or takes longer than ``timeout`` seconds.
+        VlatoolError: what a bundle raises; GraphError when the process ends or takes longer than ``timeout`` seconds.
     """
-    command = [sys.executable, "-m", "vlatool.benchmark._pairs"]
-    line = json.dumps(dataclasses.asdict(job))
-    try:
-        done = subprocess.run(command, input=line, capture_output=True, text=True, check=False, timeout=timeout)
-    except subprocess.TimeoutExpired as error:
-        raise GraphError(f"{job.candidate} beside {job.baseline}: no result after {timeout:g} s.") from error
-    if done.returncode:
-        last = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
-        raise GraphError(f"{job.candidate} beside {job.baseline} cannot be run in a fresh process: {last}")
-    found = json.loads(done.stdout.splitlines()[-1])
-    return Pairs(tuple(found["baseline_ms"]), tuple(found["candidate_ms"]), found["switches"])
+    about = f"{job.candidate} beside {job.baseline}"
+    found = ask("vlatool.benchmark._pairs", (), json.dumps(dataclasses.asdict(job)), about, timeout)
+    return Pairs(tuple(found["baseline_ms"]), tuple(found["candidate_ms"]))
 
 
 def run_job(job: Job) -> Pairs:
@@ -113,7 +101,7 @@ def run_job(job: Job) -> Pairs:
     gc.freeze()
     gc.disable()
     taken: tuple[list[float], list[float]] = ([], [])
-    begun, switches = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw
+    begun = time.monotonic()
     for number in range(job.pairs):
         if number >= FEWEST and time.monotonic() - begun > job.seconds:
             break
@@ -123,8 +111,7 @@ def run_job(job: Job) -> Pairs:
             start = time.perf_counter_ns()
             infer(observation)
             taken[which].append((time.perf_counter_ns() - start) / 1e6)
-    switches = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw - switches
-    return Pairs(tuple(taken[0]), tuple(taken[1]), switches)
+    return Pairs(tuple(taken[0]), tuple(taken[1]))
 
 
 def _warm_up(policy: Any, observations: Sequence[Any], calls: int) -> None:
@@ -135,4 +122,4 @@ def _warm_up(policy: Any, observations: Sequence[Any], calls: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(dataclasses.asdict(run_job(Job(**json.loads(sys.stdin.readline()))))) + "\n")
+    answer(lambda: dataclasses.asdict(run_job(Job(**json.loads(sys.stdin.readline())))))

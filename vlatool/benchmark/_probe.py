@@ -5,15 +5,13 @@
 
 from __future__ import annotations
 
-import json
 import resource
-import subprocess
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import GraphError
+from vlatool.benchmark._child import answer, ask
 
 
 def cold_start(bundle: Path, engine: str, threads: int) -> dict[str, float]:
@@ -24,14 +22,9 @@ def cold_start(bundle: Path, engine: str, threads: int) -> dict[str, float]:
         (10^6 bytes).
 
     Raises:
-        GraphError: when the process fails.
+        VlatoolError: what the bundle raises; GraphError when the process ends in another way.
     """
-    command = [sys.executable, "-m", "vlatool.benchmark._probe", str(bundle), engine, str(threads)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        last = (done.stderr.strip() or "no message").splitlines()[-1]
-        raise GraphError(f"{bundle} cannot be run in a fresh process: {last}")
-    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    found: dict[str, float] = ask("vlatool.benchmark._probe", (str(bundle), engine, str(threads)), "", str(bundle))
     return found
 
 
@@ -69,4 +62,4 @@ def peak_rss_mb(status: Path = Path("/proc/self/status")) -> float:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps(main(sys.argv[1:])) + "\n")
+    answer(lambda: main(sys.argv[1:]))

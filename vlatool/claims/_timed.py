@@ -32,6 +32,10 @@ class Timed:
             self.pairs.append(measure_pairs(replace(self.job, seed=self.job.seed + number)))
         return self.pairs[number].log_ratio
 
+    def processes(self) -> list[int]:
+        """Return the process of each call."""
+        return [number for number, pairs in enumerate(self.pairs) for _ in pairs.candidate_ms]
+
     def calls(self, which: str) -> list[float]:
         """Return the milliseconds of all calls of ``baseline`` or ``candidate``."""
         return [value for pairs in self.pairs for value in getattr(pairs, f"{which}_ms")]

@@ -36,10 +36,14 @@ class _Drop:
         return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
 
     def told(self, allowed: float) -> str:
-        words = f"{self.words} {self.value:+.2%} ({self.low:+.2%} to {self.high:+.2%}, {self.samples} of them; "
-        words += f"allowed: {allowed:+.2%})"
+        ends = " to ".join(f"{end:+.2%}" if math.isfinite(end) else "unbounded" for end in (self.low, self.high))
+        words = f"{self.words} {self.value:+.2%} ({ends}, {self.samples} of them; allowed: {allowed:+.2%})"
         gap = abs(allowed - self.value)
-        if self.verdict(allowed) == "inconclusive" and gap:  # an interval narrows with the root of the number
+        if self.verdict(allowed) != "inconclusive":
+            return words
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            return f"{words}, of one episode alone, which says nothing of others"
+        if gap:  # an interval narrows with the root of the number
             reach = (self.high - self.value) if self.value < allowed else (self.value - self.low)
             words += f", about {max(self.samples + 1, math.ceil(self.samples * (reach / gap) ** 2)):,} would decide"
         return words
@@ -58,11 +62,16 @@ def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: 
         drops.append(_closed_loop(candidate, baseline, claim, context))
     said = [each.told(claim.max_drop) for each in drops]
     measured = tuple(
-        Measurement(each.name, each.value, "1", samples=each.samples, low=each.low, high=each.high,
+        Measurement(each.name, each.value, "1", samples=each.samples, low=finite(each.low), high=finite(each.high),
                     confidence=CONFIDENCE, note=each.words)
         for each in drops
     )  # fmt: skip
     return Found("accuracy", worst(each.verdict(claim.max_drop) for each in drops), "; ".join(said), measured)
+
+
+def finite(bound: float) -> float | None:
+    """Return a bound of an interval; None where there is none."""
+    return bound if math.isfinite(bound) else None
 
 
 def data_of(candidate: Bundle, claim: AccuracyClaim) -> Path | None:
@@ -87,7 +96,7 @@ def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, cont
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
     value, low, high = paired_drop(lost, won, len(before), CONFIDENCE)
-    return _Drop("success_drop", "episodes that fail:", value, low, high, len(before))
+    return _Drop("success_drop", "more failed episodes:", value, low, high, len(before))
 
 
 def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context) -> _Drop:
@@ -98,9 +107,11 @@ def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context)
     episodes = None if recording.episodes is None else recording.episodes[indices]
     if recording.actions is None:  # nobody says what is right: the baseline's own actions are
         off, before = losses(action, mine, theirs), np.zeros(len(indices))
-        words = "actions away from the baseline's:"
+        words = "distance from the baseline's actions:"
     else:
         expert = recording.actions[indices]
         off, before = losses(action, mine, expert), losses(action, theirs, expert)
-        words = "actions away from the expert's:"
-    return _Drop("recorded_drop", words, *drop(off, before, episodes, CONFIDENCE), len(indices))
+        words = "more distance from the expert's actions than the baseline has:"
+    return _Drop(
+        "recorded_drop", words, *drop(off, before, episodes, CONFIDENCE, action.kind == "discrete"), len(indices)
+    )

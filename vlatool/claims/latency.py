@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from vlatool.claims._found import Found
+from vlatool.claims._found import CONFIDENCE, Found
 from vlatool.claims._timed import Timed
 from vlatool.gate import LatencyClaim
-from vlatool.regression import ALPHA, Decision, sequential
+from vlatool.regression import Decision, sequential
 from vlatool.report import Measurement
 
 
@@ -16,7 +16,7 @@ def examine(timed: Timed, claim: LatencyClaim) -> Found:
     decision, ratios = sequential(timed.log_ratio, claim.margin, claim.looks)
     measured = Measurement(
         "latency_ratio", decision.ratio, "x", samples=len(ratios), low=decision.low, high=decision.high,
-        confidence=1 - 2 * ALPHA / len(claim.looks),
+        confidence=CONFIDENCE,
         note="candidate over baseline, fresh processes with both, Hodges-Lehmann",
     )  # fmt: skip
     return Found("latency", decision.verdict, told(decision), (measured,))
@@ -25,9 +25,8 @@ def examine(timed: Timed, claim: LatencyClaim) -> Found:
 def told(decision: Decision) -> str:
     """Return a decision in words: the ratio, what it lies between, and what the processes could have found."""
     words = f"{slower(decision.ratio)} ({change(decision.low)} to {change(decision.high)}, {decision.processes} "
-    words += (
-        f"processes; allowed: {change(1 + decision.margin)}); a slowdown of {decision.detectable:.1%} would be found"
-    )
+    words += f"processes; allowed: {change(1 + decision.margin)}); "
+    words += f"a slowdown of {decision.detectable:.1%} is found 95 times in 100"
     if decision.verdict == "inconclusive":
         words += f", about {decision.wanted} processes would decide"
     return words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -14,7 +15,7 @@ from vlatool.bundle import Bundle
 from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._run import is_bundle
-from vlatool.errors import OutputError, UsageError
+from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files import whole_file
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def run(
         Path | None, typer.Option(help="the gate (see: vlatool gate init); gate.yaml here, or the defaults, if unset")
     ] = None,
     margin: Annotated[
-        float | None, typer.Option(min=0, help="largest slowdown of the median, a share (0.05 = 5 %)")
+        float | None, typer.Option(min=0, max=10, help="largest slowdown of the median, a share (0.05 = 5 %)")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the order of loading and calling")] = 0,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
@@ -55,16 +56,22 @@ def run(
     base = baseline or gate.baseline
     if base is None:
         raise UsageError("There is no baseline.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)")
+    if not base.exists():
+        raise BundleError(f"There is no baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
     refuse_existing(output, force)
+    if junit is not None:
+        _place(junit)
     with progress(workers or default_workers()) as context:
         bundle = _opened(candidate, context)
         report = run_gate(bundle, Bundle.open(base), gate, context, seed)
     report = replace(report, command=command_line(), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
-    if junit is not None:
-        _write_junit(report, junit)
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
         _tell_github(report)
-    show(report, as_json=as_json, out=output, force=force)
+    try:
+        show(report, as_json=as_json, out=output, force=force)
+    finally:  # after the directory of reports, for the file may lie in it
+        if junit is not None:
+            _write_junit(report, junit)
 
 
 @app.command("init")
@@ -88,7 +95,8 @@ def init(
         with whole_file(path) as draft:
             draft.write_text(text, encoding="utf-8")
         emit(f"written: {path}\n")
-    emit(f"next: vlatool gate {candidate} --config {directory / CONFIG}\n")
+    emit("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
+    emit(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")
 
 
 def _gate(config: Path | None, margin: float | None) -> Gate:
@@ -107,6 +115,19 @@ def _opened(candidate: str, context: object) -> Bundle:
     return Bundle.open(Path(candidate)) if is_bundle(candidate) else exported(candidate, cache_directory(), context)  # type: ignore[arg-type]
 
 
+def _place(junit: Path) -> None:
+    """Say before the work that the file cannot be written.
+
+    Raises:
+        OutputError: when it cannot.
+    """
+    if junit.is_dir():
+        raise OutputError(f"--junit {junit} is a directory.", "name a file")
+    above = next(folder for folder in junit.absolute().parents if folder.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK)):
+        raise OutputError(f"--junit {junit} cannot be written: {above} is no directory that may be written to.")
+
+
 def _write_junit(report: Report, path: Path) -> None:
     from vlatool.render import render
 
@@ -120,5 +141,8 @@ def _tell_github(report: Report) -> None:
 
     emit(render(report, "github"))
     if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
-        with Path(summary).open("a", encoding="utf-8") as stream:
-            stream.write(render(report, "markdown"))
+        try:
+            with Path(summary).open("a", encoding="utf-8") as stream:
+                stream.write(render(report, "markdown"))
+        except OSError as error:  # the verdict is worth more
+            typer.echo(f"warning: the step summary {summary} cannot be written: {error.strerror}", err=True)

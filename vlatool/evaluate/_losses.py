@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.spec import TensorSpec
-from vlatool.statistics import paired_drop
+from vlatool.statistics import paired_drop, student
 
 Array = NDArray[Any]
 DRAWS = 4000
@@ -33,18 +33,20 @@ def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
 
 
 def drop(
-    candidate: Array, baseline: Array, episodes: Array | None, confidence: float, seed: int = 0
+    candidate: Array, baseline: Array, episodes: Array | None, confidence: float, answers: bool = False, seed: int = 0
 ) -> tuple[float, float, float]:
     """Return how much more the candidate loses than the baseline on the same samples, with an interval.
 
-    Samples of one episode are alike, so whole episodes are drawn again (cluster bootstrap, Davison and Hinkley 1997,
-    3.8); where nothing differs but a few samples a bootstrap sees too little, so the interval is never narrower than
-    that of as many independent right-or-wrong answers (Agresti and Min).
+    Samples of one episode are alike, so the episode is the unit. The interval is the widest of three: whole episodes
+    drawn again (cluster bootstrap, Davison and Hinkley 1997, 3.8), which is too narrow with few of them; Student's on
+    the episodes' means, endless with one; and, where losses are shares of wrong answers, that of as many pairs of
+    which some got worse and some better (Agresti and Min), for a bootstrap sees nothing in a few changes.
 
     Args:
         candidate, baseline: (N,) losses.
         episodes: (N,) episode of each sample; each sample is its own when None.
         confidence: Of the two-sided interval.
+        answers: Whether losses are shares of wrong answers.
         seed: Of the draws.
 
     Returns:
@@ -53,17 +55,30 @@ def drop(
     difference = np.asarray(candidate, np.float64) - np.asarray(baseline, np.float64)
     groups = np.arange(len(difference)) if episodes is None else np.asarray(episodes)
     _, place = np.unique(groups, return_inverse=True)
-    sums = np.bincount(place, difference)
-    counts = np.bincount(place)
+    sums, counts = np.bincount(place, difference), np.bincount(place)
+    value = float(difference.mean())
+    if not difference.any() and not answers:
+        return value, 0.0, 0.0
+    bounds = [_bootstrap(sums, counts, confidence, seed), _student(sums / counts, value, confidence)]
+    if answers:
+        lost, won = int((difference > 0).sum()), int((difference < 0).sum())
+        bounds.append(paired_drop(lost, won, len(difference), confidence)[1:])
+    return value, min(value, *(low for low, _ in bounds)), max(value, *(high for _, high in bounds))
+
+
+def _bootstrap(sums: Array, counts: Array, confidence: float, seed: int) -> tuple[float, float]:
     random = np.random.default_rng(seed)
     means = np.empty(DRAWS)
     for draw in range(DRAWS):
         drawn = random.integers(len(sums), size=len(sums))
         means[draw] = sums[drawn].sum() / counts[drawn].sum()
-    value = float(difference.mean())
-    low, high = (float(np.quantile(means, part)) for part in ((1 - confidence) / 2, (1 + confidence) / 2))
-    if set(np.unique(candidate)) | set(np.unique(baseline)) <= {0.0, 1.0}:
-        lost, won = int((difference > 0).sum()), int((difference < 0).sum())
-        _, least, most = paired_drop(lost, won, len(difference), confidence)
-        low, high = min(low, least), max(high, most)
-    return value, min(low, value), max(high, value)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+def _student(means: Array, value: float, confidence: float) -> tuple[float, float]:
+    count = len(means)
+    if count < 2:
+        return -np.inf, np.inf
+    half = student((1 + confidence) / 2, count - 1) * float(np.std(means, ddof=1)) / count**0.5
+    return value - half, value + half
