@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from vlatool import host
 from vlatool.errors import MissingExtra, require
+from vlatool.telemetry.rapl import UDEV_RULE
 
 Status = Literal["ok", "warn", "missing"]
 
@@ -39,10 +40,6 @@ PYTHON = (3, 10)
 FREE_GB = 5.0
 """Below this a build (export, several candidates, reports) of a 0.5 GB policy runs out of disk."""
 MEMORY_GB = 2.0
-RAPL_RULE = (
-    'SUBSYSTEM=="powercap", KERNEL=="intel-rapl*", RUN+="/usr/bin/chgrp GROUP /sys/%p/energy_uj", '
-    'RUN+="/usr/bin/chmod g+r /sys/%p/energy_uj"'
-)
 
 
 @dataclass(frozen=True)
@@ -198,7 +195,7 @@ def _rapl(root: Path) -> Iterator[Check]:
             "power RAPL", "ok", "the energy counter of the processor package can be read; it leaves out the board"
         )
     else:
-        fix = f"as root, write into a udev rule, with your group for GROUP: {RAPL_RULE}"
+        fix = f"as root, write into a udev rule, with your group for GROUP: {UDEV_RULE}"
         yield Check("power RAPL", "warn", "the energy counter is there, but only root may read it", fix)
 
 

@@ -22,6 +22,7 @@ from vlatool.cli.profiles import app as profiles
 from vlatool.cli.rebuild import rebuild
 from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
+from vlatool.cli.telemetry import telemetry
 from vlatool.errors import VlatoolError
 
 INTERRUPTED = 130
@@ -68,6 +69,7 @@ app.command("explain")(explain)
 app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
 app.command("simulate")(simulate)
+app.command("telemetry")(telemetry)
 app.add_typer(gate, name="gate")
 app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")

@@ -1,0 +1,75 @@
+"""``vlatool telemetry``."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vlatool.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from vlatool.telemetry import Recorded
+
+LONGEST_S = 86_400.0
+
+
+def telemetry(
+    seconds: Annotated[float, typer.Option(help="how long to watch")] = 2.0,
+    period: Annotated[float, typer.Option(help="seconds between two samples")] = 0.1,
+    root: Annotated[Path, typer.Option(help="file system to read, such as a copied tree")] = Path("/"),
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout, with every sample")] = False,
+) -> None:
+    """Watch what this machine tells of power, energy, temperatures, clocks and throttling, and what it does not."""
+    from vlatool.telemetry import Recorder, open_all
+
+    for name, value in (("seconds", seconds), ("period", period)):
+        if not (math.isfinite(value) and 0 < value <= LONGEST_S):
+            raise UsageError(f"--{name} is {value:g}; allowed: above 0, up to {LONGEST_S:g}.")
+    if not root.is_dir():
+        raise DataError(f"There is no directory {root}.")
+    with Recorder(open_all(root), period) as recorder:
+        time.sleep(seconds)
+    found = recorder.recorded
+    if as_json:
+        typer.echo(json.dumps(plain(found)))
+        return
+    for line in lines(found):
+        typer.echo(line)
+
+
+def plain(found: Recorded) -> dict[str, Any]:
+    """Return what was recorded as JSON values."""
+    return {
+        "seconds": found.seconds,
+        "energy": [asdict(each) for each in found.energy],
+        "throttled": found.throttled,
+        "throttling": list(found.throttling),
+        "gauges": {name: asdict(each) for name, each in found.gauges.items()},
+        "counters": {name: asdict(each) for name, each in found.counters.items()},
+        "unmeasured": [asdict(each) for each in found.absent],
+    }
+
+
+def lines(found: Recorded) -> Iterator[str]:
+    """Return what a person reads: energy first, then every reading, then what is unmeasured and why."""
+    for energy in found.energy:
+        told = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"
+        yield f"{told}: {energy.label} ({energy.source})"
+    said = {None: "nothing on this machine tells", False: "no"}.get(found.throttled, "; ".join(found.throttling))
+    yield f"throttled: {said}"
+    for name, gauge in sorted(found.gauges.items()):
+        span = f" ({gauge.min:.4g} to {gauge.max:.4g})" if gauge.min != gauge.max else ""
+        yield f"  {name}: {gauge.mean:.4g} {gauge.unit}{span}"
+    for name, counter in sorted(found.counters.items()):
+        yield f"  {name}: +{counter.difference:.4g} {counter.unit} in {counter.seconds:.1f} s"
+    if found.absent:
+        yield "unmeasured:"
+    for absent in found.absent:
+        yield f"  {absent.reader}: {absent.reason}"

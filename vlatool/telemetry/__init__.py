@@ -1,0 +1,28 @@
+"""Telemetry of a board: power, energy, temperatures, clocks and throttling beside a run.
+
+One file for each source. ``open_all`` gives the readers of this machine and what it lacks; ``Recorder`` samples them.
+"""
+
+from vlatool.telemetry._open import open_all
+from vlatool.telemetry._reading import Absent, Reader, Reading, Run
+from vlatool.telemetry._summary import Counted, Energy, Gauge, Recorded, Series, collect, summarise
+from vlatool.telemetry._total import Total, totals
+from vlatool.telemetry.recorder import Recorder
+
+__all__ = [
+    "Absent",
+    "Counted",
+    "Energy",
+    "Gauge",
+    "Reader",
+    "Reading",
+    "Recorded",
+    "Recorder",
+    "Run",
+    "Series",
+    "Total",
+    "collect",
+    "open_all",
+    "summarise",
+    "totals",
+]

@@ -1,0 +1,152 @@
+"""What a reader gives: readings with units, or the reason why there are none.
+
+A reading that cannot be taken is left out; it is never 0 and never NaN.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from vlatool.host import ROOT, read_number
+
+Kind = Literal["gauge", "counter"]
+Run = Callable[[Sequence[str]], "str | None"]
+"""Runs a command and returns what it printed; None when it is absent, fails or takes too long."""
+
+WATT = "W"
+JOULE = "J"
+DEGREE = "degC"
+MEGAHERTZ = "MHz"
+MEGABYTE = "MB"
+SECOND = "s"
+SHARE = "share"
+COUNT = "count"
+THROTTLE = "throttle"
+"""Of a counter: throttle events. Of a gauge: 1 while the machine is throttled for this reason, else 0."""
+COMMAND_TIMEOUT_S = 2.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One value at one moment.
+
+    Args:
+        name: Reader and thing, ``ina.VDD_IN``.
+        value: A finite number in ``unit``.
+        unit: ``W``, ``J``, ``degC``, ``MHz``, ``MB`` (10^6 bytes), ``s``, ``share`` (0 to 1), ``count``, ``throttle``.
+        kind: ``gauge``: the value means something. ``counter``: only differences mean something.
+        wraps: The value at which a counter starts again from zero; None when it does not.
+        note: What the number is, in words, where the name does not say it.
+
+    Raises:
+        ValueError: when the value is not finite.
+    """
+
+    name: str
+    value: float
+    unit: str
+    kind: Kind
+    wraps: float | None = None
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.value):
+            raise ValueError(f"the reading '{self.name}' must be finite, got {self.value}")
+
+
+@dataclass(frozen=True)
+class Absent:
+    """What is unmeasured, and why.
+
+    Args:
+        reader: Name of the reader, or of the reading.
+        reason: Why it cannot be read and what to do about it, in words.
+    """
+
+    reader: str
+    reason: str
+
+
+class Reader(ABC):
+    """Reads one source of telemetry; one class in one file, found by its file name."""
+
+    name: ClassVar[str]
+    period_s: ClassVar[float] = 0.0
+    """Seconds between two reads at the least: a reader that starts a process would disturb what is measured."""
+    fallback_for: ClassVar[str] = ""
+    """The reader that this one stands in for; it is opened only when that one is absent."""
+
+    @classmethod
+    @abstractmethod
+    def open(cls, root: Path = ROOT, run: Run | None = None) -> Reader | Absent:
+        """Return a reader of the machine whose file system is below ``root``, or why there is none.
+
+        ``run`` is what runs commands. Without it commands run on this machine, and not at all for another root.
+        """
+
+    @abstractmethod
+    def read(self) -> list[Reading]:
+        """Return what can be read now; less than before when something fails. Never raises."""
+
+    def absent(self) -> list[Absent]:
+        """Return the parts that this source could have and has not."""
+        return []
+
+
+def gauge(name: str, value: float | None, unit: str, note: str = "") -> list[Reading]:
+    """Return one gauge; nothing when there is no finite value."""
+    return _known(name, value, unit, "gauge", None, note)
+
+
+def counter(name: str, value: float | None, unit: str, wraps: float | None = None, note: str = "") -> list[Reading]:
+    """Return one counter; nothing when there is no finite value."""
+    return _known(name, value, unit, "counter", wraps, note)
+
+
+def _known(name: str, value: float | None, unit: str, kind: Kind, wraps: float | None, note: str) -> list[Reading]:
+    if value is None or not math.isfinite(value):
+        return []
+    return [Reading(name, value, unit, kind, wraps, note)]
+
+
+def scaled(root: Path, path: str, factor: float) -> float | None:
+    """Return a file that holds one whole number, times ``factor``; None when there is none."""
+    try:
+        number = read_number(root, path)
+        return None if number is None else number * factor
+    except (ValueError, OverflowError):  # thousands of digits
+        return None
+
+
+def listed(root: Path, folder: str, pattern: str) -> list[str]:
+    """Return the entries of a folder that match, relative to ``root``; ``hwmon2`` comes before ``hwmon10``."""
+    try:
+        found = [path.relative_to(root).as_posix() for path in (root / folder).glob(pattern)]
+    except OSError:
+        return []
+    return sorted(found, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)])
+
+
+def run_command(command: Sequence[str]) -> str | None:
+    """Run a command on this machine for at most two seconds and return what it printed; None when it fails."""
+    try:
+        done = subprocess.run(
+            list(command), stdin=subprocess.DEVNULL, capture_output=True, timeout=COMMAND_TIMEOUT_S, check=False
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.decode("utf-8", "replace") if done.returncode == 0 else None
+
+
+def runner(root: Path, run: Run | None) -> Run:
+    """Return what runs commands for ``root``: ``run`` when given, this machine for its own root, else nothing."""
+    if run is not None:
+        return run
+    return run_command if root == ROOT else lambda command: None

@@ -1,0 +1,129 @@
+"""Power of the rails of a Jetson from its INA3221 and INA238 monitors.
+
+Sources: ``Documentation/hwmon/ina3221.rst`` and ``ina238.rst`` of Linux (volts in mV, current in mA, ``power1_input``
+in uW; inputs 4 to 7 of an INA3221 are shunt voltages), jetson_stats for the paths of JetPack 4 and for the rails.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vlatool.host import ROOT, read_text
+from vlatool.telemetry._reading import WATT, Absent, Reader, Reading, Run, gauge, listed, scaled
+
+HWMON = (
+    ("sys/class/hwmon", "hwmon*"),
+    ("sys/bus/i2c/drivers", "ina3221*/*/hwmon/hwmon*"),
+    ("sys/bus/i2c/drivers", "ina238*/*/hwmon/hwmon*"),
+)
+"""The first place that has monitors is read: the others show the same chips again."""
+IIO = ("sys/bus/i2c/drivers", "ina3221*/*/iio:device*")
+"""JetPack 4: ``rail_name_N`` and ``in_powerN_input`` in mW."""
+CHANNELS = (1, 2, 3)
+NO_RAIL = "NC"
+"""The label of a channel that is not connected."""
+REASON = (
+    "no INA3221 or INA238 power monitor is visible: this is no Jetson, or a container hides it "
+    "(mount /sys read-only); otherwise measure at the supply"
+)
+
+
+@dataclass(frozen=True)
+class _Rail:
+    """The files of one rail: volts and current (mV, mA), or power with its scale to watts."""
+
+    label: str
+    power: str
+    scale: float = 1e-6
+    current: str = ""
+
+    def watts(self, root: Path) -> float | None:
+        power = scaled(root, self.power, self.scale)
+        if not self.current or power is None:
+            return power
+        amperes = scaled(root, self.current, 1e-3)
+        return None if amperes is None else power * amperes
+
+
+class InaReader(Reader):
+    """Power of every labelled rail in watts, as ``ina.LABEL``; a rail of one label on two chips gets an index.
+
+    ``hwmonN`` changes from boot to boot, so chips are found by their name. A current may be below zero: the chips are
+    signed and not calibrated at zero.
+    """
+
+    name = "ina"
+
+    def __init__(self, root: Path, rails: list[_Rail]) -> None:
+        self._root = root
+        self._rails = rails
+
+    @classmethod
+    def open(cls, root: Path = ROOT, run: Run | None = None) -> InaReader | Absent:
+        """Find the rails; absent where there is no monitor or none of its rails can be read."""
+        rails = _numbered(_hwmon(root) or list(_iio(root)))
+        if not rails:
+            return Absent(cls.name, REASON)
+        found = cls(root, rails)
+        if not found.read():
+            return Absent(cls.name, "there are power monitors, but none of their rails can be read; look at dmesg")
+        return found
+
+    def read(self) -> list[Reading]:
+        """Return the power of the rails in watts."""
+        found: list[Reading] = []
+        for rail in self._rails:
+            found += gauge(f"ina.{rail.label}", rail.watts(self._root), WATT)
+        return found
+
+
+def _numbered(rails: list[_Rail]) -> list[_Rail]:
+    """Give the second rail of the same label the index 1, and so on."""
+    seen: Counter[str] = Counter()
+    found = []
+    for rail in rails:
+        index = seen[rail.label]
+        seen[rail.label] += 1
+        label = f"{rail.label}-{index}" if index else rail.label
+        found.append(_Rail(label, rail.power, rail.scale, rail.current))
+    return found
+
+
+def _hwmon(root: Path) -> list[_Rail]:
+    for folder, pattern in HWMON:
+        found = [rail for place in listed(root, folder, pattern) for rail in _chip(root, place)]
+        if found:
+            return found
+    return []
+
+
+def _chip(root: Path, place: str) -> Iterator[_Rail]:
+    chip = read_text(root, f"{place}/name")
+    if chip == "ina3221":
+        for channel in CHANNELS:
+            label = read_text(root, f"{place}/in{channel}_label")
+            if label and label != NO_RAIL:
+                yield _Rail(label, f"{place}/in{channel}_input", 1e-3, f"{place}/curr{channel}_input")
+    elif chip == "ina238" and (root / place / "power1_input").exists():
+        yield _Rail(_label_of_ina238(root, place), f"{place}/power1_input", 1e-6)
+
+
+def _label_of_ina238(root: Path, place: str) -> str:
+    """Take the label of the chip; the one of an AGX Thor without a label is the input rail (jetson_stats #900)."""
+    for name in ("in1_label", "power1_label", "label"):
+        if label := read_text(root, f"{place}/{name}"):
+            return label
+    return "VIN" if "thor" in (read_text(root, "proc/device-tree/model") or "").lower() else "INA238"
+
+
+def _iio(root: Path) -> Iterator[_Rail]:
+    for place in listed(root, *IIO):
+        for path in listed(root, place, "rail_name_*"):
+            label = read_text(root, path)
+            found = re.search(r"rail_name_(\d+)$", path)
+            if found and label and label != NO_RAIL:
+                yield _Rail(label, f"{place}/in_power{found[1]}_input", 1e-3)

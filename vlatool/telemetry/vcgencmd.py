@@ -1,0 +1,111 @@
+"""Temperature, throttling and, on a Raspberry Pi 5, the rails of the power controller, from ``vcgencmd``.
+
+Sources: the vcgencmd page of the Raspberry Pi documentation (bits of ``get_throttled``), and recorded output of
+``pmic_read_adc``. A Raspberry Pi 4 senses no current.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+from vlatool.host import ROOT
+from vlatool.telemetry._reading import DEGREE, THROTTLE, WATT, Absent, Reader, Reading, Run, counter, gauge, runner
+
+BITS = {0: "under-voltage", 1: "arm frequency capped", 2: "throttled", 3: "soft temperature limit"}
+"""What is so now; the same bits from 16 on say that it has been so since the machine started."""
+SINCE_START = 16
+TEMPERATURE = re.compile(r"temp=(-?\d+(?:\.\d+)?)'C")
+THROTTLED = re.compile(r"throttled=0x([0-9a-fA-F]{1,8})\b")
+CURRENT = re.compile(r"^\s*(\w+)_A current\(\d+\)=(\d+(?:\.\d+)?)A\s*$", re.MULTILINE)
+VOLTAGE = re.compile(r"^\s*(\w+)_V volt\(\d+\)=(\d+(?:\.\d+)?)V\s*$", re.MULTILINE)
+REASON = "vcgencmd does not answer: this is no Raspberry Pi, or 'sudo usermod -aG video $USER' and a new login are due"
+NO_CURRENT = "this board senses no current (a Raspberry Pi 4 does not): measure its power at the supply"
+
+
+class VcgencmdReader(Reader):
+    """Temperature (degC), throttling now and since the start of the machine, and watts per rail; once a second.
+
+    The rails leave out what the USB ports and the 5 V pins take, and what the converters lose.
+    """
+
+    name = "vcgencmd"
+    period_s = 1.0
+
+    def __init__(self, run: Run, has_rails: bool, was_throttled: int) -> None:
+        self._run = run
+        self._has_rails = has_rails
+        self._was_throttled = was_throttled
+
+    @classmethod
+    def open(cls, root: Path = ROOT, run: Run | None = None) -> VcgencmdReader | Absent:
+        """Ask for every value once; absent where neither temperature nor throttling is told."""
+        ask = runner(root, run)
+        bits = throttled(ask(("vcgencmd", "get_throttled")) or "")
+        degrees = temperature(ask(("vcgencmd", "measure_temp")) or "")
+        if bits is None and degrees is None:
+            return Absent(cls.name, REASON)
+        rails = pmic_watts(ask(("vcgencmd", "pmic_read_adc")) or "")
+        return cls(ask, bool(rails), (bits or 0) >> SINCE_START)
+
+    def read(self) -> list[Reading]:
+        """Return what vcgencmd says now."""
+        found = gauge("vcgencmd.temperature", temperature(self._ask("measure_temp")), DEGREE)
+        bits = throttled(self._ask("get_throttled"))
+        for bit, words in BITS.items() if bits is not None else ():
+            name = words.replace(" ", "_")
+            found += gauge(f"vcgencmd.{name}", _bit(bits, bit), THROTTLE, words)
+            if not _bit(self._was_throttled, bit):
+                sticky = _bit(bits, bit + SINCE_START)
+                found += counter(f"vcgencmd.{name}_since_start", sticky, THROTTLE, note=words)
+        if self._has_rails:
+            for rail, watts in pmic_watts(self._ask("pmic_read_adc")).items():
+                found += gauge(f"vcgencmd.{rail}", watts, WATT)
+        return found
+
+    def absent(self) -> list[Absent]:
+        """Return the board's missing current sensing, and the reasons that no longer tell anything new."""
+        found = [] if self._has_rails else [Absent("vcgencmd power", NO_CURRENT)]
+        before = [words for bit, words in BITS.items() if _bit(self._was_throttled, bit)]
+        if before:
+            reason = (
+                f"{', '.join(before)} occurred before the recording; these bits stay until a restart, "
+                "so a new event between two samples cannot be seen"
+            )
+            found.append(Absent("vcgencmd since start", reason))
+        return found
+
+    def _ask(self, command: str) -> str:
+        return self._run(("vcgencmd", command)) or ""
+
+
+def _bit(bits: int | None, bit: int) -> int:
+    return (bits or 0) >> bit & 1
+
+
+def temperature(text: str) -> float | None:
+    """Return the degC of ``temp=48.0'C``; None when there is none."""
+    found = TEMPERATURE.search(text)
+    return float(found[1]) if found else None
+
+
+def throttled(text: str) -> int | None:
+    """Return the bits of ``throttled=0x50000``; None when there are none."""
+    found = THROTTLED.search(text)
+    return int(found[1], 16) if found else None
+
+
+def pmic_watts(text: str) -> dict[str, float]:
+    r"""Return the watts of every rail that has both a current and a voltage, paired by name.
+
+    The numbers in brackets are channels of the converter and differ between the two. ``EXT5V`` and ``BATT`` have no
+    current; ``nan`` is left out.
+
+    Example:
+        >>> pmic_watts(" VDD_CORE_A current(7)=2.0A\n VDD_CORE_V volt(15)=0.75V\n BATT_V volt(25)=nanV\n")
+        {'VDD_CORE': 1.5}
+    """
+    volts = {rail: float(value) for rail, value in VOLTAGE.findall(text)}
+    watts = {rail: float(value) * volts[rail] for rail, value in CURRENT.findall(text) if rail in volts}
+    return {rail: value for rail, value in watts.items() if math.isfinite(value)}
