@@ -269,7 +269,7 @@ POINTS = [
         lambda at: ["hwselect", "score", at.points, "--held-out", "rows"]),
     Row("a negative seed of a split", "--seed", 2,
         lambda at: ["hwselect", "score", at.points, "--held-out", "models", "--seed=-1"]),
-    Row("a refit of nothing left out", "allowed: models, devices (and calibrated)", 2,
+    Row("a refit of nothing left out", "--held-out is not given; with --refit, allowed: models, devices", 2,
         lambda at: ["hwselect", "score", at.points, "--refit", 0]),
     Row("a refit in less than no time", "--refit", 2,
         lambda at: ["hwselect", "score", at.points, "--held-out", "models", "--refit=-1"]),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from pathlib import Path
 
 from vlatool.hwselect._fit import fitted
@@ -19,7 +20,7 @@ from vlatool.hwselect._score import lines, score_points
 UNSEEN = Path(__file__).with_name("unseen.csv")
 LANDMARKS = (
     ("OpenVLA-7B, whole inference", "OpenVLA", "jetson-agx-orin-64gb", ""),
-    ("GR00T N1.7, backbone and action head", "GR00T-N1.7-3B [ba]", "jetson-agx-orin-64gb", ""),
+    ("GR00T N1.7, backbone and action head", "GR00T-N1.7-3B", "jetson-agx-orin-64gb", ""),
     ("Llama-2-7B, one token", "llama-2-7b", "core-ultra-7-165h", ""),
     ("Llama-3.2-3B, one token", "Llama-3.2-3B", "jetson-orin-nano", ""),
     ("Llama-3.1-8B, Qwen2.5-7B, one token", "Llama-3.1-8B|Qwen2.5-7B", "jetson-orin-nano", "unseen"),
@@ -31,20 +32,17 @@ LANDMARKS = (
 
 def main() -> int:
     """Print the tables."""
-    import re
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("points", type=Path, help="published latencies")
     known = read_points(parser.parse_args().points)
     fresh = read_points(UNSEEN)
     print(f"{'':38}{'device':27}{'runtime':17}{'dtype':9}{'published':>10}{'predicted':>11}  80 % interval")
     for title, name, device, file in LANDMARKS:
-        rest = merged([point for point in known if not re.match(name.partition(" ")[0], point.model)])
+        rest = merged([point for point in known if not about(name, point)])
         model = fitted(rest, shipped())
         asked = [
             point for point in (fresh if file else known)
-            if point.question and re.match(name, point.question.work.name)
-            and point.question.place.device.startswith(device)
+            if about(name, point) and point.question and point.question.place.device.startswith(device)
         ]  # fmt: skip
         answers = model.predict([point.question for point in asked if point.question])
         for point, answer in zip(asked, answers, strict=True):
@@ -53,6 +51,11 @@ def main() -> int:
     for text in lines(score_points(UNSEEN)):
         print(text)
     return 0
+
+
+def about(name: str, point: Point) -> bool:
+    """Say whether a figure is of a model, by the beginning of its name (a regular expression)."""
+    return point.question is not None and re.match(name, point.question.work.name) is not None
 
 
 def line(title: str, point: Point, ms: float, low: float, high: float, why: str) -> str:

@@ -43,9 +43,9 @@ def reread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
 
 def test_what_was_measured_is_answered_as_measured(model: LatencyModel, points: list[Point]) -> None:
     found = model.predict([point.question for point in points if point.question])
-    assert [point.model for answer, point in zip(found, points, strict=True) if not answer.known] == ["vit_small"] * 2
+    assert [point.model for answer, point in zip(found, points, strict=True) if not answer.known] == ["vitsmall"] * 2
     for answer, point in zip(found, points, strict=True):
-        if point.model == "vit_small" and point.group.startswith("hailo"):
+        if point.model == "vitsmall" and point.group.startswith("hailo"):
             continue
         assert answer.regime == "known"
         assert answer.ms == pytest.approx(math.exp(point.log_ms), rel=0.15)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import DataError
-from vlatool.hwselect._points import Point, known_devices, merged, published_as, read_points
+from vlatool.hwselect._points import Point, family, known_devices, merged, published_as, read_points
 from vlatool.profile import load_profile
 
 Rows = list[dict[str, str]]
@@ -42,7 +42,11 @@ def test_every_row_becomes_a_question(points_file: Path, published: Rows) -> Non
     assert not [point.why for point in found if point.question is None]
     for point, row in zip(found, published, strict=True):
         assert point.log_ms == pytest.approx(math.log(float(row["value"])))
-        assert (point.group, point.kind, point.model) == (row["device"].lower(), row["device_class"], row["model"])
+        assert (point.group, point.kind, point.model) == (
+            row["device"].lower(),
+            row["device_class"],
+            family(row["model"]),
+        )
 
 
 def test_a_row_says_the_work(one: Callable[..., Point]) -> None:
@@ -212,8 +216,15 @@ def test_a_board_is_held_out_with_its_other_names(one: Callable[..., Point], nam
 
 def test_the_parts_of_a_model_are_held_out_with_it(one: Callable[..., Point]) -> None:
     names = ("GR00T-N1.7-3B end-to-end", "GR00T-N1.7-3B backbone (ViT+LLM)", "GR00T-N1.7-3B action head (DiT, 4 steps)")
-    assert {one(model=name).model for name in names} == {"GR00T-N1.7-3B"}
-    assert one(model="resnet50").model == "resnet50"
+    assert {one(model=name).model for name in names} == {"gr00tn173b"}
+
+
+@pytest.mark.parametrize(
+    "names", [("resnet50", "ResNet-50", "resnet_50"), ("yolov11n", "yolov11n⭐", "yolo11n"), ("levit_128", "LeViT128")]
+)
+def test_a_model_is_held_out_with_its_other_spellings(one: Callable[..., Point], names: tuple[str, ...]) -> None:
+    assert len({one(model=name).model for name in names}) == 1
+    assert one(model="resnet101").model != one(model="resnet-50").model
 
 
 def test_what_tensorrt_leaves_to_pytorch_is_pytorchs(one: Callable[..., Point]) -> None:

@@ -81,7 +81,7 @@ def test_workers_compute_in_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("held_out", [None, "rows", "calibrated"])
 def test_an_unknown_split_is_refused(points_file: Path, held_out: str | None) -> None:
-    with pytest.raises(UsageError, match=r"with --refit, allowed: models, devices \(and calibrated\)"):
+    with pytest.raises(UsageError, match=r"with --refit, allowed: models, devices \(which tells calibrated, too\)"):
         refit_points(points_file, held_out, 0, 0.0, silent)
 
 

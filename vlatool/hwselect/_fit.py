@@ -109,11 +109,12 @@ def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[
 
     Where a unit has too few rows, all of the regime speak for it.
     """
-    folds = Folds(rows_of(sample.questions, shares), sample, scales)
+    rows = rows_of(sample.questions, shares)
+    folds = Folds(rows, sample, scales)
     found: dict[str, dict[str, float]] = {}
     for regime, scores in (
-        ("known", Scores.of(sample, *folds.without(sample.models), sample.models)),
-        ("unseen", Scores.of(sample, *folds.without(sample.devices), sample.devices)),
+        ("known", Scores.of(sample, *folds.without(sample.models), sample.models, sample.models)),
+        ("unseen", Scores.of(sample, *folds.without(sample.devices), sample.devices, rows.keys["pair"])),
         ("calibrated", Scores.calibrated(sample, folds)),
     ):
         found[regime] = {unit: scores.reach(number) for number, unit in enumerate(UNITS)}
@@ -132,7 +133,8 @@ class Scores:
         values: (n,) for each published figure, several versions of a runtime apart.
         groups: (n,) what it was left out with.
         units: (n,) index into ``UNITS``.
-        draws: (n,) which draw it is of: a model, a device, a device with the model that calibrates it.
+        draws: (n,) which draw it is of: a model; a device with a runtime and precision; a device with the model that
+            calibrates it.
     """
 
     values: Array
@@ -141,11 +143,11 @@ class Scores:
     draws: Array
 
     @staticmethod
-    def of(sample: Sample, error: Array, deviation: Array, groups: Array, draws: Array | None = None) -> Scores:
-        """Return the scores of every row of a sample; each group is a draw when nothing else is said."""
+    def of(sample: Sample, error: Array, deviation: Array, groups: Array, draws: Array) -> Scores:
+        """Return the scores of every row of a sample."""
         place = sample.figures
         values = np.abs(error[place] + sample.logs[place] - sample.published) / deviation[place]
-        return Scores(values, groups[place], sample.units[place], (groups if draws is None else draws)[place])
+        return Scores(values, groups[place], sample.units[place], draws[place])
 
     @staticmethod
     def calibrated(sample: Sample, folds: Folds) -> Scores:

@@ -142,6 +142,9 @@ class LatencyModel:
             regime = "known" if int(rows.keys["pair"][number]) in pairs else "unseen"
             if int(rows.keys["device"][number]) in self.own:
                 regime = "calibrated"
+            if part == "npu" and regime == "unseen":
+                found.append(Predicted(math.nan, regime=regime, why=OTHER_NPU))
+                continue
             spans = self.conformal[part][regime]
             half = float(spans.get(question.place.unit, max(spans.values())) * deviation[number])
             if half > WIDEST:
@@ -163,6 +166,10 @@ class LatencyModel:
         if (part, unasked) not in self._processes:
             self._processes[part, unasked] = self.parts[part].without(unasked)
         return self._processes[part, unasked]
+
+
+OTHER_NPU = "figures of one neural processing unit say too little of another; measure it on the board"
+"""Left out whole, they were off by a factor of 2.6 in the middle, and by 4.9 in one of ten."""
 
 
 def part_of(question: Question) -> str:

@@ -116,7 +116,7 @@ def _point(row: Mapping[str, str], where: str) -> Point:
     if kind not in ("cpu", "gpu", "igpu", "npu"):
         raise DataError(f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.")
     board = _name(row["device"])
-    blank = Point(None, math.nan, TWINS.get(board, board), kind, PART.sub("", row["model"]))
+    blank = Point(None, math.nan, TWINS.get(board, board), kind, family(row["model"]))
     if not (value > 0 and math.isfinite(value)):
         return replace(blank, why="its value is 0, endless or missing: nothing was measured")
     blank = replace(blank, log_ms=math.log(value if metric == "latency_ms" else 1000 / value))
@@ -220,6 +220,20 @@ def place_of(row: Mapping[str, str]) -> Place | None:
 
 PART = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
 """What a name says beside the model's: figures of its parts are held out with it."""
+SPELLING = re.compile(r"[\W_]+")
+"""What differs between two spellings of one model's name: ``resnet-50``, ``resnet50`` and ``ResNet_50``."""
+
+
+def family(model: str) -> str:
+    """Return the name that a model is held out by.
+
+    Example:
+        >>> family("LeViT_128") == family("levit-128⭐")
+        True
+    """
+    return SPELLING.sub("", PART.sub("", model).lower()).replace("yolov11", "yolo11")
+
+
 TWINS = {
     "jetson-agx-orin": "jetson-agx-orin-64gb", "jetson-orin-nano-8gb-super": "jetson-orin-nano-8gb",
     "raspberry-pi-5-2.9ghz": "raspberry-pi-5",

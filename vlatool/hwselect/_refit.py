@@ -45,18 +45,25 @@ def refit_points(
         DataError: when the file is malformed, or nothing of it is left to fit on.
     """
     if held_out not in KINDS:
-        raise UsageError(f"--held-out is '{held_out}'; with --refit, allowed: {', '.join(KINDS)} (and calibrated).")
+        given = "not given" if held_out is None else f"'{held_out}'"
+        raise UsageError(
+            f"--held-out is {given}; with --refit, allowed: models, devices (which tells calibrated, too)."
+        )
     points = read_points(path)
     folds = dealt([point for point in points if point.question], held_out, seed)
     if len(folds) < 2:
         raise DataError(f"{path} has no two {held_out}: nothing is left to fit on.")
     answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
-    with single_threads(), ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as workers:
+    with single_threads(), ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn")) as workers:
         jobs = [workers.submit(one_fold, points, held, held_out, seed, seconds) for held in folds]
-        for done, job in enumerate(as_completed(jobs), 1):
-            for kind, answers in job.result().items():
-                answered[kind] += answers
-            tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
+        try:
+            for done, job in enumerate(as_completed(jobs), 1):
+                for kind, answers in job.result().items():
+                    answered[kind] += answers
+                tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
+        except BaseException:  # Ctrl-C too: what has begun ends, nothing further begins
+            workers.shutdown(wait=False, cancel_futures=True)
+            raise
     found = {}
     for kind, answers in answered.items():
         shown = [point for point, _ in answers] + [point for point in points if not point.question]
