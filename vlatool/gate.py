@@ -10,6 +10,7 @@ from vlatool.errors import RecipeError, require
 from vlatool.latencies import PERCENTILES
 from vlatool.regression import ALPHA, LOOKS
 from vlatool.signed_rank import fewest
+from vlatool.yaml_files import read_mapping
 
 
 class _Claim(BaseModel):
@@ -95,17 +96,9 @@ def read_gate(path: Path) -> Gate:
     Raises:
         RecipeError: when the file is missing, is not YAML, or says something impossible; lists every problem.
     """
-    yaml = require("yaml", "build")
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise RecipeError(f"There is no gate {path}.", "write one: vlatool gate init") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecipeError(f"The gate {path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
-    except (yaml.YAMLError, ValueError) as error:  # a date that is none is a ValueError
-        raise RecipeError(f"The gate {path} is not valid YAML: {' '.join(str(error).split())}.") from error
-    if not isinstance(data, dict):
-        raise RecipeError(f"The gate {path} must be a mapping; got {type(data).__name__}.")
+    if not path.exists():
+        raise RecipeError(f"There is no gate {path}.", "write one: vlatool gate init")
+    data = read_mapping(path, f"The gate {path}", RecipeError)
     try:
         gate = Gate.model_validate(data)
     except ValidationError as error:

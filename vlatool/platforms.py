@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vlatool.errors import ProfileError, nearest
 from vlatool.profile import SUFFIXES, Kind
+from vlatool.yaml_files import read_yaml
 
 
 class Platform(BaseModel):
@@ -50,20 +50,13 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
         >>> load_platform("quadcopter").compute_watts
         15.0
     """
-    import yaml
-
     wanted = os.fspath(name_or_path)
     own = wanted.endswith(SUFFIXES) or os.sep in wanted
     path = Path(wanted) if own else _folder() / f"{wanted}.yaml"
     if not own and wanted not in platform_names():
         raise ProfileError(f"There is no platform '{wanted}'; {nearest(wanted, platform_names())}.")
     try:
-        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return Platform.model_validate(data)
-    except OSError as error:
-        raise ProfileError(f"The platform {path} cannot be read: {error.strerror}.") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ProfileError(f"The platform {path} is not valid YAML: {' '.join(str(error).split())}.") from error
+        return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])

@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from vlatool._profile_problems import problem, wrong_names, wrong_sources
 from vlatool.errors import OutputError, ProfileError, nearest
 from vlatool.files import whole_file
+from vlatool.yaml_files import read_mapping
 
 SEARCH_PATH = "VLATOOL_PROFILES"
 SUFFIXES = (".yaml", ".yml")
@@ -266,7 +267,7 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
     else:
         fix = f"name one of these or a YAML file, or add a directory to {SEARCH_PATH}"
         raise ProfileError(f"There is no profile '{wanted}'; {nearest(wanted, found)}.", fix)
-    data = _read(path)
+    data = read_mapping(path, f"The profile {path}", ProfileError)
     try:
         return Profile.model_validate(data)
     except ValidationError as error:
@@ -305,17 +306,3 @@ def _found() -> dict[str, Path]:
     own = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
     files = [path for folder in (*own, shipped) if folder and folder.is_dir() for path in sorted(folder.iterdir())]
     return {path.stem: path for path in reversed(files) if path.suffix in SUFFIXES}
-
-
-def _read(path: Path) -> Any:
-    import yaml
-
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ProfileError(f"The profile {path} cannot be read: {error.strerror}.") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ProfileError(f"The profile {path} is not valid YAML: {' '.join(str(error).split())}.") from error
-    if not isinstance(data, dict):
-        raise ProfileError(f"The profile {path} must be a mapping; got {type(data).__name__}.")
-    return data

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vlatool.errors import RecipeError, require
+from vlatool.yaml_files import read_mapping
 
 StageList = tuple[dict[str, dict[str, Any]], ...]
 """Stages in order, each a mapping of one name to its options."""
@@ -97,17 +98,9 @@ def read_recipe(path: Path) -> Recipe:
     Raises:
         RecipeError: when the file is missing, is not YAML, or says something impossible; lists every problem.
     """
-    yaml = require("yaml", "build")
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise RecipeError(f"There is no recipe {path}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecipeError(f"The recipe {path} cannot be read: {error}.") from error
-    except yaml.YAMLError as error:
-        raise RecipeError(f"The recipe {path} is not valid YAML: {' '.join(str(error).split())}.") from error
-    if not isinstance(data, dict):
-        raise RecipeError(f"The recipe {path} must be a mapping; got {type(data).__name__}.")
+    if not path.exists():
+        raise RecipeError(f"There is no recipe {path}.")
+    data = read_mapping(path, f"The recipe {path}", RecipeError)
     try:
         return Recipe.model_validate(data)
     except ValidationError as error:

@@ -115,6 +115,14 @@ def test_init_writes_what_the_gate_then_reads(vlatool, float_bundle, slowdown, t
     assert vlatool("gate", "init", tmp_path, "--force")[0] == 0
 
 
+def test_init_writes_nothing_where_it_cannot_write_all(vlatool, tmp_path) -> None:
+    (tmp_path / ".github").write_text("in the way")
+    code, out, err = vlatool("gate", "init", tmp_path)
+    assert (code, out) == (3, "")
+    assert ".github" in err
+    assert not (tmp_path / "gate.yaml").exists()
+
+
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [

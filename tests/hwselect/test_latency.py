@@ -158,6 +158,29 @@ def test_a_directory_takes_the_place_of_the_shipped_model(
     assert shipped().about == before
 
 
+def test_a_directory_of_another_version_is_named(
+    model: LatencyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(model, tmp_path)
+    with np.load(tmp_path / "latency.npz") as stored:
+        older = {name: stored[name][:, :8] if name.endswith(".keys") else stored[name] for name in stored.files}
+    np.savez(tmp_path / "latency.npz", **older)
+    monkeypatch.setenv("VLATOOL_LATENCY", str(tmp_path))
+    with pytest.raises(DataError, match="it was fitted by another version of vlatool") as caught:
+        shipped()
+    assert "hwselect fit" in caught.value.fix
+
+
+def test_an_npu_that_was_never_published_is_unknown(model: LatencyModel) -> None:
+    other = replace(HAILO, device="hailo-99")
+    asked = ask(place=other, runtime="hailort", precision="int8")
+    (found,) = model.predict([asked])
+    assert (found.regime, found.why) == ("unseen", _latency.OTHER_NPU)
+    assert model.predict([replace(asked, place=HAILO)])[0].known
+    told = model.conditioned([(asked, 20.0)])
+    assert told.predict([asked])[0].known, "once it was measured"
+
+
 @pytest.mark.parametrize(
     "damage",
     ["absent", "empty", "cut", "no archive", "no JSON", "another file", "no array", "no part", "flipped", "a list"],
@@ -199,7 +222,7 @@ def test_a_directory_without_a_model_is_named(
 def test_npus_are_asked_apart() -> None:
     assert part_of(ask()) == "processors"
     assert part_of(ask(place=HAILO)) == "npu"
-    assert no_ground(ask(), published=True) == ""
+    assert no_ground(ask(), published=True, seen=True) == ""
 
 
 # ---- the model that is shipped

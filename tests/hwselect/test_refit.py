@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from vlatool.errors import DataError, UsageError
-from vlatool.hwselect import _refit
 from vlatool.hwselect._points import Point, read_points
-from vlatool.hwselect._refit import dealt, one_fold, refit_points, single_threads
+from vlatool.hwselect._refit import dealt, one_fold, refit_points
 
 Rows = list[dict[str, str]]
 Written = Callable[[Rows], Path]
@@ -68,15 +67,6 @@ def test_a_whole_file_is_scored_in_processes(published: Rows, points_at: Written
     assert sorted(told)[-1] == "2 of 2 parts left out"
     assert dict(os.environ) == before
     assert list(refit_points(path, "models", 0, 0.0, silent)) == ["models"]
-
-
-def test_workers_compute_in_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "5")
-    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    with single_threads():
-        assert {os.environ[name] for name in _refit.THREADS} == {"1"}
-    assert os.environ["OMP_NUM_THREADS"] == "5"
-    assert "MKL_NUM_THREADS" not in os.environ
 
 
 @pytest.mark.parametrize("held_out", [None, "rows", "calibrated"])

@@ -10,6 +10,7 @@ from typing import Any
 
 from vlatool import errors
 from vlatool.errors import GraphError, VlatoolError
+from vlatool.processes import environment
 
 SAID = "vlatool error"
 
@@ -29,7 +30,9 @@ def ask(module: str, arguments: Sequence[str], line: str, about: str, timeout: f
     """
     command = [sys.executable, "-m", module, *arguments]
     try:
-        done = subprocess.run(command, input=line, capture_output=True, text=True, check=False, timeout=timeout)
+        done = subprocess.run(
+            command, input=line, capture_output=True, text=True, check=False, timeout=timeout, env=environment()
+        )
     except subprocess.TimeoutExpired as error:
         raise GraphError(f"{about}: no result after {timeout:g} s.") from error
     told = done.stdout.splitlines()[-1:]

@@ -103,12 +103,17 @@ def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
     return bundle
 
 
+def opened(source: str, context: Context) -> Bundle:
+    """Return the bundle that is named, or that of a policy, exported with the default options."""
+    from vlatool.pipeline import exported
+
+    return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
+
+
 def measure(
     stage: Measure, source: str, out: Path | None, profile: str | None, workers: int | None, force: bool, as_json: bool
 ) -> None:
     """Measure a bundle, or a policy that is exported first."""
-    from vlatool.pipeline import exported
-
     refuse_existing(out, force)
     board = None
     if profile:
@@ -116,7 +121,7 @@ def measure(
 
         board = load_profile(profile)
     with progress(workers or default_workers()) as context:
-        bundle = Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
+        bundle = opened(source, context)
         stage.check(bundle, board)
         report = stage.run(bundle, context)
     if board is not None:

@@ -14,7 +14,7 @@ import typer
 from vlatool.bundle import Bundle
 from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
 from vlatool.cli._default import group_with
-from vlatool.cli._run import is_bundle
+from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files import whole_file
 
@@ -62,7 +62,7 @@ def run(
     if junit is not None:
         _place(junit)
     with progress(workers or default_workers()) as context:
-        bundle = _opened(candidate, context)
+        bundle = opened(candidate, context)
         report = run_gate(bundle, Bundle.open(base), gate, context, seed)
     report = replace(report, command=command_line(), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
@@ -90,8 +90,9 @@ def init(
     present = [path for path in files if path.exists()]
     if present and not force:
         raise OutputError(f"{present[0]} exists already.", "pass --force to replace it")
-    for path, text in files.items():
+    for path in files:
         path.parent.mkdir(parents=True, exist_ok=True)
+    for path, text in files.items():
         with whole_file(path) as draft:
             draft.write_text(text, encoding="utf-8")
         emit(f"written: {path}\n")
@@ -106,13 +107,6 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
     if margin is None:
         return gate
     return gate.model_copy(update={"latency": (gate.latency or LatencyClaim()).model_copy(update={"margin": margin})})
-
-
-def _opened(candidate: str, context: object) -> Bundle:
-    from vlatool.launch import cache_directory
-    from vlatool.pipeline import exported
-
-    return Bundle.open(Path(candidate)) if is_bundle(candidate) else exported(candidate, cache_directory(), context)  # type: ignore[arg-type]
 
 
 def _place(junit: Path) -> None:

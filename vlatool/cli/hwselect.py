@@ -100,6 +100,12 @@ def _above_zero(**numbers: float | None) -> None:
             raise UsageError(f"--{name.replace('_', '-')} is {value:g}; allowed: a number above 0.")
 
 
+def _finite(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not math.isfinite(value):
+            raise UsageError(f"--{name} is {value:g}; allowed: a number from 0.")
+
+
 @app.command("score")
 def score(
     points: Annotated[Path, typer.Argument(help=POINTS, show_default=False)],
@@ -113,22 +119,27 @@ def score(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the split")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="print JSON on stdout; with --refit a table for each kind")
+    ] = False,
 ) -> None:
     """Predict every row of a file of published latencies, and print error and interval coverage."""
     from vlatool.hwselect._refit import refit_points
     from vlatool.hwselect._score import lines, score_points
 
     if refit is None:
-        found = {held_out or "all": score_points(points, held_out, seed)}
+        found = score_points(points, held_out, seed)
+        tables = [found]
     else:
+        _finite(refit=refit)
         with progress() as context:
             found = refit_points(points, held_out, seed, refit, context.tell)
+        tables = list(found.values())
     if as_json:
-        typer.echo(json.dumps(found if refit is not None else found[held_out or "all"]))
+        typer.echo(json.dumps(found))
         return
-    for scores in found.values():
-        for line in lines(scores):
+    for table in tables:
+        for line in lines(table):
             typer.echo(line)
 
 
@@ -149,4 +160,5 @@ def fit(
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.hwselect._fit import fit_files
 
+    _finite(seconds=seconds)
     fit_files(points, output, seconds, seed, anew, lambda line: typer.echo(line, err=True))

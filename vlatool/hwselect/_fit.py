@@ -107,7 +107,7 @@ def _changed(scales: Scales, shares: Shares, name: str, factor: float) -> tuple[
 def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[str, float]]:
     """Return regime -> unit -> how many standard deviations reach ``LEVEL`` of what is left out (split conformal).
 
-    Where a unit has too few rows, all of the regime speak for it.
+    Where a unit has few models or devices, it is drawn towards all of the regime (``Scores.reach``).
     """
     rows = rows_of(sample.questions, shares)
     folds = Folds(rows, sample, scales)
@@ -216,9 +216,8 @@ def thinned(points: Sequence[Point], most: int = MOST, seed: int = 0) -> list[Po
     random = np.random.default_rng(seed)
     alike: dict[tuple[str, ...], list[Point]] = {}
     for point in merged(points):
-        asked = point.question
-        assert asked is not None
-        alike.setdefault((point.group, asked.place.unit, asked.runtime, asked.precision), []).append(point)
+        if asked := point.question:
+            alike.setdefault((point.group, asked.place.unit, asked.runtime, asked.precision), []).append(point)
     drawn = (random.permutation(len(same))[:most] for same in alike.values())
     return [same[place] for same, places in zip(alike.values(), drawn, strict=True) for place in sorted(places)]
 

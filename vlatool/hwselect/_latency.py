@@ -136,14 +136,11 @@ class LatencyModel:
         pairs, runtimes = (set(known.rows.keys[name].tolist()) for name in ("pair", "runtime"))
         found = []
         for number, question in enumerate(questions):
-            if why := no_ground(question, int(rows.keys["runtime"][number]) in runtimes):
-                found.append(Predicted(math.nan, why=why))
-                continue
             regime = "known" if int(rows.keys["pair"][number]) in pairs else "unseen"
             if int(rows.keys["device"][number]) in self.own:
                 regime = "calibrated"
-            if part == "npu" and regime == "unseen":
-                found.append(Predicted(math.nan, regime=regime, why=OTHER_NPU))
+            if why := no_ground(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen"):
+                found.append(Predicted(math.nan, regime=regime, why=why))
                 continue
             spans = self.conformal[part][regime]
             half = float(spans.get(question.place.unit, max(spans.values())) * deviation[number])
@@ -177,14 +174,22 @@ def part_of(question: Question) -> str:
     return "npu" if question.place.unit == "npu" else "processors"
 
 
-def no_ground(question: Question, published: bool) -> str:
-    """Return why nothing can be said, or an empty string."""
+def no_ground(question: Question, published: bool, seen: bool) -> str:
+    """Return why nothing can be said, or an empty string.
+
+    Args:
+        question: What is asked.
+        published: Whether a figure of the runtime is known.
+        seen: Whether one of this device is known.
+    """
     if question.runtime == "hailort" and "attention" in question.work.traits:
         return "Hailo's published figures are of convolutional networks; a transformer's latency there is unknown"
     precision = ALIKE.get(question.precision, question.precision)
     if question.place.unit == "npu" and precision in ("float32", "w4", "w8"):
         return f"the unit does not compute in {question.precision}"
-    return "" if published else f"no latency was published for the runtime {question.runtime}"
+    if not published:
+        return f"no latency was published for the runtime {question.runtime}"
+    return OTHER_NPU if question.place.unit == "npu" and not seen else ""
 
 
 def shipped() -> LatencyModel:
@@ -217,6 +222,8 @@ def read_model(folder: Path) -> LatencyModel:
         for part, values in parameters["parts"].items():
             arrays = {name: stored[f"{part}.{name}"] for name in ("model", "traits", "device", "prior")}
             keys = stored[f"{part}.keys"]
+            if keys.ndim != 2 or keys.shape[1] != len(KEYS):
+                raise ValueError("it was fitted by another version of vlatool")
             rows = Rows({name: keys[:, place].astype(np.int64) for place, name in enumerate(KEYS)},
                         **{name: array.astype(float) for name, array in arrays.items()})  # fmt: skip
             parts[part] = Known(rows, stored[f"{part}.logs"].astype(float), Scales(**values["scales"]))

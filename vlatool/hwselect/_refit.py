@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,9 +16,9 @@ from vlatool.hwselect._fit import fit
 from vlatool.hwselect._latency import LatencyModel, Predicted
 from vlatool.hwselect._points import Point, merged, read_points
 from vlatool.hwselect._score import DRAWS, FOLDS, summary, told_as
+from vlatool.processes import single_threads
 
 Answered = list[tuple[Point, Predicted]]
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def refit_points(
@@ -58,33 +57,23 @@ def refit_points(
         jobs = [workers.submit(one_fold, points, held, held_out, seed, seconds) for held in folds]
         try:
             for done, job in enumerate(as_completed(jobs), 1):
-                for kind, answers in job.result().items():
-                    answered[kind] += answers
+                for kind, found in job.result().items():
+                    answered[kind] += found
                 tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
         except BaseException:  # Ctrl-C too: what has begun ends, nothing further begins
             workers.shutdown(wait=False, cancel_futures=True)
             raise
-    found = {}
-    for kind, answers in answered.items():
-        shown = [point for point, _ in answers] + [point for point in points if not point.question]
-        how = f"{told_as(kind, seed)}; all fitted anew without it, {seconds:g} s each"
-        found[kind] = summary(shown, [answer for _, answer in answers], how)
-    return found
+    unasked = [point for point in points if not point.question]
+    how = f"all fitted anew without it, {seconds:g} s each"
+    return {
+        kind: summary(
+            [point for point, _ in found] + unasked, [each for _, each in found], f"{told_as(kind, seed)}; {how}"
+        )
+        for kind, found in answered.items()
+    }
 
 
 KINDS = {"models": ("models",), "devices": ("devices", "calibrated")}
-
-
-@contextlib.contextmanager
-def single_threads() -> Iterator[None]:
-    """Let processes that are started meanwhile compute in one thread: they are as many as there are processors."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def dealt(points: Sequence[Point], held_out: str, seed: int) -> list[frozenset[str]]:

@@ -15,7 +15,7 @@ from vlatool.errors import DataError, UsageError
 from vlatool.hwselect._features import rows_of
 from vlatool.hwselect._fit import Scores, by_part
 from vlatool.hwselect._folds import UNITS, Folds, Sample
-from vlatool.hwselect._latency import LEVEL, OTHER_NPU, PLACE, WIDEST, Predicted, no_ground, shipped
+from vlatool.hwselect._latency import LEVEL, PLACE, WIDEST, Predicted, no_ground, shipped
 from vlatool.hwselect._points import Point, read_points
 
 Array = NDArray[Any]
@@ -96,9 +96,7 @@ def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, 
     found: dict[Any, Predicted] = {}
     for place, question in enumerate(sample.questions):
         half = reach[groups[place], sample.units[place]] * deviation[place]
-        why = no_ground(question, not lonely[place])
-        if not why and part == "npu" and regime == "unseen":
-            why = OTHER_NPU
+        why = no_ground(question, not lonely[place], regime != "unseen")
         if not why and half > WIDEST:
             why = "published figures leave too wide an interval"
         if told[place] or why:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import queue
 import subprocess
 import sys
@@ -15,9 +14,8 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from vlatool import errors
+from vlatool.processes import SINGLE, environment
 from vlatool.quantize._records import Record, Tools, compute
-
-SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Ahead:
@@ -81,11 +79,9 @@ class Worker:
     """A process that computes one record at a time."""
 
     def __init__(self) -> None:
-        package = str(Path(__file__).parents[2])
-        path = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
         self._process = subprocess.Popen(
             [sys.executable, "-m", "vlatool.quantize._worker"],
-            env={**os.environ, "PYTHONPATH": path, **dict.fromkeys(SINGLE, "1")},
+            env={**environment(), **SINGLE},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle import LOCATION
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, nearest
 from vlatool.manifest import ProgramStep, check_program, program_from, single_graph
 from vlatool.spec import PolicySpec
+from vlatool.yaml_files import read_mapping
 
 FILE = "policy.yaml"
 KEYS = (
@@ -129,20 +130,9 @@ def read_location(bundle: Path) -> Path:
 
 
 def _mapping(file: Path) -> Mapping[str, Any]:
-    yaml = require("yaml", "build")
-    try:
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SourceError(
-            f"There is no {file}.", "a policy needs a description; see docs/guides/your-own-policy.md"
-        ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{file} cannot be read: {error}.") from error
-    except yaml.YAMLError as error:
-        raise SourceError(f"{file} is not valid YAML: {' '.join(str(error).split())}.") from error
-    if not isinstance(data, Mapping):
-        raise SourceError(f"{file} must be a mapping; got {type(data).__name__}.")
-    return data
+    if not file.exists():
+        raise SourceError(f"There is no {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
+    return read_mapping(file, str(file), SourceError)
 
 
 def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
