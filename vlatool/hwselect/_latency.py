@@ -166,7 +166,6 @@ class LatencyModel:
 
 
 OTHER_NPU = "figures of one neural processing unit say too little of another; measure it on the board"
-"""Left out whole, they were off by a factor of 2.6 in the middle, and by 4.9 in one of ten."""
 
 
 def part_of(question: Question) -> str:
