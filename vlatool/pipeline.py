@@ -292,7 +292,7 @@ def _latency_rows(
     torch = [source] if source.manifest.source and source.path != bundles[BASELINE].path else []
     others = [bundle for name, bundle in bundles.items() if name != BASELINE]
     against = tuple(bundle.path for bundle in [*others, *torch])
-    stage = Latency(against=against, iterations=effort.iterations, threads=effort.threads)
+    stage = Latency(against=against, iterations=effort.iterations, threads=effort.threads, duration=0, phase=False)
     begun = now()
     report = cached_measure(stage, bundles[BASELINE], plan.cache, context, fresh=plan.fresh)
     kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)

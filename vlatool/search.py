@@ -48,6 +48,7 @@ SECONDS = 120.0
 SAMPLES = 8
 """Observations on which it is measured, at most."""
 TIMED = 20
+QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False}
 BF16 = ("amx_bf16", "avx512_bf16")
 AMX = ("amx_tile", "amx_int8")
 INT8: dict[str, dict[str, Any]] = {
@@ -154,7 +155,7 @@ class Search:
             twin = self._seen.setdefault(graphs_of(bundle), name)
             if twin != name:  # no product has enough rows to become a convolution, say
                 raise GraphError(f"It has the graphs of {twin}.")
-            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, cold=False)
+            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, **QUICK)
             speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
             error = self._error(bundle, quiet)
             trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value)

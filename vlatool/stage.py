@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -41,11 +41,14 @@ class Context:
         tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
         workers: Processes that a stage may start.
         command: The command line, for reports.
+        elsewhere: Measures on another machine: a job, the bundles that it names, and ``tell`` -> what was found there.
+            Here when None.
     """
 
     tell: Tell = field(default=_silent)
     workers: int = 1
     command: str = ""
+    elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
 
 
 class SampleSet:
@@ -184,6 +187,13 @@ class Transform(Stage):
 
 class Measure(Stage):
     """A stage that makes a report."""
+
+    remotely: ClassVar[bool] = False
+    """Whether it can measure on another machine (``Context.elsewhere``)."""
+
+    def on(self, profile: Profile) -> Measure:
+        """Return the stage as it is for a board."""
+        return self
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Measure and return the report; the caller writes it."""

@@ -5,17 +5,19 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements, speedup, unique_names
-from vlatool.benchmark._probe import cold_start, main, peak_rss_mb
+from vlatool.benchmark._memory import peak_rss_mb, resident_mb
+from vlatool.benchmark._probe import cold_start, main
 from vlatool.benchmark.latency import Latency, busy_warning
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, UsageError
 from vlatool.hwselect._workload import workload
 from vlatool.stage import Context
 
-PROBED = {"import_ms", "load_ms", "first_ms", "peak_rss_mb"}
+PROBED = {"import_ms", "engine_ms", "load_ms", "first_ms", "peak_rss_mb", "rss_mb"}
 
 
 def names(row):
@@ -24,7 +26,7 @@ def names(row):
 
 @pytest.fixture(scope="module")
 def report(float_bundle, int8_bundle):
-    stage = Latency(against=(int8_bundle.path,), iterations=20, warmup=1, cold=False)
+    stage = Latency(against=(int8_bundle.path,), iterations=20, warmup=1, duration=0, cold=False)
     stage.check(float_bundle, None)
     return stage.run(float_bundle, Context())
 
@@ -82,7 +84,7 @@ def test_without_cold_starts_none_is_reported(report):
 
 
 def test_a_cold_start_reports_memory_and_time(float_bundle):
-    row = Latency(iterations=20, warmup=1).run(float_bundle, Context()).rows[0]
+    row = Latency(iterations=20, warmup=1, duration=0).run(float_bundle, Context()).rows[0]
     assert row.get("peak_rss").unit == "MB"
     assert row.value("peak_rss") > 10
     assert row.value("cold_start") > 0
@@ -90,7 +92,9 @@ def test_a_cold_start_reports_memory_and_time(float_bundle):
 
 
 def test_a_source_bundle_is_measured_in_eager_torch(float_bundle, source_bundle):
-    found = Latency(against=(source_bundle.path,), iterations=20, warmup=1, cold=False).run(float_bundle, Context())
+    found = Latency(against=(source_bundle.path,), iterations=20, warmup=1, duration=0, cold=False).run(
+        float_bundle, Context()
+    )
     row = found.rows[1]
     assert row.name == "torch eager"
     assert "size" not in names(row)
@@ -138,20 +142,28 @@ def test_the_speed_up_is_the_ratio_of_the_medians(float_bundle):
 @pytest.mark.parametrize(
     ("count", "wanted"),
     [
-        (5, set()),
-        (6, {"p50"}),
-        (35, {"p50"}),
-        (36, {"p50", "p90"}),
-        (367, {"p50", "p90"}),
-        (368, {"p50", "p90", "p99"}),
+        (10, set()),
+        (11, {"p50"}),
+        (63, {"p50"}),
+        (64, {"p50", "p90"}),
+        (130, {"p50", "p90", "p95"}),
+        (662, {"p50", "p90", "p95", "p99"}),
+        (6636, {"p50", "p90", "p95", "p99", "p99.9"}),
     ],
 )
 def test_a_percentile_needs_enough_samples_for_its_upper_bound(count, wanted):
-    found = latency_measurements([float(value) for value in range(1, count + 1)])
-    assert {each.name for each in found} == {f"latency_{name}" for name in wanted} | {"latency_max"}
-    assert found[-1].value == count
-    for each in found[:-1]:
-        assert each.low is None or each.low <= each.value <= each.high
+    samples = np.random.default_rng(count).exponential(size=count)
+    found = {each.name: each for each in latency_measurements(samples)}
+    assert set(found) == {f"latency_{name}" for name in wanted} | {"latency_p50", "latency_max"}
+    assert found["latency_max"].value == samples.max()
+    for name in wanted:
+        each = found[f"latency_{name}"]
+        assert (each.low, each.confidence) == (None, 0.99)
+        assert each.value <= each.high
+    assert found["latency_p50"].high is not None or count < 11
+    refused = {each.name: each for each in latency_measurements(samples, refusals=True) if not each.known}
+    assert set(refused) == {f"latency_p{name}" for name in ("90", "95", "99", "99.9")} - set(found)
+    assert all("independent calls" in each.note and "--iterations" in each.note for each in refused.values())
 
 
 def test_a_busy_host_is_a_warning():
@@ -165,14 +177,17 @@ def test_a_busy_host_is_a_warning():
 
 def test_the_probe_runs_in_a_fresh_process(int8_bundle):
     found = cold_start(int8_bundle.path, "ort_cpu", 1)
-    assert set(found) == PROBED
-    assert all(value > 0 for value in found.values())
+    assert set(found) == PROBED | {"start_ms", "total_ms"}
+    assert all(value > 0 for name, value in found.items() if name != "rss_mb")
+    assert list(found["rss_mb"]) == ["interpreter", "imported", "engine", "loaded", "first", "more"]
+    assert 0 < found["rss_mb"]["interpreter"] < found["rss_mb"]["loaded"] <= found["peak_rss_mb"] + 1
+    assert found["total_ms"] > found["start_ms"] + found["import_ms"] + found["load_ms"]
 
 
 def test_the_probe_prints_one_line_of_json(int8_bundle):
     command = [sys.executable, "-m", "vlatool.benchmark._probe", str(int8_bundle.path), "ort_cpu", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert set(json.loads(done.stdout)) == PROBED
+    assert set(json.loads(done.stdout)) == PROBED | {"begun_ns", "acted_ns"}
 
 
 def test_the_probe_says_why_a_bundle_does_not_run(tmp_path):
@@ -181,7 +196,7 @@ def test_the_probe_says_why_a_bundle_does_not_run(tmp_path):
 
 
 def test_the_probe_in_this_process(float_bundle):
-    assert set(main([str(float_bundle.path), "ort_cpu", "1"])) == PROBED
+    assert set(main([str(float_bundle.path), "ort_cpu", "1"])) == PROBED | {"begun_ns", "acted_ns"}
 
 
 def test_a_bundle_without_golden_values_is_probed_without_an_inference(float_bundle, copied):
@@ -189,11 +204,16 @@ def test_a_bundle_without_golden_values_is_probed_without_an_inference(float_bun
 
     bare = copied(float_bundle)
     seal(bare.path, replace(bare.manifest, golden=""))
-    assert set(main([str(bare.path), "ort_cpu", "1"])) == PROBED
+    found = main([str(bare.path), "ort_cpu", "1"])
+    assert "first" not in found["rss_mb"]
+    assert found["first_ms"] == 0
 
 
 def test_the_peak_of_memory_is_the_processs_own(tmp_path):
     (tmp_path / "status").write_text("Name:\tx\nVmHWM:\t   2000 kB\n")
     assert peak_rss_mb(tmp_path / "status") == 2.048
+    (tmp_path / "status").write_text("VmHWM:\t   2000 kB\nVmRSS:\t   1000 kB\n")
+    assert resident_mb(tmp_path / "status") == 1.024
     (tmp_path / "status").write_text("Name:\tx\n")
     assert peak_rss_mb(tmp_path / "status") > 1
+    assert resident_mb(tmp_path / "status") > 1

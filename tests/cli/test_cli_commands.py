@@ -24,7 +24,7 @@ from vlatool.profile import names
 from vlatool.report import Measurement, Report, Row, read_report
 from vlatool.stage import Context
 
-FAST = ["--iterations", "20", "--no-cold"]
+FAST = ["--iterations", "20", "--duration", "0", "--no-cold"]
 
 
 def process(*line: Any, **settings: Any) -> subprocess.CompletedProcess[str]:

@@ -340,7 +340,7 @@ def test_a_measurement_changes_what_is_predicted_for_its_board(vlatool, float_bu
         return Report.from_json(vlatool(*line, *more)[1]).rows[0].get("latency_p50", "predicted")
 
     before = predicted()
-    fast = ["--iterations", 20, "--no-cold"]
+    fast = ["--duration", 0, "--iterations", 20, "--no-cold"]
     assert vlatool("benchmark", float_bundle.path, *fast, "-o", tmp_path / "report")[0] == 0
     measured = read_report(tmp_path / "report").rows[0].value("latency_p50")
     code, out, _ = vlatool("profiles", "calibrate", "raspberry-pi-5", "--from", tmp_path / "report")
@@ -357,7 +357,7 @@ def test_a_measurement_changes_what_is_predicted_for_its_board(vlatool, float_bu
 
 
 def test_a_report_is_no_calibration_before_it_is_told(vlatool, float_bundle, tmp_path):
-    fast = ["--iterations", 20, "--no-cold"]
+    fast = ["--duration", 0, "--iterations", 20, "--no-cold"]
     assert vlatool("benchmark", float_bundle.path, *fast, "-o", tmp_path / "report")[0] == 0
     assert "file that `vlatool profiles calibrate` keeps" in " ".join(
         vlatool("hwselect", "select", "--help")[1].split()

@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from vlatool import errors
-from vlatool.errors import GraphError, VlatoolError
+from vlatool.benchmark._job import Limits
+from vlatool.benchmark._limited import command
+from vlatool.errors import GateFailed, GraphError, VlatoolError
 from vlatool.processes import environment
 
 SAID = "vlatool error"
+NO_MEMORY = (
+    "MemoryError",
+    "bad_alloc",
+    "ailed to allocate",
+    "out of memory",
+    "annot allocate memory",
+    "Memory allocation",
+)
+"""What Python, C++ and the engines say when a limit is reached; a control group kills instead."""
 
 
-def ask(module: str, arguments: Sequence[str], line: str, about: str, timeout: float | None = None) -> dict[str, Any]:
+def ask(
+    module: str,
+    arguments: Sequence[str],
+    line: str,
+    about: str,
+    timeout: float | None = None,
+    limits: Limits = Limits(),  # noqa: B008
+) -> dict[str, Any]:
     """Run a module of vlatool in a fresh process and return what it answers.
 
     Args:
@@ -24,26 +43,59 @@ def ask(module: str, arguments: Sequence[str], line: str, about: str, timeout: f
         line: For its standard input.
         about: What is asked about, for errors.
         timeout: Seconds; endless when None.
+        limits: Of the process.
 
     Raises:
-        VlatoolError: what the process raised, of the same class; GraphError when it ended in another way.
+        VlatoolError: what the process raised, of the same class; GraphError when it ended in another way; GateFailed
+            when it needed more memory than the limit.
     """
-    command = [sys.executable, "-m", module, *arguments]
     try:
         done = subprocess.run(
-            command, input=line, capture_output=True, text=True, check=False, timeout=timeout, env=environment()
+            command(limits, module, arguments),
+            input=line,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=timeout,
+            env=environment(),
         )
     except subprocess.TimeoutExpired as error:
         raise GraphError(f"{about}: no result after {timeout:g} s.") from error
     told = done.stdout.splitlines()[-1:]
     found: dict[str, Any] = json.loads(told[0]) if told and told[0].startswith("{") else {}
-    if SAID in found:
-        raised = getattr(errors, str(found[SAID]), GraphError)
-        raise raised(str(found["message"]), str(found["fix"]))
+    raise_said(found, limits)
     if done.returncode or not found:
-        last = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
-        raise GraphError(f"{about} cannot be run in a fresh process: {last}")
+        raise ended(about, done.returncode, done.stderr, limits)
     return found
+
+
+def raise_said(found: Mapping[str, Any], limits: Limits = Limits()) -> None:  # noqa: B008
+    """Raise what a process said that it raised; nothing when it did not."""
+    if SAID not in found:
+        return
+    message = str(found["message"])
+    if limits.memory_mb and any(sign in message for sign in NO_MEMORY):
+        raise too_large(limits)
+    raised = getattr(errors, str(found[SAID]), GraphError)
+    raise raised(message, str(found["fix"]))
+
+
+def ended(about: str, code: int, log: str, limits: Limits) -> VlatoolError:
+    """Return the error of a process that ended without a result."""
+    if limits.memory_mb and (code in (-signal.SIGKILL, -signal.SIGABRT) or any(sign in log for sign in NO_MEMORY)):
+        return too_large(limits)
+    if code == -signal.SIGKILL:
+        return GraphError(f"{about}: the process was killed, most likely since memory ran out.", "use a smaller policy")
+    last = (log.strip() or f"exit code {code}").splitlines()[-1]
+    return GraphError(f"{about} cannot be run in a fresh process: {last}")
+
+
+def too_large(limits: Limits, seen: str = "") -> GateFailed:
+    """Return the error of a policy that needs more memory than the board leaves it; ``seen`` says how much."""
+    return GateFailed(
+        f"It does not fit: the process needs more than {limits.memory_mb:,.0f} MB of memory{seen}.",
+        "quantize it, or see which boards it fits on: vlatool hwselect",
+    )
 
 
 def answer(give: Callable[[], dict[str, Any]]) -> None:

@@ -2,32 +2,45 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from array import array
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from vlatool.benchmark._answers import Answers
 from vlatool.bundle import Bundle
+from vlatool.latencies import PERCENTILES, Percentile, percentile
 from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
-from vlatool.stage import Context
 from vlatool.statistics import quantile_interval
 
+MOST = 2_000_000
+"""Calls of each after which a run ends before its duration does: every one of them is kept."""
 BLOCKS = 20
 """Rounds in which every policy takes its turn; ratios are taken within a round."""
+Tell = Callable[[str, "float | None"], None]
 
 
 @dataclass
 class Contestant:
-    """One policy in the run: its bundle, how it is opened, and the milliseconds of each inference."""
+    """One policy in the run: its bundle, how it is opened, and the milliseconds of each inference.
+
+    Args:
+        starts: When each inference began, in seconds of ``time.monotonic``.
+        answers: What the policy is expected to answer; None when that is not looked at.
+    """
 
     name: str
     bundle: Bundle
     policy: Policy
     observations: list[dict[str, Any]]
-    blocks: list[list[float]] = field(default_factory=list)
+    blocks: list[Sequence[float]] = field(default_factory=list)
+    starts: array[float] = field(default_factory=lambda: array("d"))
+    answers: Answers | None = None
 
     @property
     def samples(self) -> list[float]:
@@ -35,50 +48,99 @@ class Contestant:
         return [value for block in self.blocks for value in block]
 
 
-def run_interleaved(contestants: Sequence[Contestant], iterations: int, warmup: int, context: Context) -> None:
-    """Time ``iterations`` inferences of each policy after ``warmup`` untimed ones, in rounds of seeded random order."""
+def run_interleaved(
+    contestants: Sequence[Contestant],
+    iterations: int,
+    warmup: int,
+    tell: Tell,
+    duration: float = 0.0,
+    between: Callable[[], None] = lambda: None,
+) -> None:
+    """Time each policy after ``warmup`` untimed inferences, in rounds of seeded random order.
+
+    Args:
+        contestants: Get their samples.
+        iterations: Inferences of each, at least.
+        warmup: Untimed ones before.
+        tell: What is being done, and the share that is done.
+        duration: Seconds that each is timed for, at least.
+        between: Called before each round and after the last.
+    """
     for contestant in contestants:
         for index in range(warmup):
             contestant.policy.infer(contestant.observations[index % len(contestant.observations)])
     each = -(-iterations // BLOCKS)
     order = np.random.default_rng(0)
     for block in range(BLOCKS):
-        context.tell("measuring latency", block / BLOCKS)
+        tell("measuring latency", block / BLOCKS)
+        between()
         for index in order.permutation(len(contestants)):
-            contestants[int(index)].blocks.append(_timed(contestants[int(index)], each))
+            _time(contestants[int(index)], each, duration / BLOCKS)
+    between()
 
 
-def _timed(contestant: Contestant, count: int) -> list[float]:
-    found = []
-    done = len(contestant.blocks) * count
-    for index in range(count):
-        observation = contestant.observations[(done + index) % len(contestant.observations)]
+def _time(contestant: Contestant, count: int, seconds: float) -> None:
+    observations, infer, answers = contestant.observations, contestant.policy.infer, contestant.answers
+    taken, starts, size = array("d"), contestant.starts, len(observations)
+    end = time.perf_counter() + seconds
+    while len(taken) < count or (time.perf_counter() < end and len(starts) < MOST):
+        place = len(starts) % size
+        if not place:
+            contestant.policy.reset()  # the same noise and kept values in every turn through the observations
+        observation = observations[place]
+        starts.append(time.monotonic())
         start = time.perf_counter_ns()
-        contestant.policy.infer(observation)
-        found.append((time.perf_counter_ns() - start) / 1e6)
-    return found
+        action = infer(observation)
+        taken.append((time.perf_counter_ns() - start) / 1e6)
+        if answers is not None:
+            answers.look(place, action.outputs)
+    contestant.blocks.append(taken)
 
 
-def latency_measurements(samples: Sequence[float]) -> list[Measurement]:
-    """Return p50, p90, p99 and max in ms; a percentile whose upper bound the samples do not reach is left out."""
+def latency_measurements(samples: Sequence[float], refusals: bool = False) -> list[Measurement]:
+    """Return the percentiles and the maximum in ms, each percentile with its upper bound at 99 %.
+
+    The median is always given; without a bound where the samples are too few for one. Any other percentile that is not
+    bounded is left out, or, with ``refusals``, named with what it would take.
+    """
     found = []
-    for name, quantile in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99)):
-        value, low, high = quantile_interval(samples, quantile)
-        if high is not None:
-            found.append(Measurement(f"latency_{name}", value, "ms", samples=len(samples), low=low, high=high))
+    for percent in PERCENTILES:
+        seen = percentile(samples, percent)
+        name = f"latency_{seen.name}"
+        if seen.known:
+            found.append(
+                Measurement(name, seen.value, "ms", samples=len(samples), high=seen.bound, confidence=seen.confidence)
+            )
+        elif percent == PERCENTILES[0]:
+            found.append(Measurement(name, float(np.median(samples)), "ms", samples=len(samples)))
+        elif refusals:
+            found.append(Measurement(name, math.nan, "ms", samples=len(samples), note=_wanting(seen, len(samples))))
     return [*found, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
+
+
+def _wanting(seen: Percentile, calls: int) -> str:
+    """Return what a percentile lacks; calls that follow each other count for less than independent ones."""
+    more = math.ceil(1.1 * seen.needed * max(1.0, calls / seen.worth) / 100) * 100
+    worth = f"{calls:,} calls" if seen.worth >= calls else f"{calls:,} calls that are worth {int(seen.worth):,}"
+    return f"needs {seen.needed:,} independent calls, this run has {worth}; pass --iterations {more}"
 
 
 def speedup(contestant: Contestant, reference: Contestant) -> Measurement:
     """Return reference median / own median, with the order-statistic interval of the ratios within rounds."""
-    ratios = [
-        float(np.median(base) / np.median(own)) for base, own in zip(reference.blocks, contestant.blocks, strict=True)
-    ]
-    value = float(np.median(reference.samples) / np.median(contestant.samples))
+    return speedup_of(contestant.blocks, reference.blocks, reference.name)
+
+
+def speedup_of(
+    blocks: Sequence[Sequence[float]], reference: Sequence[Sequence[float]], reference_name: str
+) -> Measurement:
+    """Return the speed-up from the milliseconds of both, round by round."""
+    ratios = [float(np.median(base) / np.median(own)) for base, own in zip(reference, blocks, strict=True)]
+    count = sum(map(len, blocks))
+    value = float(np.median(np.concatenate(reference)) / np.median(np.concatenate(blocks)))
     _, low, high = quantile_interval(ratios, 0.5)
     low, high = (min(low, value) if low else low), (max(high, value) if high else high)
-    note = f"ratio of medians to {reference.name}, interleaved"
-    return Measurement("speedup", value, "x", samples=len(contestant.samples), low=low, high=high, note=note)
+    note = f"ratio of medians to {reference_name}, interleaved"
+    return Measurement("speedup", value, "x", samples=count, low=low, high=high, note=note)
 
 
 def unique_names(contestants: Sequence[Contestant]) -> None:

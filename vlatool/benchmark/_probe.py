@@ -1,64 +1,95 @@
-"""Run in a fresh process: load a bundle, infer once, and say how long it took and how much memory it needed.
+"""Run in a fresh process: load a bundle, infer, and say how long each part took and how much memory it needed.
 
 ``python -m vlatool.benchmark._probe BUNDLE ENGINE THREADS`` prints one line of JSON.
 """
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from vlatool.benchmark._child import answer, ask
+from vlatool.benchmark._job import Limits
+from vlatool.benchmark._memory import peak_rss_mb, resident_mb
+
+MORE = 5
+"""Inferences after the first: an engine's arena may grow with the second."""
+PARTS = {
+    "interpreter": "Python",
+    "imported": "numpy and runtime",
+    "engine": "engine library",
+    "loaded": "graphs and weights",
+    "first": "first inference",
+    "more": "later inferences",
+}
 
 
-def cold_start(bundle: Path, engine: str, threads: int) -> dict[str, float]:
+def cold_start(bundle: Path, engine: str, threads: int, limits: Limits = Limits()) -> dict[str, Any]:  # noqa: B008
     """Probe a bundle in a fresh process.
 
     Returns:
-        ``import_ms``, ``load_ms``, ``first_ms`` (the first inference after the load) and ``peak_rss_mb``
-        (10^6 bytes).
+        ``start_ms`` (from the start of the process until its first line of Python), ``import_ms``, ``engine_ms`` (the
+        engine's library), ``load_ms``, ``first_ms`` (the first inference after the load), ``total_ms`` (from the start
+        of the process to the first action), ``peak_rss_mb`` (10^6 bytes) and ``rss_mb``: part -> what the process
+        holds once that part is done.
 
     Raises:
         VlatoolError: what the bundle raises; GraphError when the process ends in another way.
     """
-    found: dict[str, float] = ask("vlatool.benchmark._probe", (str(bundle), engine, str(threads)), "", str(bundle))
+    begun = time.monotonic_ns()
+    found = ask("vlatool.benchmark._probe", (str(bundle), engine, str(threads)), "", str(bundle), limits=limits)
+    found["start_ms"] = (found.pop("begun_ns") - begun) / 1e6
+    found["total_ms"] = (found.pop("acted_ns") - begun) / 1e6
     return found
 
 
-def main(arguments: list[str]) -> dict[str, float]:
+def main(arguments: list[str]) -> dict[str, Any]:
     """Load and run once in this process."""
-    start = time.perf_counter_ns()
+    begun = time.monotonic_ns()  # the same clock in every process of a machine
+    rss = {"interpreter": resident_mb()}
+    from vlatool.bundle import Bundle
     from vlatool.runtime import load
-    from vlatool.runtime.policy import load_golden
+    from vlatool.runtime.policy import DEFAULT_ENGINE, load_golden
 
-    imported = time.perf_counter_ns()
+    imported = time.monotonic_ns()
+    rss["imported"] = resident_mb()
+    opened = Bundle.open(arguments[0], verify=False)
+    _import_engine(arguments[1] or opened.manifest.engine or DEFAULT_ENGINE)
+    ready = time.monotonic_ns()
+    rss["engine"] = resident_mb()
     policy = load(arguments[0], engine=arguments[1], threads=int(arguments[2]), warmup=0)
-    loaded = time.perf_counter_ns()
+    loaded = time.monotonic_ns()
+    rss["loaded"] = resident_mb()
     golden: Any = load_golden(policy.bundle)
-    ready = time.perf_counter_ns()
+    before = time.monotonic_ns()
+    acted = before
     if golden is not None:
         policy.infer(golden[0], noise=golden[1])
-    done = time.perf_counter_ns()
+        acted = time.monotonic_ns()
+        rss["first"] = resident_mb()
+        for _ in range(MORE):
+            policy.infer(golden[0], noise=golden[1])
+        rss["more"] = resident_mb()
     return {
-        "import_ms": (imported - start) / 1e6,
-        "load_ms": (loaded - imported) / 1e6,
-        "first_ms": (done - ready) / 1e6,
+        "begun_ns": begun,
+        "import_ms": (imported - begun) / 1e6,
+        "engine_ms": (ready - imported) / 1e6,
+        "load_ms": (loaded - ready) / 1e6,
+        "first_ms": (acted - before) / 1e6,
+        "acted_ns": acted,
         "peak_rss_mb": peak_rss_mb(),
+        "rss_mb": rss,
     }
 
 
-def peak_rss_mb(status: Path = Path("/proc/self/status")) -> float:
-    """Return the largest resident set of this process so far in MB (10^6 bytes).
+def _import_engine(name: str) -> None:
+    """Import the library of an engine by asking for its version; what it needs is told when the graphs are opened."""
+    from vlatool import registry
 
-    ``ru_maxrss`` would do, but Linux lets a child inherit its parent's value; ``VmHWM`` belongs to the process alone.
-    """
-    for line in status.read_text(encoding="utf-8").splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    engine: Any = registry.load("engines", name)
+    engine.version()
 
 
 if __name__ == "__main__":

@@ -1,45 +1,66 @@
-"""Latency through the runtime, several policies interleaved in one run."""
+"""Latency, memory, energy and what a board tells meanwhile, through the runtime, several policies in one run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
-from vlatool.benchmark._contest import Contestant, latency_measurements, run_interleaved, speedup, unique_names
-from vlatool.benchmark._probe import cold_start
+from vlatool.benchmark import _agent
+from vlatool.benchmark._job import Job, Limits
+from vlatool.benchmark._rows import measurements, raw, samples_of, sustained, tables
+from vlatool.benchmark._trust import findings, validity
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.data import observations_for
-from vlatool.errors import BundleError, GraphError, MissingExtra
-from vlatool.export._torch_policy import torch_policy
+from vlatool.errors import BundleError, GraphError, MissingExtra, UsageError
 from vlatool.host import fingerprint
 from vlatool.hwselect._measured import WORK, whole_work
 from vlatool.hwselect._workload import workload
-from vlatool.report import Measurement, Report, Row
-from vlatool.runtime.policy import Policy
+from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.stage import Context, Measure
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 COLD_STARTS = 3
+HERE = "this host"
 
 
 class Latency(Measure):
-    """Measure inference latency through the runtime, batch 1, all policies interleaved in one run.
+    """Measure latency, memory and energy through the runtime, batch 1, in a fresh process.
 
-    A bundle that has no graph (a torch source) is measured in eager torch.
+    Back to back, or with --rate as a control loop: then everything counts from the moment at which a tick was due.
+    With --against all policies take turns in one run. A bundle without a graph (a torch source) is measured in eager
+    torch.
     """
 
+    remotely: ClassVar[bool] = True
+
     against: tuple[Path, ...] = Field((), description="further bundles, measured in the same run; compared with BUNDLE")
-    iterations: int = Field(200, ge=20, description="inferences of each policy")
+    iterations: int = Field(200, ge=20, description="inferences of each policy, at least")
+    duration: float = Field(10.0, ge=0, le=86_400, description="seconds that each is timed for, at least")
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
+    rate: float = Field(0.0, ge=0, le=10_000, description="pace of a control loop in Hz; back to back when 0")
+    sustained: float = Field(
+        0.0, ge=0, le=86_400, description="run so many seconds, and compare their end with the start"
+    )
     threads: int = Field(1, ge=1, description="intra-op threads")
+    pin: str = Field("", description="processors to run on, such as 0-3 or 2,4; all when empty")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
-    cold: bool = Field(True, description="also load each bundle in a fresh process: load time and peak memory")
+    cold: bool = Field(True, description="also load each bundle in fresh processes: cold start, and memory by part")
+    phase: bool = Field(True, description="also time the parts of an inference: encoding, each graph, decoding")
+    answers: bool = Field(True, description="also look for answers that change in the run, or come from memory")
+    cores: int = Field(0, ge=0, description="processors that the policy may use; all when 0")
+    memory_mb: float = Field(0.0, ge=0, description="memory that its process may use, in MB (10^6 bytes); all when 0")
+    emulate: bool = Field(
+        False, description="take --cores and --memory-mb from --profile: what does not fit fails here"
+    )
+    mode: str = Field("", description="power mode of --profile that --emulate takes; its default mode when empty")
+    _board: str = PrivateAttr("")
 
     def inputs(self) -> tuple[Path, ...]:
         """The manifests of the further bundles; they hold the hash of every file."""
@@ -51,67 +72,149 @@ class Latency(Measure):
         return super().key(f"{source_hash} {host.get('cpu')} {host.get('cores')} {host.get('kernel')}")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Every bundle can be opened."""
+        """Every bundle can be opened, and the options fit each other."""
+        for name in ("duration", "rate", "sustained", "memory_mb"):
+            if not math.isfinite(getattr(self, name)):
+                raise UsageError(f"--{name.replace('_', '-')} is {getattr(self, name)}; allowed: a number from 0.")
+        if self.rate and self.against:
+            raise UsageError("--rate paces one policy; measure the further ones in runs of their own.")
+        if self.sustained and self.rate:
+            raise UsageError("--sustained calls back to back; with --rate pass --duration.")
+        if self.emulate and profile is None:
+            raise UsageError("--emulate needs a board.", "name it: --profile NAME (see: vlatool profiles list)")
+        if self.mode and not self.emulate:
+            raise UsageError("--mode is the power mode that --emulate takes.", "pass --emulate, too")
+        processors(self.pin)
         for path in self.against:
             Bundle.open(path, verify=False)
 
+    def on(self, profile: Profile) -> Latency:
+        """Return the stage with the limits of a board, where it is to be emulated.
+
+        Raises:
+            UsageError: when more threads are asked for than the board has cores.
+            ProfileError: when it has no such power mode.
+        """
+        if not self.emulate:
+            return self
+        mode = profile.mode(self.mode or None)
+        cores = int(mode.cores.get("cpu", profile.units["cpu"].cores.value if "cpu" in profile.units else 0))
+        if cores and self.threads > cores:
+            raise UsageError(f"--threads is {self.threads}; {profile.name} has {cores} processors in this mode.")
+        memory = 1e3 * profile.usable_memory_gb.value
+        limited = self.model_copy(update={"cores": self.cores or cores, "memory_mb": self.memory_mb or memory})
+        limited._board = profile.name
+        return limited
+
     def run(self, source: Bundle, context: Context) -> Report:
         """Measure and return one row for each policy, the first is the reference of the speed-ups."""
-        host = fingerprint()  # before the run itself loads the machine
         bundles = [source, *(Bundle.open(path) for path in self.against)]
-        contestants = [self._open(bundle) for bundle in bundles]
-        unique_names(contestants)
-        run_interleaved(contestants, self.iterations, self.warmup, context)
-        rows: list[Row] = []
-        for contestant in contestants:
-            context.tell("cold start of each in a fresh process", len(rows) / len(contestants))
-            rows.append(self._row(contestant, contestants[0] if len(contestants) > 1 else None))
-        p50 = rows[0].value("latency_p50")
-        where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
-        summary = f"{rows[0].name}: {p50:.3g} ms median latency on {where}."
-        title = f"Latency of {source.manifest.name}"
+        for bundle in bundles:
+            if not bundle.manifest.graphs and "factory" not in bundle.manifest.source:
+                raise BundleError(f"{bundle.path} has nothing to run.")
+        job = self._job(bundles)
+        elsewhere = context.elsewhere
+        found = (
+            _agent.measure(job, context.tell)
+            if elsewhere is None
+            else elsewhere(job.to_dict(), [bundle.path for bundle in bundles], context.tell)
+        )
+        return self._report(bundles, found, remote=elsewhere is not None)
+
+    def _job(self, bundles: Sequence[Bundle]) -> Job:
+        return Job(
+            bundles=tuple(str(bundle.path.resolve()) for bundle in bundles),
+            engine=self.engine,
+            threads=self.threads,
+            iterations=self.iterations,
+            duration=max(self.duration, self.sustained),
+            warmup=self.warmup,
+            rate=self.rate,
+            phases=self.phase,
+            cold=COLD_STARTS if self.cold else 0,
+            check=self.answers,
+            limits=Limits(processors(self.pin), self.cores, self.memory_mb),
+        )
+
+    def _report(self, bundles: Sequence[Bundle], found: Mapping[str, Any], remote: bool) -> Report:
+        policies, host = found["policies"], found["host"]
+        alone = len(policies) == 1
+        where = _place(host) if remote else HERE
+        if self.memory_mb or self.cores:
+            where += f", limited{f' as {self._board}' if self._board else ''}"
+        rows = []
+        for bundle, policy in zip(bundles, policies, strict=True):
+            measured = measurements(found, policy, None if alone else policies[0], self.rate)
+            measured += sustained(samples_of(policy)) if self.sustained else []
+            if bundle.manifest.graphs:
+                measured.append(Measurement("size", _graph_bytes(bundle) / 1e6, "MB", note="graphs on disk"))
+            told = tables(found, policy, alone) | _work(bundle, policy["engine"])
+            role = "baseline" if policy is policies[0] and not alone else "subject"
+            placed = tuple(replace(each, where=where) for each in measured)
+            rows.append(Row(policy["name"], role, measurements=placed, raw=raw(found, policy, alone), details=told))
+        seen = (*findings(found, bool(self.sustained)), *self._limited(host))
+        valid = validity(seen)
         return Report(
-            "benchmark", title, summary=(summary,), rows=tuple(rows), environment=host, warnings=busy_warning(host)
+            "benchmark",
+            f"Latency of {bundles[0].manifest.name}",
+            verdict="inconclusive" if valid == "invalid" else "info",
+            summary=(self._sentence(rows[0], host, valid, seen),),
+            rows=tuple(rows),
+            environment={**host, **({"target": found["target"]} if "target" in found else {})},
+            warnings=busy_warning(host),
+            validity=valid,
+            findings=seen,
         )
 
-    def _open(self, bundle: Bundle) -> Contestant:
-        manifest = bundle.manifest
-        if manifest.graphs:
-            policy = Policy.open(bundle, engine=self.engine, threads=self.threads, seed=0)
-        elif "factory" in manifest.source:
-            policy = torch_policy(bundle)
-            set_torch_threads(self.threads)
-        else:
-            raise BundleError(f"{bundle.path} has nothing to run.")
-        stage = str(manifest.made_by.get("stage", "policy")).rpartition(".")[2]
-        name = {"torch_module": "torch eager", "onnx": "float32"}.get(stage, stage)
-        return Contestant(name, bundle, policy, observations_for(bundle, 32))
+    def _sentence(self, row: Row, host: Mapping[str, Any], valid: str, seen: Sequence[Finding]) -> str:
+        if valid == "invalid":
+            return f"The measurement is invalid: {seen[0].reason}."
+        where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
+        told = f"{row.name}: {row.value('latency_p50'):.3g} ms median latency on {where}"
+        if self.rate:
+            misses = row.value("deadline_misses")
+            late = f"{misses:.2%} of the ticks are late" if misses else "no tick is late"
+            told = f"{row.name} at {self.rate:g} Hz: {late}, {row.value('latency_p50'):.3g} ms median from the tick to "
+            told += f"its action, on {where}"
+        return told + "."
 
-    def _row(self, contestant: Contestant, reference: Contestant | None) -> Row:
-        samples = contestant.samples
-        measurements = latency_measurements(samples)
-        if reference is not None:
-            measurements.append(speedup(contestant, reference))
-        size = sum(
-            record.bytes for path, record in contestant.bundle.manifest.files.items() if path.startswith("graphs/")
-        )
-        if contestant.bundle.manifest.graphs:
-            measurements.append(Measurement("size", size / 1e6, "MB", note="graphs on disk"))
-            if self.cold:
-                measurements += self._cold(contestant)
-        role = "baseline" if contestant is reference else "subject"
-        tables = _work(contestant.bundle, contestant.policy.engine)
-        return Row(contestant.name, role, measurements=tuple(measurements), raw={"latency_ms": samples}, details=tables)
+    def _limited(self, host: Mapping[str, Any]) -> list[Finding]:
+        if not (self.cores or self.memory_mb):
+            return []
+        name = self._board or "these limits"
+        what = [f"{self.cores} processors"] * bool(self.cores) + [f"{self.memory_mb:,.0f} MB"] * bool(self.memory_mb)
+        told = [Finding("note", f"emulation: limited to {' and '.join(what)} ({name}); the speed is that of this host")]
+        if self.cores > (host.get("cores") or self.cores):
+            told.append(
+                Finding("suspect", f"{name} has {self.cores} processors, this host {host['cores']}",
+                        "measure on a host with as many")
+            )  # fmt: skip
+        return told
 
-    def _cold(self, contestant: Contestant) -> list[Measurement]:
-        found = [cold_start(contestant.bundle.path, self.engine, self.threads) for _ in range(COLD_STARTS)]
-        note = f"import of the runtime, load and one inference; median of {COLD_STARTS} fresh processes"
-        totals = [each["import_ms"] + each["load_ms"] + each["first_ms"] for each in found]
-        peaks = [each["peak_rss_mb"] for each in found]
-        return [
-            Measurement("peak_rss", float(np.median(peaks)), "MB", samples=COLD_STARTS, note=note),
-            Measurement("cold_start", float(np.median(totals)), "ms", samples=COLD_STARTS, note=note),
-        ]
+
+def processors(text: str) -> tuple[int, ...]:
+    """Return the numbers of ``0-3,6``; none for an empty text.
+
+    Raises:
+        UsageError: when it is no such list.
+    """
+    if not text:
+        return ()
+    if not re.fullmatch(r"\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*", text):
+        raise UsageError(f"--pin is {text!r}; allowed: processors such as 0-3 or 2,4.")
+    ends = [[int(end) for end in part.split("-")] for part in text.split(",")]
+    found = sorted({number for end in ends for number in range(end[0], end[-1] + 1)})
+    if not found:
+        raise UsageError(f"--pin is {text!r}, which names no processor; allowed: such as 0-3 or 2,4.")
+    return tuple(found)
+
+
+def _place(host: Mapping[str, Any]) -> str:
+    return str(host.get("board") or host.get("cpu") or "the target")
+
+
+def _graph_bytes(bundle: Bundle) -> int:
+    return sum(record.bytes for path, record in bundle.manifest.files.items() if path.startswith("graphs/"))
 
 
 def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:
@@ -133,10 +236,3 @@ def busy_warning(host: Mapping[str, Any]) -> tuple[str, ...]:
         f"this host was busy (load {load[0]:.1f} on {cores} cores): the latencies are those of a contended machine; "
         "ratios within the run still compare, absolute values do not; repeat on an idle machine",
     )
-
-
-def set_torch_threads(threads: int) -> None:
-    """Give eager torch as many threads as the engine gets."""
-    import torch
-
-    torch.set_num_threads(threads)

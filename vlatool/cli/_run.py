@@ -123,7 +123,7 @@ def measure(
     with progress(workers or default_workers()) as context:
         bundle = opened(source, context)
         stage.check(bundle, board)
-        report = stage.run(bundle, context)
+        report = (stage if board is None else stage.on(board)).run(bundle, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
     show(report, as_json=as_json, out=out, force=force)

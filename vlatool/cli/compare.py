@@ -36,7 +36,7 @@ def compare(
     bundles = [(path / MANIFEST).is_file() for path in paths]
     if all(bundles):
         with progress() as context:
-            stage = Latency(against=tuple(paths[1:]), iterations=iterations, threads=threads)
+            stage = Latency(against=tuple(paths[1:]), iterations=iterations, threads=threads, duration=0)
             stage.check(None, None)
             report = replace(stage.run(Bundle.open(paths[0]), context), kind="compare")
     elif any(bundles):

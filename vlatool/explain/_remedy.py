@@ -162,7 +162,7 @@ def measure(
             reference = reference or outputs
             each.error = float(np.mean([relative_error(*pair) for pair in zip(outputs, reference, strict=True)]))
         each.contestant = Contestant(each.name, each.bundle, policy, [dict(item) for item in observations])
-    run_interleaved([each.contestant for each in made if each.contestant], ITERATIONS, 5, context)
+    run_interleaved([each.contestant for each in made if each.contestant], ITERATIONS, 5, context.tell)
     return Contest(now, base, [each for each in tried if each.bundle is not None])
 
 

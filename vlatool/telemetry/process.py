@@ -29,24 +29,30 @@ class ProcessReader(Reader):
 
     An involuntary switch means that something else wanted the core. Switches are added up over the threads, those that
     have ended included from the moment they were seen. Steal time is that of the whole machine, over all its cores.
+
+    Args:
+        root: The root of the file system.
+        process: An object of psutil in the place of ``/proc``.
+        number: Another process that is read in the place of this one; 0 for this one.
     """
 
     name = "process"
 
-    def __init__(self, root: Path, process: Any = None) -> None:
+    def __init__(self, root: Path, process: Any = None, number: int = 0) -> None:
         self._root = root
+        self._place = f"proc/{number or 'self'}"
         self._process = process
         self._switches: dict[str, int] = {}
 
     @classmethod
-    def open(cls, root: Path = ROOT, run: Run | None = None) -> ProcessReader | Absent:
+    def open(cls, root: Path = ROOT, run: Run | None = None, number: int = 0) -> ProcessReader | Absent:
         """Read ``/proc``, or open psutil on this machine; absent where there is neither."""
-        found = cls(root)
+        found = cls(root, number=number)
         if found.read():
             return found
         if root == ROOT:
             with contextlib.suppress(ImportError):
-                found = cls(root, importlib.import_module("psutil").Process())
+                found = cls(root, importlib.import_module("psutil").Process(*[number][: bool(number)]))
             if found.read():
                 return found
         return Absent(cls.name, "there is no /proc; elsewhere than on Linux: pip install psutil")
@@ -56,11 +62,11 @@ class ProcessReader(Reader):
         return self._psutil() if self._process is not None else [*self._proc(), *self._steal()]
 
     def _proc(self) -> list[Reading]:
-        times = STAT.search(read_text(self._root, "proc/self/stat") or "")
+        times = STAT.search(read_text(self._root, f"{self._place}/stat") or "")
         found = _times((int(times[1]) + int(times[2])) / TICKS if times else None)
-        resident = RESIDENT.search(read_text(self._root, "proc/self/status") or "")
+        resident = RESIDENT.search(read_text(self._root, f"{self._place}/status") or "")
         found += gauge("process.memory", int(resident[1]) * 1024 / 1e6 if resident else None, _reading.MEGABYTE)
-        for path in listed(self._root, "proc/self/task", "*/status"):
+        for path in listed(self._root, f"{self._place}/task", "*/status"):
             if switches := SWITCHES.search(read_text(self._root, path) or ""):
                 self._switches[path] = int(switches[1])
         return found + _switches(sum(self._switches.values()) if self._switches else None)

@@ -1,0 +1,52 @@
+"""A whole measurement on this machine, in processes of its own."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from vlatool.benchmark._agent import measure
+from vlatool.benchmark._job import Job, Limits
+from vlatool.errors import BundleError, GateFailed, UsageError
+from vlatool.processes import environment
+
+
+def quiet(what, share):
+    """Tell nobody."""
+
+
+def test_a_measurement_holds_the_host_the_board_and_the_cold_starts(float_bundle):
+    told = []
+    job = Job((str(float_bundle.path),), iterations=20, warmup=1, cold=1)
+    found = measure(job, lambda what, share: told.append(what))
+    assert json.loads(json.dumps(found)) == found
+    assert found["host"]["cores"] >= 1
+    assert {"opening", "measuring latency", "cold start of each in a fresh process"} <= set(told)
+    (start,) = found["policies"][0]["cold"]
+    assert start["total_ms"] > start["import_ms"] > 0
+    memory = found["telemetry"]["gauges"]["process.memory"]
+    assert memory["min"] > 10, "of the process that calls the policy"
+    assert found["telemetry"]["counters"]["process.cpu"]["difference"] >= 0
+
+
+def test_what_does_not_fit_fails(float_bundle):
+    with pytest.raises(GateFailed, match=r"does not fit: the process needs more than 30 MB"):
+        measure(Job((str(float_bundle.path),), iterations=20, limits=Limits(memory_mb=30)), quiet)
+
+
+def test_errors_of_the_worker_come_back(tmp_path, float_bundle):
+    with pytest.raises(BundleError, match="There is no bundle at"):
+        measure(Job((str(tmp_path / "none"),)), quiet)
+    with pytest.raises(UsageError, match="There is no engines 'foo'"):
+        measure(Job((str(float_bundle.path),), engine="foo"), quiet)
+
+
+def test_the_agent_speaks_json_lines(float_bundle, tmp_path):
+    command = [sys.executable, "-m", "vlatool.benchmark._agent"]
+    for bundle, last in ((float_bundle.path, "result"), (tmp_path / "none", "vlatool error")):
+        line = json.dumps(Job((str(bundle),), iterations=20).to_dict()) + "\n"
+        done = subprocess.run(command, input=line, text=True, capture_output=True, check=True, env=environment())
+        told = [json.loads(each) for each in done.stdout.splitlines()]
+        assert last in told[-1]
+        assert all("progress" in each for each in told[:-1])

@@ -1,0 +1,75 @@
+"""A process under limits, for real."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from vlatool.benchmark import _limited
+from vlatool.benchmark._job import Job, Limits
+from vlatool.benchmark._limited import chosen, command, grouped
+from vlatool.errors import UsageError
+from vlatool.processes import environment
+
+USES = "import os, sys; print(sorted(os.sched_getaffinity(0)))"
+
+
+def test_without_limits_the_command_is_plain():
+    assert command(Limits(), "json.tool", ["-h"]) == [sys.executable, "-m", "json.tool", "-h"]
+    assert not Limits()
+    assert Limits(cores=1)
+    assert Limits(memory_mb=1)
+
+
+def test_a_module_runs_under_limits(tmp_path):
+    (tmp_path / "told.py").write_text(
+        "import os, resource, sys\n"
+        "print(sys.argv[1:], sorted(os.sched_getaffinity(0)), resource.getrlimit(resource.RLIMIT_DATA)[0])\n"
+    )
+    cpu = sorted(os.sched_getaffinity(0))[-1]
+    words = command(Limits((cpu,), memory_mb=500), "told", ["x", "y"])
+    env = environment()
+    env["PYTHONPATH"] = f"{tmp_path}{os.pathsep}{env['PYTHONPATH']}"
+    done = subprocess.run(words, capture_output=True, text=True, check=True, env=env)
+    assert done.stdout.strip() == f"['x', 'y'] [{cpu}] 500000000"
+
+
+def test_the_first_processors_are_taken_and_missing_ones_named():
+    usable = sorted(os.sched_getaffinity(0))
+    assert chosen(Limits(cores=1)).cpus == (usable[0],)
+    assert chosen(Limits((usable[-1],), 3)).cpus == (usable[-1],)
+    assert chosen(Limits(memory_mb=5)) == Limits(memory_mb=5)
+    with pytest.raises(UsageError, match="names processor 9999; this process may use 0"):
+        chosen(Limits((9999,)))
+
+
+def test_a_control_group_is_made_where_there_is_one_and_removed(tmp_path, monkeypatch):
+    base = tmp_path / "memory"
+    base.mkdir()
+    monkeypatch.setattr(_limited, "GROUPS", ((base, "memory.max", ("memory.swap.max", "0")),))
+    with grouped(Limits(memory_mb=100)) as limits:
+        assert limits.cgroup == "", "a plain directory is no control group"
+        assert list(base.iterdir()) == []
+    with grouped(Limits(cores=1)) as limits:
+        assert limits == Limits(cores=1)
+
+
+def test_what_needs_more_memory_is_stopped(tmp_path):
+    (tmp_path / "hungry.py").write_text(
+        "block = bytearray(400_000_000)\nblock[::4096] = bytes(len(block[::4096]))\nprint('lived')\n"
+    )
+    env = environment()
+    env["PYTHONPATH"] = f"{tmp_path}{os.pathsep}{env['PYTHONPATH']}"
+    with grouped(Limits(memory_mb=200)) as limits:
+        done = subprocess.run(command(limits, "hungry"), capture_output=True, text=True, check=False, env=env)
+    assert done.returncode != 0
+    assert "lived" not in done.stdout
+    assert done.returncode == -9 if limits.cgroup else "MemoryError" in done.stderr
+    assert not limits.cgroup or not os.path.exists(limits.cgroup)
+
+
+def test_a_job_goes_through_json_and_back():
+    job = Job(("a", "b"), rate=5.0, limits=Limits((1, 2), 2, 3.5))
+    assert Job.from_dict(json.loads(json.dumps(job.to_dict()))) == job

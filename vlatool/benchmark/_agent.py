@@ -1,0 +1,147 @@
+"""What runs a benchmark on a machine, this one or another: ``python -m vlatool.benchmark._agent``.
+
+It starts the fresh processes of the cold starts and the worker that calls the policies, records the board while the
+worker runs (in this process, so that no reader shares the worker's interpreter), and says what it found: one line of
+JSON in (the job), lines of JSON out (``progress``, in the end ``result`` or what was raised). It needs the standard
+library, numpy and an engine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from vlatool.benchmark._child import answer, ended, raise_said, too_large
+from vlatool.benchmark._contest import Tell
+from vlatool.benchmark._job import Job, Limits
+from vlatool.benchmark._limited import chosen, command, grouped
+from vlatool.benchmark._probe import cold_start
+from vlatool.bundle import Bundle
+from vlatool.host import fingerprint
+from vlatool.processes import environment
+from vlatool.telemetry import Absent, Recorded, Recorder, open_all
+from vlatool.telemetry.process import ProcessReader
+
+PERIOD_S = 0.2
+WORKER = "vlatool.benchmark._worker"
+
+
+def measure(job: Job, tell: Tell) -> dict[str, Any]:
+    """Measure on this machine.
+
+    Returns:
+        JSON values: ``host``, ``begun_s``, ``ended_s``, ``canary_ms``, ``cpu_s``, ``wall_s``, ``switches``,
+        ``policies`` (one for each bundle) and ``telemetry``.
+
+    Raises:
+        VlatoolError: what a bundle raises; GraphError when a process ends; GateFailed when it needs more memory than
+            the limits leave.
+    """
+    host = fingerprint()  # before the run itself loads the machine
+    with grouped(chosen(job.limits)) as limits:
+        found = _run_worker(job, limits, tell)
+        for number, (path, policy) in enumerate(zip(job.bundles, found["policies"], strict=True)):
+            if job.cold and Bundle.open(Path(path), verify=False).manifest.graphs:
+                tell("cold start of each in a fresh process", number / len(job.bundles))
+                starts = [cold_start(Path(path), job.engine, job.threads, limits) for _ in range(job.cold)]
+                policy["cold"] = starts
+    _fits(found, job.limits)
+    return {"host": host, **found}
+
+
+def _fits(found: Mapping[str, Any], limits: Limits) -> None:
+    """Refuse what a control group lets through: pages of files that others have read already.
+
+    Raises:
+        GateFailed: when more was resident than the limit.
+    """
+    peaks = [each["peak_rss_mb"] for policy in found["policies"] for each in policy.get("cold", ())]
+    peak = max(peaks or [found["peak_rss_mb"]])
+    if limits.memory_mb and peak > limits.memory_mb:
+        raise too_large(limits, f": {peak:,.0f} MB")
+
+
+def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
+    about = ", ".join(job.bundles)
+    with tempfile.TemporaryFile("w+") as log, _started(command(limits, WORKER), log) as worker:
+        assert worker.stdin is not None
+        assert worker.stdout is not None
+        recorder: Recorder | None = None
+        with contextlib.suppress(BrokenPipeError), contextlib.ExitStack() as recording:
+            worker.stdin.write(json.dumps(job.to_dict()) + "\n")
+            worker.stdin.flush()
+            for text in worker.stdout:
+                line: dict[str, Any] = json.loads(text) if text.startswith("{") else {}
+                if "progress" in line:
+                    tell(*line["progress"])
+                elif "ready" in line:
+                    recorder = recording.enter_context(Recorder(_readers(int(line["ready"])), PERIOD_S))
+                    worker.stdin.write("\n")
+                    worker.stdin.flush()
+                elif "result" in line:
+                    found: dict[str, Any] = line["result"]
+                    recording.close()
+                    return {**found, "telemetry": plain(recorder.recorded) if recorder else None}
+                else:
+                    raise_said(line, limits)
+        code = worker.wait()
+        log.seek(0)
+        raise ended(about, code, log.read(), limits)
+
+
+@contextlib.contextmanager
+def _started(words: list[str], log: IO[str]) -> Iterator[subprocess.Popen[str]]:
+    """Start a process, and see to it that it ends with the block."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=log, text=True, env=environment()) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def _readers(worker: int) -> list[Any]:
+    """Return the readers of the board, and one of the worker in the place of that of this process."""
+    found = [each for each in open_all() if _name(each) != ProcessReader.name]
+    return [*found, ProcessReader.open(number=worker)]
+
+
+def _name(each: Any) -> str:
+    return str(each.reader if isinstance(each, Absent) else each.name)
+
+
+def plain(found: Recorded) -> dict[str, Any]:
+    """Return what was recorded as JSON values, times in seconds of ``time.monotonic``."""
+    return {
+        "seconds": found.seconds,
+        "energy": [{**vars(each), "names": list(each.names)} for each in found.energy],
+        "throttled": found.throttled,
+        "throttling": list(found.throttling),
+        "gauges": {
+            name: {**vars(each), "times": list(each.times), "values": list(each.values)}
+            for name, each in found.gauges.items()
+        },
+        "counters": {name: vars(each) for name, each in found.counters.items()},
+        "unmeasured": [vars(each) for each in found.absent],
+    }
+
+
+def main() -> dict[str, Any]:
+    """Run the job that standard input names."""
+    job = Job.from_dict(json.loads(sys.stdin.readline()))
+
+    def tell(what: str, share: float | None) -> None:
+        sys.stdout.write(json.dumps({"progress": [what, share]}) + "\n")
+        sys.stdout.flush()
+
+    return {"result": measure(job, tell)}
+
+
+if __name__ == "__main__":
+    answer(main)

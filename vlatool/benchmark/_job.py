@@ -1,0 +1,70 @@
+"""What is measured, as it is handed from process to process: plain JSON values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the measured processes may use.
+
+    Args:
+        cpus: Numbers of the processors; every one that the process may use anyway when empty.
+        cores: How many of them, the first ones; all when 0.
+        memory_mb: Memory of a process in MB (10^6 bytes); 0 is no limit.
+        cgroup: Directory of the control group that holds the limit; empty when the process limits itself.
+    """
+
+    cpus: tuple[int, ...] = ()
+    cores: int = 0
+    memory_mb: float = 0.0
+    cgroup: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.cpus or self.cores or self.memory_mb)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A measurement.
+
+    Args:
+        bundles: Directories; the first is the reference of ratios.
+        engine: Of the runtime; that which each bundle was made for when empty.
+        threads: Intra-op threads.
+        iterations: Calls of each that count, at least.
+        duration: Seconds that the calls of each last, at least; with ``iterations`` the later of both.
+        warmup: Calls before the first that counts.
+        rate: Ticks in a second of a control loop; 0 calls back to back. One bundle only.
+        phases: Also time the parts of an inference.
+        cold: Fresh processes for the cold start of each.
+        check: Also look for answers that differ between runs, and for answers from memory.
+        limits: Of every process.
+    """
+
+    bundles: tuple[str, ...]
+    engine: str = ""
+    threads: int = 1
+    iterations: int = 200
+    duration: float = 0.0
+    warmup: int = 10
+    rate: float = 0.0
+    phases: bool = False
+    cold: int = 0
+    check: bool = True
+    limits: Limits = Limits()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, found: Mapping[str, Any]) -> Job:
+        """Read what ``to_dict`` wrote."""
+        limits = dict(found.get("limits") or {})
+        limits["cpus"] = tuple(limits.get("cpus", ()))
+        return cls(**{**found, "bundles": tuple(found["bundles"]), "limits": Limits(**limits)})

@@ -1,0 +1,141 @@
+"""A control loop at a fixed rate: what each of its ticks gets, measured from the moment at which the tick was due.
+
+The loop wants one action at every tick, from an observation of that tick, before the next one. It sleeps until a tick
+is due, infers, and goes on to the newest tick that is due then: those in between were passed over while the policy
+computed. Such a tick has waited for the next action all the same, so it counts with the time until that action
+(otherwise one stall of 50 ms at 100 Hz would count once instead of five times: coordinated omission).
+"""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from vlatool.benchmark._answers import Answers
+from vlatool.report import Measurement
+from vlatool.runtime.policy import Policy
+from vlatool.statistics import wilson
+
+MANY = 50
+"""Ticks between two reports of progress."""
+
+
+def _doubles() -> array[float]:
+    return array("d")
+
+
+@dataclass
+class Ticks:
+    """What a loop saw, one entry for each tick.
+
+    Args:
+        period_ms: Between two ticks.
+        response_ms: From the moment at which a tick was due to the action that served it.
+        due_s: When it was due, ``time.monotonic``.
+        wakeup_ms: How late the loop began a tick that it served itself.
+        age_ms: How old the observation behind the newest action was when the tick was due; from the second action on.
+        passed_over: Ticks that began and ended while the policy computed.
+    """
+
+    period_ms: float
+    response_ms: array[float] = field(default_factory=_doubles)
+    due_s: array[float] = field(default_factory=_doubles)
+    wakeup_ms: array[float] = field(default_factory=_doubles)
+    age_ms: array[float] = field(default_factory=_doubles)
+    passed_over: int = 0
+
+    @property
+    def misses(self) -> int:
+        """Ticks whose action came after the next tick was due."""
+        return sum(value > self.period_ms for value in self.response_ms)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values."""
+        return {
+            "period_ms": self.period_ms,
+            "wakeup_ms": list(self.wakeup_ms),
+            "age_ms": list(self.age_ms),
+            "misses": self.misses,
+            "passed_over": self.passed_over,
+        }
+
+
+def run_paced(
+    policy: Policy,
+    observations: Sequence[Mapping[str, Any]],
+    rate: float,
+    ticks: int,
+    answers: Answers | None = None,
+    tell: Callable[[str, float | None], None] = lambda what, share: None,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Ticks:
+    """Serve ticks of a control loop.
+
+    Args:
+        policy: Answers.
+        observations: In turns.
+        rate: Ticks in a second.
+        ticks: How many.
+        answers: What the policy is expected to answer.
+        tell: What is being done, and the share that is done.
+        clock, sleep: In seconds; other ones in tests.
+    """
+    period = 1.0 / rate
+    found = Ticks(period * 1e3)
+    begun = clock() + period
+    tick, served, last_told = 0, 0, 0
+    actions: list[tuple[float, float]] = []  # the last two: when the observation was taken, when the action was there
+    while tick < ticks:
+        due = begun + tick * period
+        if (left := due - clock()) > 0:
+            sleep(left)
+        now = clock()
+        newest = min(ticks - 1, max(tick, int((now - begun) / period)))
+        place = served % len(observations)
+        if not place:
+            policy.reset()
+        began = clock()
+        action = policy.infer(observations[place])
+        done = clock()
+        found.wakeup_ms.append((began - (begun + newest * period)) * 1e3)
+        found.passed_over += newest - tick
+        for each in range(tick, newest + 1):
+            when = begun + each * period
+            found.due_s.append(when)
+            found.response_ms.append((done - when) * 1e3)
+            if there := [taken for taken, ready in actions if ready <= when]:
+                found.age_ms.append((when - there[-1]) * 1e3)
+        actions = [*actions[-1:], (now, done)]
+        served, tick = served + 1, newest + 1
+        if answers is not None:
+            answers.look(place, action.outputs)
+        if tick - last_told >= MANY:
+            tell(f"serving ticks at {rate:g} Hz", tick / ticks)
+            last_told = tick
+    return found
+
+
+def paced_measurements(found: Mapping[str, Any], ticks: int, rate: float) -> list[Measurement]:
+    """Return misses, ages and lateness of a loop from ``Ticks.to_dict``."""
+    misses, period = int(found["misses"]), float(found["period_ms"])
+    low, high = wilson(misses, ticks)
+    note = f"ticks at {rate:g} Hz whose action came after the next tick, {period:g} ms later; "
+    note += f"{found['passed_over']} of them were passed over while the policy computed"
+    measured = [Measurement("deadline_misses", misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
+    ages, late = sorted(found["age_ms"]), sorted(found["wakeup_ms"])
+    about = "age of the observation behind the newest action when a tick is due"
+    for name, share in (("age_p50", 0.5), ("age_p99", 0.99), ("age_max", 1.0)):
+        if ages:
+            measured.append(Measurement(name, _at(ages, share), "ms", samples=len(ages), note=about))
+    about = "how late the loop begins a tick"
+    for name, share in (("wakeup_p50", 0.5), ("wakeup_p99", 0.99)):
+        measured.append(Measurement(name, _at(late, share), "ms", samples=len(late), note=about))
+    return measured
+
+
+def _at(ordered: Sequence[float], share: float) -> float:
+    return float(ordered[min(len(ordered) - 1, int(share * len(ordered)))])

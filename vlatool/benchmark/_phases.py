@@ -1,0 +1,81 @@
+"""Where the time of an inference goes: encoding, each graph of the program, decoding."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import Program, Session
+
+ACTIONS = 60
+FEWEST = 5
+ENCODE, REST = "encode observation", "decode action and the rest"
+
+
+class _Timed:
+    """A session that notes how long each run takes."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.taken: list[float] = []
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        start = time.perf_counter_ns()
+        found = self._session.run(feeds)
+        self.taken.append((time.perf_counter_ns() - start) / 1e6)
+        return found
+
+
+def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], seconds: float) -> list[dict[str, Any]]:
+    """Return a line for each phase: ``phase``, ``calls`` in an action, ``p50 ms`` of a call, ``share %`` of an action.
+
+    Args:
+        policy: Left as it was.
+        observations: In turns.
+        seconds: After which no further action begins, once ``FEWEST`` are timed.
+    """
+    sessions = {name: _Timed(session) for name, session in policy.program.sessions.items()}
+    seed = 0
+    timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed), policy.engine)
+    encode, encoded = timed.encode, []
+
+    def noted(observation: Mapping[str, Any]) -> dict[str, Any]:
+        start = time.perf_counter_ns()
+        found = encode(observation)
+        encoded.append((time.perf_counter_ns() - start) / 1e6)
+        return found
+
+    timed.encode = noted  # type: ignore[assignment]
+    whole: list[float] = []
+    end = time.monotonic() + seconds
+    for number in range(ACTIONS):
+        if number >= FEWEST and time.monotonic() > end:
+            break
+        start = time.perf_counter_ns()
+        timed.infer(observations[number % len(observations)])
+        whole.append((time.perf_counter_ns() - start) / 1e6)
+    return _table(whole, encoded, {name: session.taken for name, session in sessions.items()})
+
+
+def _table(
+    whole: Sequence[float], encoded: Sequence[float], graphs: Mapping[str, Sequence[float]]
+) -> list[dict[str, Any]]:
+    actions = len(whole)
+    sums = {ENCODE: np.array(encoded)}
+    sums |= {name: np.array(taken).reshape(actions, -1).sum(1) for name, taken in graphs.items() if taken}
+    sums[REST] = np.array(whole) - sum(sums.values())
+    total = float(np.median(whole))
+    calls = {name: len(taken) // actions for name, taken in graphs.items()}
+    return [
+        {
+            "phase": name,
+            "calls": calls.get(name, 1),
+            "p50 ms": round(float(np.median(each)) / calls.get(name, 1), 5),
+            "share %": round(100 * float(np.median(each)) / total, 1),
+        }
+        for name, each in sums.items()
+    ]

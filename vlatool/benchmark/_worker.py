@@ -1,0 +1,193 @@
+"""The process that calls the policies: ``python -m vlatool.benchmark._worker``.
+
+It reads a job (one line of JSON), opens and warms up, says ``{"ready": PID}`` and waits for a line: whoever started it
+begins to record the board then. It says ``{"progress": [what, share]}`` meanwhile and ``{"result": ...}``, or what it
+raised, in the end. It imports what a robot imports, so that its memory is that of a robot's process.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from vlatool.benchmark._answers import expected_answers, remembered
+from vlatool.benchmark._canary import canary_ms
+from vlatool.benchmark._child import answer
+from vlatool.benchmark._contest import Contestant, Tell, run_interleaved, unique_names
+from vlatool.benchmark._job import Job
+from vlatool.benchmark._memory import peak_rss_mb
+from vlatool.benchmark._paced import run_paced
+from vlatool.benchmark._phases import time_phases
+from vlatool.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import BundleError
+from vlatool.runtime.policy import Policy
+
+OBSERVATIONS = 32
+GOLDEN_TOLERANCE = 0.25
+EXTRA_S = 3.0
+"""Seconds at most for the phases, and for the look at repeated observations."""
+
+
+def main() -> dict[str, Any]:
+    """Run the job that standard input names."""
+    job = Job.from_dict(json.loads(sys.stdin.readline()))
+
+    def wait() -> None:
+        _say({"ready": os.getpid()})
+        sys.stdin.readline()
+
+    return {"result": run_job(job, lambda what, share: _say({"progress": [what, share]}), wait)}
+
+
+def _say(line: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(line) + "\n")
+    sys.stdout.flush()
+
+
+def run_job(job: Job, tell: Tell, wait: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """Measure in this process.
+
+    Args:
+        job: What to measure.
+        tell: What is being done, and the share that is done.
+        wait: Called when all is open and warm, before the first call that counts.
+
+    Returns:
+        JSON values; ``policies`` has an entry for each bundle.
+
+    Raises:
+        VlatoolError: what a bundle raises.
+    """
+    tell("opening", None)
+    contestants = [opened(path, job) for path in job.bundles]
+    unique_names(contestants)
+    return measure(contestants, job, tell, wait)
+
+
+def measure(contestants: Sequence[Contestant], job: Job, tell: Tell, wait: Callable[[], None]) -> dict[str, Any]:
+    """Measure policies that are open."""
+    for contestant in contestants:
+        tell("warming up", None)
+        if job.check:
+            contestant.answers = expected_answers(contestant.policy, contestant.observations)
+            contestant.observations = contestant.observations[: len(contestant.answers)]
+        for index in range(job.warmup):
+            contestant.policy.infer(contestant.observations[index % len(contestant.observations)])
+    gc.collect()
+    gc.freeze()
+    canaries: list[float] = []
+    wait()
+    before = _usage()
+    begun = time.monotonic()
+    paced = None
+    if job.rate:
+        only = contestants[0]
+        canaries.append(canary_ms())
+        ticks = max(job.iterations, round(job.duration * job.rate))
+        seen = run_paced(only.policy, only.observations, job.rate, ticks, only.answers, tell)
+        only.blocks, only.starts, paced = [seen.response_ms], seen.due_s, seen.to_dict()
+        canaries.append(canary_ms())
+    else:
+        run_interleaved(contestants, job.iterations, 0, tell, job.duration, lambda: canaries.append(canary_ms()))
+    ended = time.monotonic()
+    found: dict[str, Any] = {"begun_s": begun, "ended_s": ended, "canary_ms": canaries, **_used(before, _usage())}
+    found["peak_rss_mb"] = peak_rss_mb()
+    found["policies"] = [_policy(each, job, begun, tell) for each in contestants]
+    found["policies"][0]["paced"] = paced
+    return found
+
+
+def opened(path: str, job: Job) -> Contestant:
+    """Open a bundle through the runtime, or a torch source in eager torch.
+
+    Raises:
+        BundleError: when there is nothing to run.
+    """
+    bundle = Bundle.open(Path(path))
+    manifest = bundle.manifest
+    if manifest.graphs:
+        policy = Policy.open(bundle, engine=job.engine, threads=job.threads, seed=0)
+        policy.warm_up(1, GOLDEN_TOLERANCE)
+    elif "factory" in manifest.source:
+        from vlatool.export._torch_policy import torch_policy
+
+        policy = torch_policy(bundle)
+        _set_torch_threads(job.threads)
+    else:
+        raise BundleError(f"{bundle.path} has nothing to run.")
+    stage = str(manifest.made_by.get("stage", "policy")).rpartition(".")[2]
+    name = {"torch_module": "torch eager", "onnx": "float32"}.get(stage, stage)
+    return Contestant(name, bundle, policy, observations_for(bundle, OBSERVATIONS))
+
+
+def _policy(contestant: Contestant, job: Job, begun: float, tell: Tell) -> dict[str, Any]:
+    policy = contestant.policy
+    found: dict[str, Any] = {
+        "name": contestant.name,
+        "blocks_ms": [[round(value, 6) for value in block] for block in contestant.blocks],
+        "at_s": [round(start - begun, 6) for start in contestant.starts],
+        "engine": policy.engine,
+        "engines": _engines(policy),
+        "golden_error": policy.golden_error,
+    }
+    if contestant.answers is not None:
+        found["answers"] = contestant.answers.to_dict()
+        tell("repeated against fresh observations", None)
+        memory = remembered(policy, contestant.observations, EXTRA_S)
+        found["memory"] = None if memory is None else {**vars(memory), "remembers": memory.remembers}
+    if job.phases and contestant.bundle.manifest.graphs:
+        tell("timing the phases", None)
+        found["phases"] = time_phases(policy, contestant.observations, EXTRA_S)
+    return found
+
+
+def _engines(policy: Policy) -> list[dict[str, Any]]:
+    """Return for each graph what runs it, as the session says."""
+    found = []
+    for name, graph in policy.bundle.manifest.graphs.items():
+        session = policy.program.sessions[name]
+        shares = sorted(graph.precision.items(), key=lambda item: -item[1])
+        found.append(
+            {
+                "graph": name,
+                "engine": policy.engine,
+                "version": session.version() if hasattr(session, "version") else "",
+                "providers": ", ".join(getattr(session, "providers", [])) or "CPU",
+                "computes in": getattr(session, "precision", graph.compute or "float32"),
+                "MACs in": ", ".join(f"{kind} {share:.1%}" for kind, share in shares),
+            }
+        )
+    return found
+
+
+def _usage() -> dict[str, float]:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return {
+        "cpu_s": used.ru_utime + used.ru_stime,
+        "switches": used.ru_nivcsw,
+        "wall_s": time.monotonic(),
+        "faults": used.ru_majflt,
+    }
+
+
+def _used(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
+    return {name: after[name] - before[name] for name in before}
+
+
+def _set_torch_threads(threads: int) -> None:
+    """Give eager torch as many threads as the engine gets."""
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+if __name__ == "__main__":
+    answer(main)
