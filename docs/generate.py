@@ -30,7 +30,7 @@ def main() -> None:
         "command-line.md": command_line_page(),
         "manifest.md": fields_page("manifest.json", [manifest.Manifest, spec.PolicySpec, spec.TensorSpec,
                                                      manifest.ProgramStep, manifest.Graph]),
-        "report.md": fields_page("report.json", [report.Report, report.Row, report.Measurement]),
+        "report.md": fields_page("report.json", [report.Report, report.Row, report.Measurement, report.Finding]),
         "errors.md": errors_page(),
         "profiles.md": profiles_page(),
         "gate.md": gate_page(),

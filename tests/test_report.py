@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import DataError
-from vlatool.report import Measurement, Report, Row, read_report
+from vlatool.report import Finding, Measurement, Report, Row, read_report
 
 REPORT = Report(
     "optimize",
@@ -34,6 +34,8 @@ REPORT = Report(
     "2026-01-01T00:00:00Z",
     {"cpu": "x"},
     ("The clock changed.",),
+    validity="suspect",
+    findings=(Finding("suspect", "It throttled once.", "cool it"), Finding("note", "No battery.")),
 )
 
 
@@ -42,6 +44,13 @@ def test_a_report_survives_json():
     assert again.to_json() == REPORT.to_json()
     assert again.rows[0] == REPORT.rows[0]
     assert (again.title, again.summary, again.warnings) == (REPORT.title, REPORT.summary, REPORT.warnings)
+    assert (again.validity, again.findings) == (REPORT.validity, REPORT.findings)
+
+
+def test_a_report_without_a_judgement_is_not_judged():
+    old = {key: value for key, value in json.loads(REPORT.to_json()).items() if key not in ("validity", "findings")}
+    again = Report.from_json(json.dumps(old))
+    assert (again.validity, again.findings) == ("", ())
 
 
 def test_numbers_that_could_not_be_had_are_null_and_come_back_as_nan():
@@ -74,6 +83,9 @@ def test_a_measured_value_is_never_mixed_with_a_predicted_one():
         lambda: Measurement("x", 1.0, "ms", origin="guessed"),
         lambda: Row("x", "winner"),
         lambda: Report("optimize", "t", "great"),
+        lambda: Report("optimize", "t", validity="fine"),
+        lambda: Finding("bad", "x"),
+        lambda: Finding("note", 1),
     ],
 )
 def test_words_outside_the_vocabulary_are_refused(make):
@@ -101,6 +113,9 @@ def test_a_key_of_a_later_vlatool_is_passed_over():
         '{"schema": 1}',
         '{"schema": "1"}',
         '{"schema": 1, "kind": "a", "title": "t", "rows": [1]}',
+        '{"schema": 1, "kind": "a", "title": "t", "validity": "fine"}',
+        '{"schema": 1, "kind": "a", "title": "t", "findings": [{"effect": "bad", "reason": "x"}]}',
+        '{"schema": 1, "kind": "a", "title": "t", "findings": ["x"]}',
     ],
 )
 def test_text_that_is_no_report(text):

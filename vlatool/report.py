@@ -16,6 +16,8 @@ REPORT = "report.json"
 ORIGINS = ("measured", "predicted")
 VERDICTS = ("pass", "fail", "inconclusive", "info")
 ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")
+VALIDITIES = ("", "valid", "suspect", "invalid")
+EFFECTS = ("note", "suspect", "invalid")
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,27 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """What was seen that bears on whether the measurement can be trusted.
+
+    Args:
+        effect: ``invalid`` (the numbers must not be used), ``suspect`` (they may be wrong) or ``note``.
+        reason: What was seen, with its numbers.
+        remedy: What to do about it; empty when there is nothing to do.
+    """
+
+    effect: str
+    reason: str
+    remedy: str = ""
+
+    def __post_init__(self) -> None:
+        if self.effect not in EFFECTS:
+            raise ValueError(f"effect is {self.effect!r}; allowed: {', '.join(EFFECTS)}")
+        if not isinstance(self.reason, str) or not isinstance(self.remedy, str):
+            raise ValueError(f"reason and remedy are {self.reason!r} and {self.remedy!r}; allowed: text")
+
+
+@dataclass(frozen=True)
 class Report:
     """What a command found out.
 
@@ -111,6 +134,9 @@ class Report:
         created: UTC time, ISO 8601.
         environment: The machine, its state and the versions (see ``vlatool.host``).
         warnings: What a reader should know before trusting the numbers, with the remedy.
+        schema: Version of this format.
+        validity: Whether the measurement can be trusted: one of ``VALIDITIES``; empty when nobody judged it.
+        findings: Why, each with its remedy.
     """
 
     kind: str
@@ -124,10 +150,14 @@ class Report:
     environment: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     schema: int = SCHEMA
+    validity: str = ""
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
             raise ValueError(f"verdict is {self.verdict!r}; allowed: {', '.join(VERDICTS)}")
+        if self.validity not in VALIDITIES:
+            raise ValueError(f"validity is {self.validity!r}; allowed: {', '.join(VALIDITIES)}")
 
     def to_json(self) -> str:
         """Return JSON; NaN is written as null."""
@@ -151,6 +181,7 @@ class Report:
             values["rows"] = tuple(_row(row) for row in data.get("rows", ()))
             values["summary"] = tuple(data.get("summary", ()))
             values["warnings"] = tuple(data.get("warnings", ()))
+            values["findings"] = tuple(Finding(**item) for item in data.get("findings", ()))
             return cls(**values)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise DataError(f"This is no vlatool report: {error}.") from error
