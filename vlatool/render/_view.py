@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,27 @@ ACCURACY = ("success", "agreement", "agreement_expert", "agreement_baseline")
 ERRORS = ("error", "error_expert", "error_baseline")
 ROLES = {"subject": "measured", "within": "within limits", "outside": "outside limits"}
 ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
+PERCENTILES = ("latency_p50", "latency_p90", "latency_p95", "latency_p99", "latency_p99.9", "latency_max")
+ORDER = (
+    *(
+        "speedup",
+        "throughput",
+        "jitter",
+        "deadline_misses",
+        "age_p50",
+        "age_p99",
+        "age_max",
+        "wakeup_p50",
+        "wakeup_p99",
+    ),
+    *("latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu"),
+    *("size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max"),
+)
+"""The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
+TABLES = ("memory by part", "time by phase", "cold start by part", "telemetry")
+"""The details that come first, in this order."""
+ABSENT = "unmeasured"
+"""The details table that says what could not be had; shown with the numbers that are NaN."""
 SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
 
 
@@ -62,8 +83,20 @@ def headline(report: Report) -> list[str]:
 
 def other_names(report: Report) -> list[str]:
     """Return the measured names that neither the headline nor the error table shows."""
-    shown = set(headline(report))
-    return [name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name)]
+    shown = {*headline(report), *percentile_names(report)}
+    return in_order(name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name))
+
+
+def percentile_names(report: Report) -> list[str]:
+    """Return the measured percentiles of the latency when there are enough of them for a table of their own."""
+    present = names(report)
+    found = [name for name in PERCENTILES if name in present]
+    return found if len(found) > 2 else []
+
+
+def in_order(found: Iterable[str]) -> list[str]:
+    """Return names of measurements in the order in which a reader asks for them."""
+    return sorted(found, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
 
 
 def short(name: str) -> str:
@@ -154,19 +187,34 @@ def matrix(
     return [report.rows[index].name for index in kept], cells
 
 
-def unmeasured(report: Report) -> list[str]:
-    """Return a sentence for each number that could not be had."""
-    found = []
+def unmeasured(report: Report, passed_over: Iterable[str] = ()) -> list[str]:
+    """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
+
+    Args:
+        report: The report.
+        passed_over: Names of measurements whose reason stands elsewhere.
+    """
+    left = set(passed_over)
+    found: dict[tuple[str, str], list[str]] = {}
     for row in report.rows:
-        for item in row.measurements:
-            if not item.known:
-                reason = f": {plain(item.note)}" if item.note else ""
-                found.append(
-                    f"{plain(row.name)}, {label(item.name)}, {item.origin} for {plain(item.where)}{reason}"
-                    if item.origin == "predicted"
-                    else f"{plain(row.name)}, {label(item.name)}{reason}"
-                )
-    return found
+        missing = [
+            (
+                f"{label(item.name)}{f', predicted for {plain(item.where)}' if item.origin == 'predicted' else ''}",
+                item.note,
+            )
+            for item in row.measurements
+            if not item.known and item.name not in left
+        ]
+        told = [(record.get("what", ""), record.get("why", "")) for record in row.details.get(ABSENT, ())]
+        for what, why in [*missing, *told]:
+            rows = found.setdefault((plain(what), plain(why)), [])
+            if row.name not in rows:
+                rows.append(row.name)
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for (what, why), rows in found.items():
+        whose = "" if len(rows) == len(report.rows) else f"{', '.join(plain(name) for name in rows)}, "
+        grouped.setdefault((whose, why), []).append(what)
+    return [f"{whose}{', '.join(what)}{f': {why}' if why else ''}" for (whose, why), what in grouped.items()]
 
 
 def role(row: Row) -> str:
@@ -180,7 +228,7 @@ def latency(report: Report) -> Latency:
     for name, wanted in report.limits.items():
         numeric = isinstance(wanted, int | float) and not isinstance(wanted, bool)
         if numeric and name.endswith("_ms") and ("latency" in name or "deadline" in name):
-            hit = re.search(r"p\d+", name)
+            hit = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
             chosen = f"latency_{hit[0]}" if hit else "latency_p50"
             if chosen in present:
                 return Latency(chosen, float(wanted), plain(name))
@@ -223,9 +271,11 @@ def facts(environment: Mapping[str, Any], prefix: str = "") -> list[tuple[str, s
 
 def details(report: Report) -> list[Table]:
     """Return the details of all rows; the same table of several variants becomes one, with a column for the variant."""
-    by_title: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    by_title: dict[str, list[tuple[str, dict[str, Any]]]] = {title: [] for title in TABLES}
     for row in report.rows:
         for title, records in row.details.items():
+            if title == ABSENT:
+                continue
             records = [record for record in records if record]
             by_title.setdefault(title, []).extend((row.name, dict(record)) for record in records)
     return [_details_table(plain(title), records) for title, records in by_title.items() if records]
