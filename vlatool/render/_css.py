@@ -86,6 +86,17 @@ background:var(--grid);border-radius:2px}
 .groups tbody tr:first-child td{border-top:0}.groups{border-bottom:1px solid var(--rule)}
 .pairs{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:6px 28px;margin:0;font-size:13.5px}
 .pairs dt{color:var(--muted);font-size:12px}.pairs dd{margin:0}
+.trust{margin:16px 0 0;padding:11px 16px;border-left:3px solid var(--info);background:var(--wash);
+border-radius:0 5px 5px 0;max-width:90ch}
+.trust.suspect{border-color:var(--inconclusive);background:var(--inconclusive-wash)}
+.trust.invalid{border-color:var(--fail);background:var(--fail-wash)}.trust.valid{border-color:var(--pass)}
+.trust p{margin:0;font-weight:620}.trust ul{margin:6px 0 0;padding:0;list-style:none;font-size:14px}
+.trust li{margin-top:5px}.trust li b{font-weight:620;margin-right:4px}.trust b.note{color:var(--muted)}
+.trust b.suspect{color:var(--inconclusive)}.trust b.invalid{color:var(--fail)}.remedy{color:var(--muted)}
+.percentiles{width:auto;min-width:min(100%,420px)}.percentiles .bound{color:var(--muted)}
+.percentiles .why{color:var(--muted);font-size:12.5px;font-style:italic;max-width:34ch}
+.parts td:last-child,.parts th:last-child{width:42%;min-width:80px;padding-right:0;padding-left:18px}
+.parts .bar{min-width:60px;height:9px;background:none}
 .guess{border:1px dashed var(--guess-rule);border-radius:8px;background:var(--guess-wash);padding:20px 22px}
 .guess .kind{color:var(--guess);border-color:var(--guess-rule)}
 .guess th,.guess td,.guess thead th{border-color:var(--guess-rule)}
@@ -116,6 +127,8 @@ font-variant-numeric:tabular-nums}
 .ring{fill:none;stroke:var(--series);stroke-width:1.5}
 .limit{stroke:var(--limit);stroke-width:1.4;stroke-dasharray:5 3}.chart .limit-text{fill:var(--limit)}
 .outside{fill:var(--limit-wash)}.front{stroke:var(--muted);stroke-width:1;stroke-dasharray:2 3}
+.s-gauge{--series:var(--muted)}.line.s-gauge{stroke-width:1.2}
+.throttle{stroke:var(--limit);stroke-width:1;opacity:.55}
 .halo{paint-order:stroke;stroke:var(--paper);stroke-width:3.5px;stroke-linejoin:round}
 """
 

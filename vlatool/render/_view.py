@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vlatool.render._format import cell, fixed, interval, is_usual, label, plain
+from vlatool.render._format import cell, interval, is_usual, label, plain
 from vlatool.report import Measurement, Report, Row
 
 ACCURACY = ("success", "agreement", "agreement_expert", "agreement_baseline")
@@ -32,21 +32,9 @@ ORDER = (
     *("size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max"),
 )
 """The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
-TABLES = ("memory by part", "time by phase", "cold start by part", "telemetry")
-"""The details that come first, in this order."""
 ABSENT = "unmeasured"
 """The details table that says what could not be had; shown with the numbers that are NaN."""
 SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of texts; ``numeric`` tells which columns to align right."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    numeric: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
@@ -56,6 +44,11 @@ class Latency:
     name: str
     limit: float | None
     limit_name: str = ""
+
+    @property
+    def word(self) -> str:
+        """What the limit is called in a drawing."""
+        return "deadline" if "deadline" in self.limit_name else "limit"
 
 
 def measured(report: Report, name: str) -> list[Measurement | None]:
@@ -223,8 +216,15 @@ def role(row: Row) -> str:
 
 
 def latency(report: Report) -> Latency:
-    """Return which latency percentile the limit speaks of, and the limit."""
+    """Return which latency percentile the limit speaks of, and the limit.
+
+    A benchmark at a rate (``hz``) has its period as the deadline. The rate that ``optimize`` was asked for is no
+    limit on this host.
+    """
     present = names(report)
+    rate = report.limits.get("hz")
+    if report.kind == "benchmark" and isinstance(rate, int | float) and rate > 0 and "deadline_ms" not in report.limits:
+        return Latency("latency_p50", 1e3 / rate, "deadline")
     for name, wanted in report.limits.items():
         numeric = isinstance(wanted, int | float) and not isinstance(wanted, bool)
         if numeric and name.endswith("_ms") and ("latency" in name or "deadline" in name):
@@ -267,55 +267,3 @@ def facts(environment: Mapping[str, Any], prefix: str = "") -> list[tuple[str, s
         else:
             found.append((name, cell(content)))
     return found
-
-
-def details(report: Report) -> list[Table]:
-    """Return the details of all rows; the same table of several variants becomes one, with a column for the variant."""
-    by_title: dict[str, list[tuple[str, dict[str, Any]]]] = {title: [] for title in TABLES}
-    for row in report.rows:
-        for title, records in row.details.items():
-            if title == ABSENT:
-                continue
-            records = [record for record in records if record]
-            by_title.setdefault(title, []).extend((row.name, dict(record)) for record in records)
-    return [_details_table(plain(title), records) for title, records in by_title.items() if records]
-
-
-def _details_table(title: str, records: list[tuple[str, dict[str, Any]]]) -> Table:
-    columns = list(dict.fromkeys(key for _, record in records for key in record))
-    several = len({name for name, _ in records}) > 1
-    if several:
-        order = list(dict.fromkeys(cell(record.get(columns[0])) for _, record in records))
-        records = sorted(records, key=lambda item: order.index(cell(item[1].get(columns[0]))))
-    numeric = [
-        all(
-            isinstance(record.get(key), int | float | None) and not isinstance(record.get(key), bool)
-            for _, record in records
-        )
-        for key in columns
-    ]
-    by_column = [_cells([record.get(key) for _, record in records]) for key in columns]
-    rows = list(zip(*by_column, strict=True))
-    heads = tuple(plain(key) for key in columns)
-    if not several:
-        only = plain(records[0][0])
-        return Table(f"{title}: {only}", heads, tuple(rows), tuple(numeric))
-    lead: list[tuple[str, ...]] = []
-    group = ""
-    for (name, _), row in zip(records, rows, strict=True):
-        again = bool(lead) and row[0] == group
-        group = row[0]
-        lead.append(("" if again and not numeric[0] else row[0], plain(name), *row[1:]))
-    return Table(title, (heads[0], "variant", *heads[1:]), tuple(lead), (numeric[0], False, *numeric[1:]))
-
-
-def _cells(contents: list[Any]) -> list[str]:
-    """Return the texts of one column; its floats get the same decimals."""
-    floats = [item for item in contents if isinstance(item, float) and math.isfinite(item)]
-    texts = [f"{item:.4g}" for item in floats]
-    if any("e" in text for text in texts):
-        return [cell(item) for item in contents]
-    decimals = max((len(text.partition(".")[2]) for text in texts), default=0)
-    return [
-        fixed(item, decimals) if isinstance(item, float) and math.isfinite(item) else cell(item) for item in contents
-    ]

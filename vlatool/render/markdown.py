@@ -8,11 +8,11 @@ from collections.abc import Iterable, Sequence
 from vlatool.render._boards import HEADS, KIND, by_state, cells, costs, reasons
 from vlatool.render._format import full, label, limit, plain
 from vlatool.render._percentiles import percentiles
+from vlatool.render._tables import details
 from vlatool.render._trust import MARKS as TRUST
 from vlatool.render._trust import findings, reason, remedy, sentence
 from vlatool.render._view import (
     brackets,
-    details,
     error_groups,
     facts,
     headline,

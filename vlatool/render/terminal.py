@@ -14,10 +14,10 @@ from vlatool.render._format import aside, count, label, limit, plain, quantity, 
 from vlatool.render._grid import grid
 from vlatool.render._percentiles import percentiles
 from vlatool.render._samples import finite, sparkline
+from vlatool.render._tables import details
 from vlatool.render._trust import findings, reason, remedy, sentence
 from vlatool.render._view import (
     brackets,
-    details,
     error_groups,
     facts,
     headline,
