@@ -92,11 +92,14 @@ border-radius:0 5px 5px 0;max-width:90ch}
 .trust.invalid{border-color:var(--fail);background:var(--fail-wash)}.trust.valid{border-color:var(--pass)}
 .trust p{margin:0;font-weight:620}.trust ul{margin:6px 0 0;padding:0;list-style:none;font-size:14px}
 .trust li{margin-top:5px}.trust li b{font-weight:620;margin-right:4px}.trust b.note{color:var(--muted)}
-.trust b.suspect{color:var(--inconclusive)}.trust b.invalid{color:var(--fail)}.remedy{color:var(--muted)}
+.trust b.suspect{color:var(--inconclusive)}.trust b.invalid{color:var(--fail)}.remedy{display:block;color:var(--muted)}
 .percentiles{width:auto;min-width:min(100%,420px)}.percentiles .bound{color:var(--muted)}
 .percentiles .why{color:var(--muted);font-size:12.5px;font-style:italic;max-width:34ch}
-.parts td:last-child,.parts th:last-child{width:42%;min-width:80px;padding-right:0;padding-left:18px}
-.parts .bar{min-width:60px;height:9px;background:none}
+.percentiles .over th,.percentiles .over td{border-bottom:0;padding-bottom:0}
+.groups thead td{border-bottom:1px solid var(--muted)}
+.parts td:last-child{width:42%;min-width:80px;padding-right:0;padding-left:18px;vertical-align:middle}
+.parts .whose{white-space:nowrap}
+.parts .bar{min-width:60px;height:9px;margin:0;background:none}
 .guess{border:1px dashed var(--guess-rule);border-radius:8px;background:var(--guess-wash);padding:20px 22px}
 .guess .kind{color:var(--guess);border-color:var(--guess-rule)}
 .guess th,.guess td,.guess thead th{border-color:var(--guess-rule)}
@@ -138,6 +141,8 @@ main{padding:26px 16px 48px}h1{font-size:22px}section{margin-top:36px}
 .result{flex-direction:column;gap:8px}.result p{font-size:16px}
 .wide{display:none}.narrow{display:block}
 .guess{padding:16px 14px}
+.parts{font-size:13px}.parts td,.parts th{padding-right:9px}.parts td.n,.parts th.n{padding-left:6px}
+.parts td:last-child{width:22%;min-width:56px;padding-left:10px}.parts .bar{min-width:46px}
 .variants,.variants tbody,.variants tr,.variants th,.variants td{display:block}
 .variants thead{position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%)}
 .variants tbody{padding:10px 12px;border-bottom:1px solid var(--rule)}

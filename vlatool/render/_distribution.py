@@ -111,7 +111,7 @@ def distribution(variants: Sequence[Sampled], aim: Latency, width: int) -> str:
     _limit_line(canvas, axis, aim, top, height - 4)
     for variant in variants:
         _cumulative(canvas, variant, axis, up, len(variants) == 1)
-    canvas.text(right, bottom + 31, "latency, ms" + (" (logarithmic)" if axis.log else ""), "note", "end")
+    canvas.text(right, bottom + 31, "latency, ms" + (" (logarithmic)" if axis.log else ""), "note halo", "end")
     for index, variant in enumerate(variants):
         _strip(canvas, variant, axis, bottom + 46 + STRIP * index)
     return canvas.svg()

@@ -46,7 +46,7 @@ def percentile_section(report: Report) -> str:
     titles = '<th scope="col" class="n">ms</th>' + (
         f'<th scope="col" class="n">{safe(found.bound)}</th>' if found.bounded else ""
     )
-    top = f'<tr><th scope="col"></th>{names}</tr>' if several else ""
+    top = f'<tr class="over"><td></td>{names}</tr>' if several else ""
     lines = "".join(_line(found, place, each) for place in range(len(found.names)))
     table = (
         f'<table class="percentiles"><thead>{top}<tr><th scope="col">Percentile</th>'
@@ -60,13 +60,17 @@ def percentile_section(report: Report) -> str:
 
 def _line(found: Percentiles, place: int, each: int) -> str:
     cells = []
+    name = f'<th scope="row">{safe(found.names[place])}</th>'
+    told = set(found.reasons[place])
+    if len(told) == 1 and (same := told.pop()):
+        return f'<tr>{name}<td class="n why" colspan="{each * len(found.variants)}">{safe(same)}</td></tr>'
     for value, bound, why in zip(found.values[place], found.bounds[place], found.reasons[place], strict=True):
         if why:
             cells.append(f'<td class="n why" colspan="{each}">{safe(why)}</td>')
         else:
             beside = f'<td class="n bound">{safe(bound) or "–"}</td>' if found.bounded else ""
             cells.append(f'<td class="n">{safe(value)}</td>{beside}')
-    return f'<tr><th scope="row">{safe(found.names[place])}</th>{"".join(cells)}</tr>'
+    return f"<tr>{name}{''.join(cells)}</tr>"
 
 
 def bars(report: Report) -> str:
@@ -97,14 +101,14 @@ def _bars(report: Report, title: str, key: str) -> str:
         part = str(record.get(first))
         shown = safe(part) if part != last else ""
         last, begins = part, part != last
-        whose = f'<td><span class="key {css}"></span>{breakable(name)}</td>' if several else ""
+        whose = f'<td class="whose"><span class="key {css}"></span>{safe(name)}</td>' if several else ""
         numbers = "".join(f'<td class="n">{safe(column[place])}</td>' for column in texts)
         share = 100 * _size(record.get(key)) / top if top > 0 else 0.0
         drawn = f'<td><span class="bar {css}" aria-hidden="true"><i style="width:{share:.1f}%"></i></span></td>'
         lines.append(f"<tr{'' if begins else SAME}><td>{shown}</td>{whose}{numbers}{drawn}</tr>")
     heads = "".join(f'<th scope="col" class="n">{safe(name)}</th>' for name in columns)
     variant = '<th scope="col">variant</th>' if several else ""
-    top_line = f'<tr><th scope="col">{safe(first)}</th>{variant}{heads}<th scope="col">{safe(key)}</th></tr>'
+    top_line = f'<tr><th scope="col">{safe(first)}</th>{variant}{heads}<td></td></tr>'
     return (
         f'<h3>{safe(capital(title))}</h3><div class="scroll"><table class="groups parts"><thead>{top_line}</thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"

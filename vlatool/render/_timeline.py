@@ -14,7 +14,7 @@ from vlatool.render._view import Latency
 from vlatool.report import Report
 
 THROTTLED, GAUGE = "throttled_at_s", "telemetry."
-PANEL, GAUGE_PANEL, MOST_GAUGES = 84, 50, 6
+PANEL, GAUGE_PANEL, MOST_GAUGES = 104, 56, 6
 LEFT, RIGHT = 46.0, 14.0
 UNITS = {"degC": "°C", "1": ""}
 KINDS = (("degC", "temp", "thermal"), ("Hz", "freq", "clock"), ("W", "power", "in"))
@@ -125,7 +125,7 @@ def along_the_run(variants: Sequence[Sampled], aim: Latency, width: int) -> str:
 def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Axis, times: Sequence[float]) -> None:
     """Draw smallest, median and largest latency of one variant, on a scale of its own."""
     right, base = canvas.width - RIGHT, top + PANEL - 14
-    high = min(variant.ordered[-1], 2.5 * variant.at(0.95))
+    high = min(variant.ordered[-1], 1.3 * variant.at(0.99))
     scale = axis_for([variant.ordered[0], max(high, variant.ordered[0] * 1.02)], base, top + 24, pad=0.04)
     for value in scale.ticks(3):
         canvas.line(LEFT, scale(value), right, scale(value), "grid")
