@@ -175,6 +175,7 @@ def test_the_front_of_reports_is_drawn_over_memory(vlatool, tmp_path):
     code, out, _ = vlatool("compare", tmp_path / "a.json", tmp_path / "b.json", "-o", tmp_path / "out")
     assert code == 0
     assert "2.00×" in out
+    assert "The comparison is valid." in out
     assert "Peak memory against latency p50" in (tmp_path / "out/report.html").read_text()
 
 

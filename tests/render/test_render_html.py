@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import pytest
 from _render_reports import HOSTILE, KINDS, compare, evaluate, hostile, optimize, profile, sustained
 
-from vlatool.render import render
+from vlatool.render import _view, render
 from vlatool.report import Measurement, Report, Row
 
 VOID = {"meta", "br", "wbr", "hr"}
@@ -274,6 +274,18 @@ def test_the_deadline_is_marked() -> None:
     paced = replace(sustained(), limits={"hz": 25})
     assert "deadline 40 ms" in render(paced, "html")
     assert "deadline 40 ms" not in render(replace(paced, kind="optimize"), "html")
+    assert "deadline 40 ms" not in render(replace(paced, limits={"hz": True}), "html")
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen"),
+    [("latency_p99.9_ms", "latency_p99.9"), ("latency_max_ms", "latency_max"), ("max_latency_ms", "latency_p50"),
+     ("deadline_ms", "latency_p50"), ("latency_p42_ms", "latency_p50")],
+)  # fmt: skip
+def test_the_limit_speaks_of_a_percentile(name: str, chosen: str) -> None:
+    found = _view.latency(replace(sustained(), limits={name: 33, "hz": 20}))
+    assert found.name == chosen
+    assert found.limit == (50 if "p42" in name else 33)
 
 
 def test_memory_stands_in_where_accuracy_is_not_known() -> None:

@@ -43,7 +43,7 @@ def percentile_section(report: Report) -> str:
         f'<th scope="colgroup" class="n" colspan="{each}"><span class="key {tints[name]}"></span>{breakable(name)}</th>'
         for name in found.variants
     )
-    titles = '<th scope="col" class="n">ms</th>' + (
+    titles = '<th scope="col" class="n begin">ms</th>' + (
         f'<th scope="col" class="n">{safe(found.bound)}</th>' if found.bounded else ""
     )
     top = f'<tr class="over"><td></td>{names}</tr>' if several else ""
@@ -66,10 +66,10 @@ def _line(found: Percentiles, place: int, each: int) -> str:
         return f'<tr>{name}<td class="n why" colspan="{each * len(found.variants)}">{safe(same)}</td></tr>'
     for value, bound, why in zip(found.values[place], found.bounds[place], found.reasons[place], strict=True):
         if why:
-            cells.append(f'<td class="n why" colspan="{each}">{safe(why)}</td>')
+            cells.append(f'<td class="n why begin" colspan="{each}">{safe(why)}</td>')
         else:
             beside = f'<td class="n bound">{safe(bound) or "–"}</td>' if found.bounded else ""
-            cells.append(f'<td class="n">{safe(value)}</td>{beside}')
+            cells.append(f'<td class="n begin">{safe(value)}</td>{beside}')
     return f"<tr>{name}{''.join(cells)}</tr>"
 
 
@@ -94,6 +94,7 @@ def _bars(report: Report, title: str, key: str) -> str:
     records.sort(key=lambda item: order.index(str(item[2].get(first))))
     columns = list(dict.fromkeys(name for _, _, record in records for name in record if name != first))
     texts = [column_texts([record.get(name) for _, _, record in records]) for name in columns]
+    kinds = ["n calls" if name == "calls" else "n" for name in columns]
     several = len({name for name, _, _ in records}) > 1
     top = max((_size(record.get(key)) for _, _, record in records), default=0.0)
     lines, last = [], ""
@@ -102,11 +103,15 @@ def _bars(report: Report, title: str, key: str) -> str:
         shown = safe(part) if part != last else ""
         last, begins = part, part != last
         whose = f'<td class="whose"><span class="key {css}"></span>{safe(name)}</td>' if several else ""
-        numbers = "".join(f'<td class="n">{safe(column[place])}</td>' for column in texts)
+        numbers = "".join(
+            f'<td class="{css_of}">{safe(column[place])}</td>' for css_of, column in zip(kinds, texts, strict=True)
+        )
         share = 100 * _size(record.get(key)) / top if top > 0 else 0.0
         drawn = f'<td><span class="bar {css}" aria-hidden="true"><i style="width:{share:.1f}%"></i></span></td>'
         lines.append(f"<tr{'' if begins else SAME}><td>{shown}</td>{whose}{numbers}{drawn}</tr>")
-    heads = "".join(f'<th scope="col" class="n">{safe(name)}</th>' for name in columns)
+    heads = "".join(
+        f'<th scope="col" class="{css_of}">{safe(name)}</th>' for css_of, name in zip(kinds, columns, strict=True)
+    )
     variant = '<th scope="col">variant</th>' if several else ""
     top_line = f'<tr><th scope="col">{safe(first)}</th>{variant}{heads}<td></td></tr>'
     return (

@@ -38,11 +38,20 @@ def histogram(samples: Sequence[float], place: Callable[[float], float], bins: i
 
 @dataclass(frozen=True)
 class Band:
-    """Smallest, median and largest sample of a stretch of time, and its middle."""
+    """The samples of a stretch of time.
+
+    Args:
+        at: The middle of the stretch.
+        low, high: The smallest and the largest sample.
+        lower, upper: The 10th and the 90th percentile.
+        middle: The median.
+    """
 
     at: float
     low: float
+    lower: float
     middle: float
+    upper: float
     high: float
 
 
@@ -63,7 +72,8 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
     for place, part in enumerate(stretches):
         if part:
             part.sort()
-            found.append(Band(first + (place + 0.5) * wide, part[0], part[len(part) // 2], part[-1]))
+            inner = quantile(part, 0.1), part[len(part) // 2], quantile(part, 0.9)
+            found.append(Band(first + (place + 0.5) * wide, part[0], *inner, part[-1]))
     return found
 
 

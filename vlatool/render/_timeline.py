@@ -127,7 +127,7 @@ def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Ax
     right, base = canvas.width - RIGHT, top + PANEL - 14
     high = min(variant.ordered[-1], 1.3 * variant.at(0.99))
     scale = axis_for([variant.ordered[0], max(high, variant.ordered[0] * 1.02)], base, top + 24, pad=0.04)
-    for value in scale.ticks(3):
+    for value in scale.ticks(4):
         canvas.line(LEFT, scale(value), right, scale(value), "grid")
         canvas.text(LEFT - 6, scale(value) + 4, tick(value), "tick", "end")
     most = 180 if canvas.width > 500 else 90
@@ -144,9 +144,10 @@ def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Ax
 
 def _bands(canvas: Canvas, bands: Sequence[Band], across: Axis, scale: Axis, css: str) -> None:
     centres = [across(band.at) for band in bands]
-    upper = [(x, scale(band.high)) for x, band in zip(centres, bands, strict=True)]
-    lower = [(x, scale(band.low)) for x, band in zip(centres, bands, strict=True)]
-    canvas.area(upper, lower, f"band {css}")
+    for css_of, top, bottom in (("outer", "high", "low"), ("band", "upper", "lower")):
+        edges = ([scale(getattr(band, end)) for band in bands] for end in (top, bottom))
+        upper, lower = (list(zip(centres, edge, strict=True)) for edge in edges)
+        canvas.area(upper, lower, f"{css_of} {css}")
     middle = " ".join(f"{x:.1f},{scale(band.middle):.1f}" for x, band in zip(centres, bands, strict=True))
     canvas.add("polyline", f"line {css}", points=middle, fill="none")
 

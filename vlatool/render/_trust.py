@@ -21,7 +21,8 @@ def findings(report: Report) -> list[Finding]:
 
 def sentence(report: Report) -> str:
     """Return whether the measurement can be trusted, as a sentence; nothing when nobody judged it."""
-    return SENTENCES[report.validity]
+    said = SENTENCES[report.validity]
+    return said.replace("measurement", "comparison") if report.kind == "compare" else said
 
 
 def reason(found: Finding) -> str:

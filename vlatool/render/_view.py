@@ -218,21 +218,24 @@ def role(row: Row) -> str:
 def latency(report: Report) -> Latency:
     """Return which latency percentile the limit speaks of, and the limit.
 
-    A benchmark at a rate (``hz``) has its period as the deadline. The rate that ``optimize`` was asked for is no
-    limit on this host.
+    A benchmark at a rate (``hz``) without one has its period as the deadline, and so have several that are compared.
+    The rate that ``optimize`` was asked for is no limit on this host.
     """
     present = names(report)
-    rate = report.limits.get("hz")
-    if report.kind == "benchmark" and isinstance(rate, int | float) and rate > 0 and "deadline_ms" not in report.limits:
-        return Latency("latency_p50", 1e3 / rate, "deadline")
     for name, wanted in report.limits.items():
-        numeric = isinstance(wanted, int | float) and not isinstance(wanted, bool)
-        if numeric and name.endswith("_ms") and ("latency" in name or "deadline" in name):
+        if _number(wanted) and name.endswith("_ms") and ("latency" in name or "deadline" in name):
             hit = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
             chosen = f"latency_{hit[0]}" if hit else "latency_p50"
             if chosen in present:
                 return Latency(chosen, float(wanted), plain(name))
+    rate = report.limits.get("hz")
+    if report.kind in ("benchmark", "compare") and _number(rate) and rate > 0:
+        return Latency("latency_p50", 1e3 / rate, "deadline")
     return Latency("latency_p50", None)
+
+
+def _number(wanted: Any) -> bool:
+    return isinstance(wanted, int | float) and not isinstance(wanted, bool)
 
 
 def accuracy(report: Report) -> str:

@@ -93,8 +93,8 @@ class HtmlRenderer:
         if not variants:
             return ""
         aim, most = latency(report), len(gauges(report)) - MOST_GAUGES
-        sub = "Line: median of a stretch of time. Band: smallest to largest. Each has its own scale, latency "
-        sub += "in ms; a band that touches the top goes beyond it. "
+        sub = "Line: median of a stretch of time. Dark band: the middle 80 %. Light band: smallest to largest. "
+        sub += "Each has its own scale, latency in ms; a band that touches the top goes beyond it. "
         sub += "Vertical lines: moments of throttling. " if throttled(report) else ""
         sub += f"{most} more gauges in report.json. " if most > 0 else ""
         drawing = self._both(lambda width: over_time(report, variants, aim, width))
@@ -104,7 +104,8 @@ class HtmlRenderer:
         if not variants:
             return ""
         aim = latency(report)
-        sub = "Line: median of consecutive samples. Band: smallest to largest. A slope means warming up or throttling. "
+        sub = "Line: median of consecutive samples. Dark band: the middle 80 %. Light band: smallest to largest. "
+        sub += "A slope means warming up or throttling. "
         sub += "Each variant has its own scale in ms; a band that touches the top goes beyond it. "
         sub += left_out(report)
         drawing = self._both(lambda width: along_the_run(variants, aim, width))
