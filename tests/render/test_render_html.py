@@ -224,7 +224,7 @@ def test_time_line_has_seconds_gauges_and_throttled_moments() -> None:
 def test_gauges_that_two_rows_share_are_drawn_once() -> None:
     report = sustained()
     shared = {name: series for name, series in report.rows[0].raw.items() if name.startswith("telemetry.")}
-    rows = (report.rows[0], replace(report.rows[1], raw={**report.rows[1].raw, **shared}))
+    rows = (report.rows[0], replace(report.rows[1], raw={**report.rows[1].raw, **shared}, details={}))
     drawing = render(replace(report, rows=rows), "html").partition('id="time-996-t"')[2].partition("</svg>")[0]
     assert drawing.count(">thermal.cpu-thermal<") == 1
     assert "thermal.cpu-thermal, " not in drawing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vlatool.render._distribution import TIMES, Sampled
 from vlatool.render._format import fixed, plain, significant, tick
@@ -17,7 +17,7 @@ THROTTLED, GAUGE = "throttled_at_s", "telemetry."
 PANEL, GAUGE_PANEL, MOST_GAUGES = 104, 56, 6
 LEFT, RIGHT = 46.0, 14.0
 UNITS = {"degC": "°C", "1": ""}
-KINDS = (("degC", "temp", "thermal"), ("Hz", "freq", "clock"), ("W", "power", "in"))
+KINDS = (("degC", "temp", "thermal"), ("Hz", "freq", "clock"), ("W", "power", "vdd"))
 """Units and parts of names by which gauges are put in order: temperature, clock, power."""
 
 
@@ -43,28 +43,24 @@ def untimed(variants: Sequence[Sampled]) -> list[Sampled]:
 
 def gauges(report: Report) -> list[Gauge]:
     """Return what was read of the machine, each once: temperatures, clocks, power, the rest."""
-    found: list[tuple[str, str, Gauge]] = []
+    tables = [record for row in report.rows for record in row.details.get("telemetry", ())]
+    units = {str(record.get("reading")): str(record.get("unit", "")) for record in tables}
+    found: list[tuple[str, Gauge]] = []
     for row in report.rows:
-        units = {str(record.get("reading")): str(record.get("unit", "")) for record in row.details.get("telemetry", ())}
         for name in row.raw:
             at = row.raw.get(f"{name}.{TIMES}")
             if not name.startswith(GAUGE) or not at or len(at) != len(row.raw[name]):
                 continue
-            pairs = [pair for pair in zip(at, row.raw[name], strict=True) if all(map(_number, pair))]
+            pairs = sorted(pair for pair in zip(at, row.raw[name], strict=True) if all(map(_number, pair)))
             reading = name.removeprefix(GAUGE)
             gauge = Gauge(reading, units.get(reading, ""), [pair[0] for pair in pairs], [pair[1] for pair in pairs])
-            if len(pairs) > 1 and all(gauge != other for _, _, other in found):
-                found.append((row.name, reading, gauge))
-    readings = [reading for _, reading, _ in found]
+            if len(pairs) > 1 and all(gauge != other for _, other in found):
+                found.append((row.name, gauge))
+    readings = [gauge.name for _, gauge in found]
     named = [
-        Gauge(f"{gauge.name}, {row}" if readings.count(gauge.name) > 1 else gauge.name, *_rest(gauge))
-        for row, _, gauge in found
+        replace(gauge, name=f"{gauge.name}, {row}") if readings.count(gauge.name) > 1 else gauge for row, gauge in found
     ]
     return sorted(named, key=_kind)
-
-
-def _rest(gauge: Gauge) -> tuple[str, list[float], list[float]]:
-    return gauge.unit, gauge.times, gauge.values
 
 
 def _number(value: float | None) -> bool:

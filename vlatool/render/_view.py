@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 from vlatool.render._format import cell, interval, is_usual, label, plain
 from vlatool.report import Measurement, Report, Row
@@ -234,7 +234,7 @@ def latency(report: Report) -> Latency:
     return Latency("latency_p50", None)
 
 
-def _number(wanted: Any) -> bool:
+def _number(wanted: Any) -> TypeGuard[int | float]:
     return isinstance(wanted, int | float) and not isinstance(wanted, bool)
 
 
