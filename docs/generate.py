@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import os
 import re
 import sys
+import typing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +33,19 @@ def main() -> None:
         "command-line.md": command_line_page(),
         "manifest.md": fields_page("manifest.json", [manifest.Manifest, spec.PolicySpec, spec.TensorSpec,
                                                      manifest.ProgramStep, manifest.Graph]),
-        "report.md": fields_page("report.json", [report.Report, report.Row, report.Measurement, report.Finding]),
+        "report.md": report_page(),
         "errors.md": errors_page(),
         "profiles.md": profiles_page(),
         "gate.md": gate_page(),
     }  # fmt: skip
+    pages = {name: NOTE + text for name, text in pages.items()}
+    pages["report.schema.json"] = schema_page()
     if "--check" not in sys.argv:
         REFERENCE.mkdir(exist_ok=True)
         for name, text in pages.items():
-            (REFERENCE / name).write_text(NOTE + text, encoding="utf-8")
+            (REFERENCE / name).write_text(text, encoding="utf-8")
         return
-    stale = [name for name, text in pages.items() if _read(REFERENCE / name) != NOTE + text]
+    stale = [name for name, text in pages.items() if _read(REFERENCE / name) != text]
     if stale:
         sys.exit(f"docs/reference differs from the code in {', '.join(stale)}; run: make docs")
     print(f"docs/reference equals the code ({len(pages)} pages)")
@@ -119,6 +124,83 @@ def fields_page(title: str, classes: list[Any]) -> str:
             rows.append(f"| `{field.name}` | {kind_of} | {default} | {meanings.get(field.name, '')} |")
         parts.append(f"## {kind.__name__}\n\n{text}\n\n" + "\n".join(rows) + "\n")
     return "\n".join(parts)
+
+
+def report_page() -> str:
+    """Return the fields of a report, and where its schema is."""
+    top = fields_page("report.json", [report.Report, report.Row, report.Measurement, report.Finding])
+    head, _, rest = top.partition("\n")
+    about = (
+        "Every command that measures writes one (`-o DIRECTORY`, or `--json` on stdout). "
+        "[report.schema.json](report.schema.json) is its JSON Schema (draft 2020-12), made from the same classes: "
+        "`check-jsonschema --schemafile docs/reference/report.schema.json report.json`.\n\n"
+        "A number that could not be had is null, and the note beside it says why. Within schema 1 a later version may "
+        "add keys at the top level, which readers pass over; rows, measurements and findings have these keys only."
+    )
+    return f"{head}\n\n{about}\n{rest}"
+
+
+def schema_page() -> str:
+    """Return the JSON Schema of a report, from the dataclasses, their vocabularies and their docstrings."""
+    root = _object(report.Report, ("schema",))
+    defs = {kind.__name__: _object(kind) for kind in (report.Row, report.Measurement, report.Finding)}
+    head = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$comment": "written by docs/generate.py from the code; do not edit",
+        "title": "vlatool report",
+    }
+    return json.dumps({**head, **root, "additionalProperties": True, "$defs": defs}, indent=1) + "\n"
+
+
+WORDS = {
+    "verdict": report.VERDICTS,
+    "validity": report.VALIDITIES,
+    "role": report.ROLES,
+    "origin": report.ORIGINS,
+    "effect": report.EFFECTS,
+}
+NARROWER: dict[str, dict[str, Any]] = {
+    "schema": {"const": report.SCHEMA},
+    "value": {"type": ["number", "null"]},
+    "samples": {"type": "integer", "minimum": 0},
+    "confidence": {"type": "number", "minimum": 0, "maximum": 1},
+}
+"""What the type of a field does not say."""
+
+
+def _object(kind: Any, also_required: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the schema of one dataclass."""
+    text, meanings = _described(kind)
+    hints = typing.get_type_hints(kind)
+    properties, required = {}, list(also_required)
+    for field in dataclasses.fields(kind):
+        found = {"enum": list(WORDS[field.name])} if field.name in WORDS else _type(hints[field.name])
+        meaning = meanings.get(field.name, "").replace("``", "")
+        properties[field.name] = {**NARROWER.get(field.name, found), **({"description": meaning} if meaning else {})}
+        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
+            required.append(field.name)
+    return {
+        "type": "object", "description": text, "properties": properties, "required": required,
+        "additionalProperties": False,
+    }  # fmt: skip
+
+
+def _type(hint: Any) -> dict[str, Any]:
+    """Return the schema of a type; a float inside a list may be null, since NaN is."""
+    simple = {str: "string", int: "integer", float: "number"}
+    if hint in simple:
+        return {"type": simple[hint]}
+    if dataclasses.is_dataclass(hint):
+        return {"$ref": f"#/$defs/{getattr(hint, '__name__', '')}"}
+    inner = typing.get_args(hint)
+    if hint is Any or not inner:
+        return {}
+    if type(None) in inner:
+        return {"type": ["number", "null"]}
+    if typing.get_origin(hint) in (list, tuple):
+        return {"type": "array", "items": {"type": ["number", "null"]} if inner[0] is float else _type(inner[0])}
+    values = _type(inner[1])
+    return {"type": "object", **({"additionalProperties": values} if values else {})}
 
 
 def _described(kind: Any) -> tuple[str, dict[str, str]]:

@@ -65,10 +65,12 @@ class Row:
 
     Args:
         name: Name of the variant, for example ``static_int8``.
-        role: One of ``ROLES``.
+        role: ``baseline``, ``chosen``, ``within`` or ``outside`` the limits, ``failed``, or ``subject``.
         reason: Why it has this role, in words.
         measurements: By no particular order; names are unique within a row and origin.
-        raw: Series name -> raw samples in the order in which they were taken, for example ``latency_ms``.
+        raw: Series name -> raw samples in the order in which they were taken: ``latency_ms``, and ``at_s`` (the start
+            of each call, seconds since the start of the run); ``telemetry.NAME`` and ``telemetry.NAME.at_s`` (a reading
+            of the machine and its times); ``throttled_at_s`` (moments at which throttling was seen).
         details: Tables that belong to the row: title -> list of {column: cell}.
     """
 
@@ -124,9 +126,9 @@ class Report:
     """What a command found out.
 
     Args:
-        kind: ``benchmark``, ``evaluate``, ``optimize`` or ``compare``.
+        kind: ``benchmark``, ``evaluate``, ``optimize``, ``compare``, ``hwselect`` or ``gate``.
         title: One line.
-        verdict: One of ``VERDICTS``.
+        verdict: ``pass``, ``fail``, ``inconclusive`` or ``info``.
         summary: Sentences for a person; the first is the result.
         rows: The variants, baseline first.
         limits: Limit name -> the value that was asked for, with its unit in the name.
@@ -135,7 +137,7 @@ class Report:
         environment: The machine, its state and the versions (see ``vlatool.host``).
         warnings: What a reader should know before trusting the numbers, with the remedy.
         schema: Version of this format.
-        validity: Whether the measurement can be trusted: one of ``VALIDITIES``; empty when nobody judged it.
+        validity: Whether the measurement can be trusted: ``valid``, ``suspect``, ``invalid``; empty when not judged.
         findings: Why, each with its remedy.
     """
 

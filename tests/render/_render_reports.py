@@ -3,7 +3,7 @@ from __future__ import annotations
 import math
 import random
 
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import Finding, Measurement, Report, Row
 
 HOSTILE = "<script>alert('x')</script> | `a` \x1b[31m \"&\" \n[b](c) \u202e"
 
@@ -107,7 +107,70 @@ def hostile() -> Report:
         for index, role in enumerate(("baseline", "chosen"))
     )  # fmt: skip
     return Report("optimize", HOSTILE, "pass", (HOSTILE, "x" * 300), rows, {HOSTILE: HOSTILE, "latency_ms": 5.5},
-                  HOSTILE, HOSTILE, {HOSTILE: {"a": HOSTILE}}, (HOSTILE,))  # fmt: skip
+                  HOSTILE, HOSTILE, {HOSTILE: {"a": HOSTILE}}, (HOSTILE,), validity="invalid",
+                  findings=(Finding("invalid", HOSTILE, HOSTILE), Finding("note", HOSTILE)))  # fmt: skip
+
+
+NEEDS = "needs 6,636 independent calls, this run is worth 1,204; pass --iterations 33000"
+PARTS = {
+    "memory by part": [{"part": "weights", "MB": 88.25, "share %": 40.0},
+                       {"part": "the rest", "MB": 132.4, "share %": 60.0}],
+    "time by phase": [{"phase": "encode", "calls": 9, "p50 ms": 1.0, "share %": 5.0},
+                      {"phase": "graph", "calls": 9, "p50 ms": 19.0, "share %": 95.0}],
+    "cold start by part": [{"part": "import", "ms": 300.0}, {"part": "load", "ms": 500.0}],
+    "telemetry": [{"reading": "thermal.cpu-thermal", "unit": "degC", "min": 45.0, "mean": 66.2, "max": 78.5}],
+    "unmeasured": [{"what": "GPU memory", "why": "no GPU"}, {"what": "GPU clock", "why": "no GPU"}],
+    "engine": [{"engine": "ort_cpu", "version": "1.23.2", "threads": 1}],
+}  # fmt: skip
+
+
+def profile(name: str, role: str, median: float, samples: int = 300, readings: int = 60) -> Row:
+    """A row as the benchmark makes it: percentiles with bounds, a time line, tables by part and phase."""
+    raw = latencies(int(median), median, samples)
+    ordered, seconds = sorted(raw), samples * median / 500
+    at = [index * seconds / samples for index in range(samples)]
+    sampled = [index * seconds / readings for index in range(readings)]
+    tops = [("latency_p50", 0.5), ("latency_p90", 0.9), ("latency_p95", 0.95), ("latency_p99", 0.99)]
+    percentiles = [(which, ordered[math.ceil(share * samples) - 1]) for which, share in tops]
+    items = [
+        *(Measurement(which, found, "ms", samples=samples, high=found + 1, confidence=0.99)
+          for which, found in percentiles),
+        Measurement("latency_p99.9", math.nan, "ms", samples=samples, confidence=0.99, note=NEEDS),
+        Measurement("latency_max", ordered[-1], "ms", samples=samples),
+        Measurement("energy_per_action", math.nan, "J", note="no power meter"),
+        Measurement("power_mean", math.nan, "W", note="no power meter"),
+        Measurement("throughput", 1e3 / median, "1/s", samples=samples),
+        Measurement("cpu", 1.93, "cores"),
+        Measurement("peak_rss", 10 * median, "MB", samples=3),
+        Measurement("temperature_max", 78.5, "degC"),
+        Measurement("deadline_misses", 0.0123, "1", samples=2400, low=0.008, high=0.017, note="at 20 Hz"),
+        Measurement("age_p99", 71.0, "ms", samples=2400),
+        Measurement("sustained_slowdown", 1.24, "x", low=1.2, high=1.27),
+    ]  # fmt: skip
+    gauges = {"thermal.cpu-thermal": 45.0, "cpufreq.policy0": 2400.0, "ina3221.VDD_IN": 4.2}
+    series = {"latency_ms": raw, "at_s": at, "throttled_at_s": [seconds * 0.6, seconds * 0.61]}
+    for place, (gauge, level) in enumerate(gauges.items()):
+        series[f"telemetry.{gauge}"] = [level * (1 + 0.01 * math.sin(second + place)) for second in sampled]
+        series[f"telemetry.{gauge}.at_s"] = sampled
+    return Row(name, role, "", tuple(items), series, PARTS)
+
+
+THROTTLED = Finding("suspect", "The processor was throttled at 2 moments", "cool the board")
+
+
+def sustained(rows: int = 2, samples: int = 300, readings: int = 60) -> Report:
+    """A report of the benchmark, with a time line."""
+    names = (("float32", "baseline" if rows > 1 else "subject", 41.0), ("static_int8", "subject", 12.0))
+    return Report(
+        "benchmark",
+        "Latency of vla",
+        summary=("float32: 41.0 ms.",),
+        rows=tuple(profile(*name, samples, readings) for name in names[:rows]),
+        limits={"deadline_ms": 50},
+        environment={"cpu": "Cortex-A76", "governor": "ondemand"},
+        validity="suspect",
+        findings=(Finding("note", "Its clock is not known."), THROTTLED),
+    )
 
 
 def board(
@@ -164,6 +227,9 @@ EMPTY = Report("benchmark", "Nothing")
 KINDS = {
     "optimize": optimize,
     "benchmark": benchmark,
+    "sustained": sustained,
+    "sustained-alone": lambda: sustained(1),
+    "one-call": lambda: sustained(1, 1, 1),
     "evaluate": evaluate,
     "compare": compare,
     "hostile": hostile,

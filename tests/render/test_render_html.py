@@ -5,9 +5,9 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
-from _render_reports import HOSTILE, KINDS, compare, evaluate, hostile, optimize
+from _render_reports import HOSTILE, KINDS, compare, evaluate, hostile, optimize, profile, sustained
 
-from vlatool.render import render
+from vlatool.render import _view, render
 from vlatool.report import Measurement, Report, Row
 
 VOID = {"meta", "br", "wbr", "hr"}
@@ -184,3 +184,125 @@ def test_hostile_text_reaches_attributes_only_escaped() -> None:
     page = render(hostile(), "html")
     assert HOSTILE not in page
     assert not re.search(r'data-label="[^"]*<', page)
+
+
+def test_distrust_stands_in_the_head() -> None:
+    page = render(sustained(), "html")
+    head = page[page.index("<header>") : page.index("</header>")]
+    assert '<div class="trust suspect"><p>The measurement is suspect: its numbers may be wrong.</p>' in head
+    assert head.index("throttled at 2 moments.") < head.index("Remedy: cool the board.") < head.index("Its clock")
+    assert 'class="trust' not in render(optimize(), "html")
+    valid = render(replace(sustained(), validity="valid", findings=()), "html")
+    assert '<div class="trust valid"><p>The measurement is valid.</p></div>' in valid
+
+
+def test_percentiles_with_bounds_and_the_reason_for_what_is_missing() -> None:
+    (text,) = (text for text in parse(render(sustained(1), "html")).sections if "Latency percentiles" in text)
+    assert "at most (99 %)" in text
+    assert re.search(r"p504\d\.\d4\d\.\d", text)
+    assert "p99.9needs 6,636 independent calls" in text
+    both = render(sustained(2), "html")
+    assert both.count("needs 6,636 independent calls") == 1
+    assert 'colspan="4">needs 6,636' in both
+
+
+def test_time_line_has_seconds_gauges_and_throttled_moments() -> None:
+    page = render(sustained(), "html")
+    assert page.count('id="time-996-t"') == 1
+    assert "Latency along the run" not in page
+    drawing = page[page.index('id="time-996-t"') :].partition("</svg>")[0]
+    assert "seconds since the start of the run" in drawing
+    assert "throttled: 4 moments" in drawing
+    names = ["thermal.cpu-thermal, float32", "thermal.cpu-thermal, static_int8", "cpufreq.policy0, float32",
+             "cpufreq.policy0, static_int8", "ina3221.VDD_IN, float32", "ina3221.VDD_IN, static_int8"]  # fmt: skip
+    assert [drawing.index(name) for name in names] == sorted(drawing.index(name) for name in names)
+    assert "°C" in drawing
+    ticks = [float(text) for text in re.findall(r'class="tick">([\d.]+)</text>', drawing)]
+    assert max(ticks) >= 20  # 300 calls of 41 ms, two policies in turns: 24.6 s
+
+
+def test_gauges_that_two_rows_share_are_drawn_once() -> None:
+    report = sustained()
+    shared = {name: series for name, series in report.rows[0].raw.items() if name.startswith("telemetry.")}
+    rows = (report.rows[0], replace(report.rows[1], raw={**report.rows[1].raw, **shared}, details={}))
+    drawing = render(replace(report, rows=rows), "html").partition('id="time-996-t"')[2].partition("</svg>")[0]
+    assert drawing.count(">thermal.cpu-thermal<") == 1
+    assert "thermal.cpu-thermal, " not in drawing
+
+
+def test_gauges_beyond_the_room_are_counted() -> None:
+    row = profile("a", "subject", 10.0)
+    more = {f"telemetry.g{place}": [1.0, 2.0] for place in range(5)}
+    times = {f"telemetry.g{place}.at_s": [0.0, 1.0 + place] for place in range(5)}
+    page = render(Report("benchmark", "t", rows=(replace(row, raw={**row.raw, **more, **times}),)), "html")
+    assert page.count("2 more gauges in report.json.") == 1
+
+
+@pytest.mark.parametrize(
+    "times",
+    [[], [1.0], [0.0] * 300, [300.0 - index for index in range(300)], [-1.0 + index for index in range(300)],
+     [float("nan"), *map(float, range(299))]],
+)  # fmt: skip
+def test_without_usable_times_latency_is_drawn_along_the_run(times: list[float]) -> None:
+    row = profile("a", "subject", 10.0)
+    page = render(Report("benchmark", "t", rows=(replace(row, raw={**row.raw, "at_s": times}),)), "html")
+    assert "Latency along the run" in page
+    assert "Latency over time" not in page
+    assert "first sample" in page
+
+
+def test_a_lost_sample_takes_its_time_with_it() -> None:
+    row = profile("a", "subject", 10.0)
+    lost = [None if index == 7 else sample for index, sample in enumerate(row.raw["latency_ms"])]
+    page = render(Report("benchmark", "t", rows=(replace(row, raw={**row.raw, "latency_ms": lost}),)), "html")
+    assert "Latency over time" in page
+    assert "n = 299" in page
+
+
+def test_bars_show_each_part_with_its_number() -> None:
+    page = render(sustained(1), "html")
+    (text,) = (text for text in parse(page).sections if "Where memory and time go" in text)
+    assert "weights88.2540the rest132.4060" in text
+    bars = page[page.index("Where memory and time go") :].partition("</section>")[0]
+    widths = [float(width) for width in re.findall(r'<i style="width:([\d.]+)%', bars)]
+    assert widths == [66.7, 100.0, 5.3, 100.0, 60.0, 100.0]
+    assert page.count("memory by part") + page.count("Memory by part") == 1
+
+
+def test_the_deadline_is_marked() -> None:
+    assert "deadline 50 ms" in render(sustained(), "html")
+    paced = replace(sustained(), limits={"hz": 25})
+    assert "deadline 40 ms" in render(paced, "html")
+    assert "deadline 40 ms" not in render(replace(paced, kind="optimize"), "html")
+    assert "deadline 40 ms" not in render(replace(paced, limits={"hz": True}), "html")
+
+
+@pytest.mark.parametrize(
+    ("name", "chosen"),
+    [("latency_p99.9_ms", "latency_p99.9"), ("latency_max_ms", "latency_max"), ("max_latency_ms", "latency_p50"),
+     ("deadline_ms", "latency_p50"), ("latency_p42_ms", "latency_p50")],
+)  # fmt: skip
+def test_the_limit_speaks_of_a_percentile(name: str, chosen: str) -> None:
+    found = _view.latency(replace(sustained(), limits={name: 33, "hz": 20}))
+    assert found.name == chosen
+    assert found.limit == (50 if "p42" in name else 33)
+
+
+def test_memory_stands_in_where_accuracy_is_not_known() -> None:
+    page = render(sustained(), "html")
+    assert "Peak memory against latency p50" in page
+    assert "Down and to the left is better" in page
+    assert "against latency p50" not in render(sustained(1), "html")
+
+
+def test_one_call_is_shown_without_charts() -> None:
+    page = render(KINDS["one-call"](), "html")
+    assert "<svg" not in page
+    assert "Latency percentiles" in page
+
+
+def test_page_stays_small_with_a_long_run() -> None:
+    page = render(sustained(2, 200_000, 20_000), "html")
+    assert len(page.encode()) <= 300_000
+    assert not parse(page).faults
+    assert "200\u202f000" in page

@@ -6,7 +6,7 @@ import pytest
 from _render_reports import HOSTILE
 
 from vlatool.render import render
-from vlatool.report import Report, Row
+from vlatool.report import Finding, Report, Row
 
 
 def gate(*claims: tuple[str, str, str], verdict: str = "fail") -> Report:
@@ -61,3 +61,30 @@ def test_github_is_told_of_every_report() -> None:
     assert (
         render(Report("optimize", "a, b", "fail", ("No.",)), "github") == "::error title=a%2C b%3A verdict fail::No.\n"
     )
+
+
+WRONG = (Finding("note", "It is warm."), Finding("suspect", "It throttled", "cool it"), Finding("invalid", "It lied."))
+
+
+@pytest.mark.parametrize(
+    ("validity", "tag", "errors", "skipped"),
+    [("invalid", "error", "1", "0"), ("suspect", "skipped", "0", "1"), ("valid", None, "0", "0")],
+)
+def test_a_judged_measurement_is_a_case(validity: str, tag: str | None, errors: str, skipped: str) -> None:
+    report = Report("benchmark", "T", command="vlatool x", validity=validity, findings=WRONG)
+    root = ElementTree.fromstring(render(report, "junit"))
+    assert (root.get("tests"), root.get("errors"), root.get("skipped")) == ("2", errors, skipped)
+    (case,) = (case for case in root[0] if case.get("name") == "measurement")
+    assert [child.tag for child in case] == [*([tag] if tag else []), "system-out"]
+    assert "It lied. It throttled. Remedy: cool it. It is warm." in case.findtext("system-out")
+
+
+def test_github_is_told_each_reason_and_remedy() -> None:
+    report = Report("benchmark", "T", validity="invalid", findings=WRONG)
+    assert render(report, "github").splitlines() == [
+        "::error title=T%3A measurement invalid::It lied.",
+        "::warning title=T%3A measurement suspect::It throttled. Remedy: cool it.",
+    ]
+    bare = Report("benchmark", "T", validity="suspect")
+    assert render(bare, "github").startswith("::warning title=T%3A measurement suspect::The measurement is suspect")
+    assert render(Report("benchmark", "T", validity="valid"), "github") == "::notice title=T::T\n"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from _render_reports import KINDS, hostile, optimize
+from _render_reports import KINDS, hostile, optimize, sustained
 
 from vlatool.render import render
 from vlatool.render.markdown import inline
@@ -57,3 +57,12 @@ def test_headline_measured_and_predicted() -> None:
 def test_long_details_are_cut() -> None:
     table = [{"episode": index} for index in range(70)]
     assert "10 more rows" in render(Report("evaluate", "m", rows=(Row("a", details={"e": table}),)), "markdown")
+
+
+def test_distrust_and_percentiles() -> None:
+    text = render(sustained(), "markdown")
+    assert "**⚠️ The measurement is suspect: its numbers may be wrong.**" in text
+    assert "- *suspect*: The processor was throttled at 2 moments. Remedy: cool the board.\n- *note*: Its clock" in text
+    assert "| latency, ms | float32 | at most (99 %) | static\\_int8 | at most (99 %) |" in text
+    assert "| p99.9 | – | – | – | – |" in text
+    assert "- energy per action, mean power: no power meter\n- GPU memory, GPU clock: no GPU" in text

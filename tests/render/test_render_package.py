@@ -8,7 +8,7 @@ from _render_reports import KINDS, optimize
 
 from vlatool import registry
 from vlatool.errors import OutputError, UsageError
-from vlatool.render import FILES, _format, _samples, _scatter, _svg, _view, render, write_reports
+from vlatool.render import FILES, _format, _samples, _scatter, _svg, _tables, render, write_reports
 from vlatool.report import Measurement, Report, Row, read_report
 
 
@@ -106,7 +106,13 @@ def test_ecdf_keeps_ends_and_few_points() -> None:
 
 def test_histogram_envelope_and_sparkline() -> None:
     assert _samples.histogram([0.0, 0.5, 1.0, 2.0], lambda value: value, 2) == [1, 2]
-    assert _samples.envelope([3.0, 1.0, 2.0, 9.0], 2) == [(1.0, 3.0, 3.0), (2.0, 9.0, 9.0)]
+    band = _samples.Band
+    assert _samples.envelope([0.0, 1.0, 9.0, 10.0], [3.0, 1.0, 2.0, 9.0], 2) == [
+        band(2.5, 1.0, 1.0, 3.0, 3.0, 3.0), band(7.5, 2.0, 2.0, 9.0, 9.0, 9.0),
+    ]  # fmt: skip
+    assert [found.at for found in _samples.envelope([0.0, 0.1, 8.0], [1.0, 2.0, 3.0], 4)] == [1.0, 7.0]
+    hundred = [float(value) for value in range(100)]
+    assert _samples.envelope([5.0] * 100, hundred, 3) == [band(5.0, 0.0, 9.0, 50.0, 89.0, 99.0)]
     assert _samples.sparkline([1.0] * 5, 8) == "█"
     assert len(_samples.sparkline([float(value) for value in range(100)], 8)) == 8
 
@@ -132,7 +138,7 @@ def test_pareto_front_leaves_out_the_dominated() -> None:
 
 
 def test_details_of_several_variants_become_one_table() -> None:
-    (table,) = _view.details(optimize())
+    (table,) = _tables.details(optimize())
     assert table.columns[:2] == ("task", "variant")
     assert [row[0] for row in table.rows] == ["reach", "", "", "", "", "push", "", "", "", ""]
     assert table.rows[0][2:] == ("0.9", "0.8", "0.95", "200", "no")
@@ -140,7 +146,7 @@ def test_details_of_several_variants_become_one_table() -> None:
 
 def test_details_columns_keep_their_decimals() -> None:
     records = [{"steps": 54.4, "p": 1e-12}, {"steps": 52.0, "p": 0.5}, {}, {"steps": None}]
-    (table,) = _view.details(Report("evaluate", "t", rows=(Row("a", details={"d": records, "none": []}),)))
+    (table,) = _tables.details(Report("evaluate", "t", rows=(Row("a", details={"d": records, "none": []}),)))
     assert table.title == "d: a"
     assert [row[0] for row in table.rows] == ["54.4", "52.0", "–"]
     assert table.rows[0][1] == "1e−12"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from _render_reports import KINDS, compare, hostile, optimize
+from _render_reports import KINDS, compare, hostile, optimize, sustained
 from rich.cells import cell_len
 
 from vlatool.render import render
@@ -47,7 +47,7 @@ def test_blocks_are_labelled_and_apart() -> None:
     assert "MEASURED on this host: AMD EPYC" in measured
     assert "35.4 ms" not in measured
     assert "35.4 ms" in predicted
-    assert "unmeasured: float16, latency p50: engine refused" in measured
+    assert "\nUnmeasured\n  float16, latency p50: engine refused\n" in measured
     assert "98.4 %" in measured
     assert "n = 1000" in measured
     assert "0.350 mm" in measured
@@ -73,3 +73,43 @@ def test_long_details_are_cut() -> None:
     table = [{"episode": index} for index in range(30)]
     text = render(Report("evaluate", "many", rows=(Row("a", details={"episodes": table}),)), "terminal")
     assert "… 6 more rows in report.json" in text
+
+
+def test_distrust_stands_below_the_result_with_its_remedy() -> None:
+    first, *more = render(sustained(), "terminal").splitlines()
+    assert first == "INFO  float32: 41.0 ms."
+    assert [line.strip() for line in more[:4]] == [
+        "The measurement is suspect: its numbers may be wrong.",
+        "- suspect: The processor was throttled at 2 moments.",
+        "Remedy: cool the board.",
+        "- note: Its clock is not known.",
+    ]
+
+
+def test_percentiles_of_one_variant_are_one_table() -> None:
+    text = render(sustained(1), "terminal")
+    assert re.search(r"^latency, ms +value +at most \(99 %\)$", text, re.M)
+    assert re.search(r"^p50 +4\d\.\d +≤ 4\d\.\d$", text, re.M)
+    assert re.search(r"^p99\.9 +–$", text, re.M)
+    assert "300 calls." in text
+    assert re.search(r"^deadline misses +1\.2 % +0\.8–1\.7 +n = 2400$", text, re.M)
+    assert re.search(r"^highest temperature +78\.5 °C$", text, re.M)
+    assert text.count("latency p50") == 0
+
+
+def test_percentiles_of_two_variants_stand_side_by_side() -> None:
+    text = render(sustained(2), "terminal")
+    assert re.search(r"^p50 +4\d\.\d  ≤ 4\d\.\d +1\d\.\d  ≤ 1\d\.\d$", text, re.M)
+    assert "≤: at most (99 %). 300 calls each." in text
+
+
+def test_what_is_unmeasured_is_one_block_and_one_line_for_each_reason() -> None:
+    text = render(sustained(2), "terminal")
+    block = text.partition("\nUnmeasured\n")[2].partition("\n\n")[0]
+    assert [line.strip() for line in block.splitlines()] == [
+        "latency p99.9: needs 6,636 independent calls, this run is worth 1,204; pass",
+        "--iterations 33000",
+        "energy per action, mean power: no power meter",
+        "GPU memory, GPU clock: no GPU",
+    ]
+    assert text.index("memory by part") < text.index("time by phase") < text.index("cold start by part")

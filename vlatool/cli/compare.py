@@ -10,6 +10,7 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._side_by_side import read_reports, side_by_side
 from vlatool.errors import DataError, UsageError
 
 
@@ -23,9 +24,12 @@ def compare(
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
-    """Compare bundles in one interleaved run, or put reports side by side. The first is the baseline."""
+    """Compare bundles in one interleaved run, or put reports side by side. The first is the baseline.
+
+    Reports that were made on other machines, with other engines, threads or clocks are put side by side with a warning
+    that names what differs; a speed-up across reports is given for the same machine only.
+    """
     from vlatool.benchmark.latency import Latency
-    from vlatool.report import Report, read_report
 
     if len(paths) < 2:
         raise UsageError("compare needs two or more bundles, or two or more reports.")
@@ -42,11 +46,5 @@ def compare(
     elif any(bundles):
         raise UsageError("compare takes bundles or reports, not both at once.")
     else:
-        reports = [read_report(path) for path in paths]
-        rows = [
-            replace(row, name=f"{path}: {row.name}")
-            for path, each in zip(paths, reports, strict=True)
-            for row in each.rows
-        ]
-        report = Report("compare", "Reports side by side", rows=tuple(rows), environment=reports[0].environment)
+        report = side_by_side(paths, read_reports(paths))
     show(report, as_json=as_json, out=output, force=force)

@@ -86,6 +86,21 @@ background:var(--grid);border-radius:2px}
 .groups tbody tr:first-child td{border-top:0}.groups{border-bottom:1px solid var(--rule)}
 .pairs{display:grid;grid-template-columns:repeat(auto-fill,minmax(250px,1fr));gap:6px 28px;margin:0;font-size:13.5px}
 .pairs dt{color:var(--muted);font-size:12px}.pairs dd{margin:0}
+.trust{margin:16px 0 0;padding:11px 16px;border-left:3px solid var(--info);background:var(--wash);
+border-radius:0 5px 5px 0;max-width:90ch}
+.trust.suspect{border-color:var(--inconclusive);background:var(--inconclusive-wash)}
+.trust.invalid{border-color:var(--fail);background:var(--fail-wash)}.trust.valid{border-color:var(--pass)}
+.trust p{margin:0;font-weight:620}.trust ul{margin:6px 0 0;padding:0;list-style:none;font-size:14px}
+.trust li{margin-top:5px}.trust li b{font-weight:620;margin-right:4px}.trust b.note{color:var(--muted)}
+.trust b.suspect{color:var(--inconclusive)}.trust b.invalid{color:var(--fail)}.remedy{display:block;color:var(--muted)}
+.percentiles{width:auto;min-width:min(100%,420px)}.percentiles .bound{color:var(--muted)}
+.percentiles .why{color:var(--muted);font-size:12.5px;font-style:italic;max-width:46ch}
+.percentiles .begin{padding-left:30px}
+.percentiles .over th,.percentiles .over td{border-bottom:0;padding-bottom:0}
+.groups thead td{border-bottom:1px solid var(--muted)}
+.parts td:last-child{width:42%;min-width:80px;padding-right:0;padding-left:18px;vertical-align:top}
+.parts .whose{white-space:nowrap}
+.parts .bar{min-width:60px;height:9px;margin:6px 0 0;background:none}
 .guess{border:1px dashed var(--guess-rule);border-radius:8px;background:var(--guess-wash);padding:20px 22px}
 .guess .kind{color:var(--guess);border-color:var(--guess-rule)}
 .guess th,.guess td,.guess thead th{border-color:var(--guess-rule)}
@@ -110,12 +125,14 @@ font-variant-numeric:tabular-nums}
 .line{stroke:var(--series);stroke-width:1.6;stroke-linejoin:round}
 .line.s-chosen{stroke-width:2.4}.line.s-base{stroke-dasharray:6 3}.line.s1{stroke-dasharray:9 2 2 2}
 .line.s2{stroke-dasharray:3 2}.line.s3{stroke-dasharray:11 3}.line.s4{stroke-dasharray:1.5 2.5}
-.fill{fill:var(--series);opacity:.62}.band{fill:var(--series);opacity:.24}.band~.line{stroke-dasharray:none}
+.fill{fill:var(--series);opacity:.62}.outer{fill:var(--series);opacity:.13}.band{fill:var(--series);opacity:.26}.band~.line{stroke-dasharray:none}
 .mark{stroke:var(--series);stroke-width:2}.whisker{stroke:var(--series);stroke-width:1.5;opacity:.65}
 .dot{fill:var(--series);stroke:var(--paper);stroke-width:1}.hollow{fill:var(--paper);stroke:var(--series);stroke-width:2}
 .ring{fill:none;stroke:var(--series);stroke-width:1.5}
 .limit{stroke:var(--limit);stroke-width:1.4;stroke-dasharray:5 3}.chart .limit-text{fill:var(--limit)}
 .outside{fill:var(--limit-wash)}.front{stroke:var(--muted);stroke-width:1;stroke-dasharray:2 3}
+.s-gauge{--series:var(--muted)}.line.s-gauge{stroke-width:1.2}
+.throttle{stroke:var(--limit);stroke-width:1;opacity:.55}
 .halo{paint-order:stroke;stroke:var(--paper);stroke-width:3.5px;stroke-linejoin:round}
 """
 
@@ -125,6 +142,10 @@ main{padding:26px 16px 48px}h1{font-size:22px}section{margin-top:36px}
 .result{flex-direction:column;gap:8px}.result p{font-size:16px}
 .wide{display:none}.narrow{display:block}
 .guess{padding:16px 14px}
+.percentiles .begin{padding-left:16px}
+.parts .calls{display:none}.parts{font-size:13px}.parts td,.parts th{padding-right:9px}
+.parts td.n,.parts th.n{padding-left:6px}
+.parts td:last-child{width:22%;min-width:56px;padding-left:10px}.parts .bar{min-width:46px}
 .variants,.variants tbody,.variants tr,.variants th,.variants td{display:block}
 .variants thead{position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%)}
 .variants tbody{padding:10px 12px;border-bottom:1px solid var(--rule)}

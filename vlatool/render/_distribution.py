@@ -1,32 +1,43 @@
-"""Chart: how the latencies of the variants are spread, and how they went over time."""
+"""Chart: how the latencies of the variants are spread."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
-from vlatool.render._format import significant, tick
-from vlatool.render._samples import ecdf, envelope, finite, histogram, quantile
+from vlatool.render._format import fixed, significant, tick
+from vlatool.render._samples import ecdf, finite, histogram, quantile
 from vlatool.render._svg import Axis, Canvas, axis_for, series, shorten
-from vlatool.report import Report
+from vlatool.render._view import Latency
+from vlatool.report import Report, Row
 
-SERIES_NAME = "latency_ms"
+SERIES_NAME, TIMES = "latency_ms", "at_s"
 MOST = 8
 STRIP = 52
-STRETCH = 78
+MARKED = {"p50": 0.5, "p90": 0.9, "p99": 0.99}
+"""The percentiles that are marked on the curve and below the histogram."""
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """The latency samples of one variant, in ms: as they came, and ordered."""
+    """The latency samples of one variant.
+
+    Args:
+        name, css: The variant and the class of its colour.
+        samples: In ms, as they came.
+        ordered: The same, ascending.
+        known: Share -> the percentile that the report has.
+        times: When each call began, in seconds since the start of the run; empty when that is not known.
+    """
 
     name: str
     css: str
     samples: list[float]
     ordered: list[float]
-
     known: Mapping[float, float]
+    times: list[float]
 
     def at(self, share: float) -> float:
         """Return a quantile in ms; the reported one where the report has it."""
@@ -41,14 +52,25 @@ def left_out(report: Report) -> str:
 
 def sampled(report: Report) -> list[Sampled]:
     """Return the variants that kept latency samples, the first eight at most."""
-    found = []
+    found: list[Sampled] = []
     for row, css in zip(report.rows, series(report.rows), strict=True):
-        samples = finite(row.raw.get(SERIES_NAME) or [])
-        if len(samples) > 1:
-            reported = {0.5: row.value("latency_p50"), 0.99: row.value("latency_p99")}
+        samples, times = _series(row)
+        if len(samples) > 1 and len(found) < MOST:
+            reported = {share: row.value(f"latency_{name}") for name, share in MARKED.items()}
             known = {share: value for share, value in reported.items() if math.isfinite(value)}
-            found.append(Sampled(row.name, css, samples, sorted(samples), known))
-    return found[:MOST]
+            found.append(Sampled(row.name, css, samples, sorted(samples), known, times))
+    return found
+
+
+def _series(row: Row) -> tuple[list[float], list[float]]:
+    """Return the samples, and when each call began; no times unless all are known and time went on."""
+    samples, times = row.raw.get(SERIES_NAME) or [], row.raw.get(TIMES) or []
+    if len(times) != len(samples):
+        return finite(samples), []
+    kept = [time for time, sample in zip(times, samples, strict=True) if finite([sample])]
+    known = finite(kept)
+    going = len(known) == len(kept) > 1 and 0 <= known[0] < known[-1] and all(a <= b for a, b in pairwise(known))
+    return finite(samples), known if going else []
 
 
 def _span(variants: Sequence[Sampled], limit: float | None, start: float, end: float) -> Axis:
@@ -60,53 +82,53 @@ def _span(variants: Sequence[Sampled], limit: float | None, start: float, end: f
     return axis_for(reach, start, end, pad=0.03)
 
 
-def beyond(report: Report, limit: float | None) -> str:
+def beyond(variants: Sequence[Sampled], limit: float | None) -> str:
     """Return a sentence about the samples that lie beyond the end of the axis."""
-    variants = sampled(report)
     axis = _span(variants, limit, 0, 1)
     found = []
     for variant in variants:
         missing = sum(sample > axis.high for sample in variant.samples)
         if missing:
-            found.append(
-                f"{variant.name}: {missing} of {len(variant.samples)}, up to {significant(variant.ordered[-1])} ms"
-            )
+            share = f"{fixed(missing, 0)} of {fixed(len(variant.samples), 0)}"
+            found.append(f"{variant.name}: {share}, up to {significant(variant.ordered[-1])} ms")
     return "Beyond the right end: " + "; ".join(found) + "." if found else ""
 
 
-def distribution(report: Report, limit: float | None, width: int) -> str:
+def distribution(variants: Sequence[Sampled], aim: Latency, width: int) -> str:
     """Return the cumulative share of inferences over latency, with one histogram below for each variant."""
-    variants = sampled(report)
     left, right, top = 46, width - 14, 36
     bottom = top + (200 if width > 500 else 170)
     height = bottom + 50 + STRIP * len(variants)
     medians = ", ".join(f"{variant.name} {significant(variant.at(0.5))} ms" for variant in variants)
     canvas = Canvas(f"spread-{width}", width, height, "Distribution of latency", f"Median latency: {medians}.")
-    axis = _span(variants, limit, left, right)
+    axis = _span(variants, aim.limit, left, right)
     up = Axis(0, 1, bottom, top)
     for share in (0, 0.25, 0.5, 0.75, 1):
         canvas.line(left, up(share), right, up(share), "grid")
         canvas.text(left - 6, up(share) + 4, f"{share:.0%}".replace("%", " %"), "tick", "end")
     canvas.text(0, 12, "share of inferences that are done within …", "note")
     canvas.across(axis, bottom, top, 9 if width > 500 else 5)
-    _limit_line(canvas, axis, limit, top, height - 4)
+    _limit_line(canvas, axis, aim, top, height - 4)
     for variant in variants:
-        _cumulative(canvas, variant, axis, up)
-    canvas.text(right, bottom + 31, "latency, ms" + (" (logarithmic)" if axis.log else ""), "note", "end")
+        _cumulative(canvas, variant, axis, up, len(variants) == 1)
+    canvas.text(right, bottom + 31, "latency, ms" + (" (logarithmic)" if axis.log else ""), "note halo", "end")
     for index, variant in enumerate(variants):
         _strip(canvas, variant, axis, bottom + 46 + STRIP * index)
     return canvas.svg()
 
 
-def _limit_line(canvas: Canvas, axis: Axis, limit: float | None, top: float, bottom: float) -> None:
+def _limit_line(canvas: Canvas, axis: Axis, aim: Latency, top: float, bottom: float) -> None:
+    limit = aim.limit
     if limit is None or not axis.holds(limit):
         return
     canvas.line(axis(limit), top, axis(limit), bottom, "limit")
     anchor = "end" if axis.share(limit) > 0.5 else "start"
-    canvas.text(axis(limit) + (4 if anchor == "end" else -4), top - 5, f"limit {tick(limit)} ms", "limit-text", anchor)
+    canvas.text(
+        axis(limit) + (4 if anchor == "end" else -4), top - 5, f"{aim.word} {tick(limit)} ms", "limit-text", anchor
+    )
 
 
-def _cumulative(canvas: Canvas, variant: Sampled, axis: Axis, up: Axis) -> None:
+def _cumulative(canvas: Canvas, variant: Sampled, axis: Axis, up: Axis, named: bool) -> None:
     points = [(axis(sample), up(share)) for sample, share in ecdf(variant.ordered) if sample <= axis.high]
     if not points:
         return
@@ -115,6 +137,12 @@ def _cumulative(canvas: Canvas, variant: Sampled, axis: Axis, up: Axis) -> None:
         line.append((axis.end, up(1)))
     tip = f"{variant.name}: median {significant(variant.at(0.5))} ms, p99 {significant(variant.at(0.99))} ms"
     canvas.steps(line, f"line {variant.css}", tip)
+    for name, share in MARKED.items():
+        if axis.holds(variant.at(share)):
+            x, y = axis(variant.at(share)), up(share)
+            canvas.add("circle", f"dot {variant.css}", f"{name} {significant(variant.at(share))} ms", cx=x, cy=y, r=3.5)
+            if named:
+                canvas.text(x + 7, y + 14, name, "tick halo")
 
 
 def _strip(canvas: Canvas, variant: Sampled, axis: Axis, top: float) -> None:
@@ -128,47 +156,11 @@ def _strip(canvas: Canvas, variant: Sampled, axis: Axis, top: float) -> None:
     )
     canvas.add("path", f"fill {variant.css}", f"{variant.name}: {len(variant.samples)} samples", d=bars or "M0 0")
     canvas.line(axis.start, base, axis.end, base, "axis")
-    for share in (0.5, 0.99):
+    for share in MARKED.values():
         if axis.holds(variant.at(share)):
             spot = axis(variant.at(share))
             canvas.line(spot, base - 2, spot, base + 5, f"mark {variant.css}")
-    numbers = f"p50 {significant(variant.at(0.5))} · p99 {significant(variant.at(0.99))} ms"
+    numbers = f"{' · '.join(f'{name} {significant(variant.at(share))}' for name, share in MARKED.items())} ms"
     room = canvas.width - len(numbers) * 6.2 - 20
     canvas.text(0, top + 4, shorten(variant.name, room), f"name halo ink {variant.css}")
     canvas.text(axis.end, top + 4, numbers, "tick halo", "end")
-
-
-def over_time(report: Report, limit: float | None, width: int) -> str:
-    """Return smallest, median and largest latency along the run, each variant on its own scale."""
-    variants = sampled(report)
-    height = STRETCH * len(variants) + 22
-    worst = ", ".join(f"{variant.name} {significant(variant.ordered[-1])} ms" for variant in variants)
-    canvas = Canvas(f"time-{width}", width, height, "Latency along the run", f"Largest latency: {worst}.")
-    for index, variant in enumerate(variants):
-        _stretch(canvas, variant, limit, STRETCH * index)
-    canvas.text(46, height - 4, "first sample", "tick")
-    canvas.text(width - 14, height - 4, "last sample", "tick", "end")
-    return canvas.svg()
-
-
-def _stretch(canvas: Canvas, variant: Sampled, limit: float | None, top: float) -> None:
-    left, right, base = 46.0, canvas.width - 14.0, top + STRETCH - 12
-    high = min(variant.ordered[-1], 2.5 * variant.at(0.95))
-    scale = axis_for([variant.ordered[0], max(high, variant.ordered[0] * 1.02)], base, top + 22, pad=0.04)
-    for value in scale.ticks(3):
-        canvas.line(left, scale(value), right, scale(value), "grid")
-        canvas.text(left - 6, scale(value) + 4, tick(value), "tick", "end")
-    most = 180 if canvas.width > 500 else 90
-    bands = envelope(variant.samples, max(20, min(most, len(variant.samples) // 12)))
-    step = (right - left) / len(bands)
-    centres = [left + step * (index + 0.5) for index in range(len(bands))]
-    upper = [(x, scale(band[2])) for x, band in zip(centres, bands, strict=True)]
-    lower = [(x, scale(band[0])) for x, band in zip(centres, bands, strict=True)]
-    canvas.area(upper, lower, f"band {variant.css}")
-    middle = " ".join(f"{x:.1f},{scale(band[1]):.1f}" for x, band in zip(centres, bands, strict=True))
-    canvas.add("polyline", f"line {variant.css}", points=middle, fill="none")
-    if limit is not None and scale.holds(limit):
-        canvas.line(left, scale(limit), right, scale(limit), "limit")
-    numbers = f"{significant(variant.ordered[0])}–{significant(variant.ordered[-1])} ms, n = {len(variant.samples)}"
-    canvas.text(0, top + 12, shorten(variant.name, canvas.width - len(numbers) * 6.2 - 20), f"name ink {variant.css}")
-    canvas.text(right, top + 12, numbers, "tick", "end")

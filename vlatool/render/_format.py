@@ -15,6 +15,19 @@ MINUS = "\u2212"
 LABELS = {
     "speedup": "speed-up",
     "peak_rss": "peak memory",
+    "steady_rss": "steady memory",
+    "latency_p99.9": "latency p99.9",
+    "latency_start_p50": "latency p50 at the start",
+    "latency_sustained_p50": "latency p50 sustained",
+    "sustained_slowdown": "sustained slow-down",
+    "cpu": "processor use",
+    "power_mean": "mean power",
+    "temperature_max": "highest temperature",
+    "age_p50": "observation age p50",
+    "age_p99": "observation age p99",
+    "age_max": "observation age max",
+    "wakeup_p50": "wake-up delay p50",
+    "wakeup_p99": "wake-up delay p99",
     "mcnemar_p": "McNemar p",
     "success_drop": "success drop",
 }
@@ -128,7 +141,7 @@ def unit(measurement: Measurement) -> str:
         return "%"
     if _in_millimetres(measurement):
         return "mm"
-    return {"1": "", "x": "×"}.get(measurement.unit, plain(measurement.unit))
+    return {"1": "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
 
 
 def _decimals(measurement: Measurement, value: float) -> int:

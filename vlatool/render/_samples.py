@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import pairwise
+from dataclasses import dataclass
 
 
 def finite(samples: Sequence[float | None]) -> list[float]:
@@ -36,12 +36,45 @@ def histogram(samples: Sequence[float], place: Callable[[float], float], bins: i
     return counts
 
 
-def envelope(samples: Sequence[float], bins: int) -> list[tuple[float, float, float]]:
-    """Return (smallest, median, largest) of consecutive stretches, in the order of time."""
-    bins = min(bins, len(samples))
-    edges = [round(index * len(samples) / bins) for index in range(bins + 1)]
-    stretches = [sorted(samples[start:end]) for start, end in pairwise(edges)]
-    return [(part[0], part[len(part) // 2], part[-1]) for part in stretches]
+@dataclass(frozen=True)
+class Band:
+    """The samples of a stretch of time.
+
+    Args:
+        at: The middle of the stretch.
+        low, high: The smallest and the largest sample.
+        lower, upper: The 10th and the 90th percentile.
+        middle: The median.
+    """
+
+    at: float
+    low: float
+    lower: float
+    middle: float
+    upper: float
+    high: float
+
+
+def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> list[Band]:
+    """Return a band for each stretch of time that has samples; the stretches are equally long.
+
+    Args:
+        times: When each sample was taken, ascending.
+        samples: As many as there are times.
+        bins: How many stretches.
+    """
+    first, last = times[0], times[-1]
+    wide = (last - first) / bins
+    stretches: list[list[float]] = [[] for _ in range(bins)]
+    for moment, sample in zip(times, samples, strict=True):
+        stretches[min(bins - 1, int((moment - first) / wide)) if wide > 0 else 0].append(sample)
+    found = []
+    for place, part in enumerate(stretches):
+        if part:
+            part.sort()
+            inner = quantile(part, 0.1), part[len(part) // 2], quantile(part, 0.9)
+            found.append(Band(first + (place + 0.5) * wide, part[0], *inner, part[-1]))
+    return found
 
 
 def sparkline(samples: Sequence[float], bins: int) -> str:

@@ -1,4 +1,4 @@
-"""Chart: accuracy against latency, with intervals, the limits and the Pareto front."""
+"""Chart: accuracy, or memory where accuracy is not known, against latency: intervals, limits, the Pareto front."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vlatool.render._format import full, is_share, label, number, quantity, tick
+from vlatool.render._format import full, is_share, label, number, quantity, tick, unit
 from vlatool.render._svg import CHARACTER, Axis, Canvas, axis_for, series, shorten
-from vlatool.render._view import ERRORS, Latency, accuracy, floor, latency
+from vlatool.render._view import ERRORS, Latency, accuracy, floor, latency, measured
 from vlatool.report import Measurement, Report
 
+FOOTPRINT = ("peak_rss", "steady_rss", "size")
 Box = tuple[float, float, float, float]
 
 
@@ -25,9 +26,21 @@ class Point:
     y: Measurement
 
 
+def upright(report: Report) -> str:
+    """Return the name of the number that is drawn against latency: the accuracy, else memory or size."""
+    if found := accuracy(report):
+        return found
+    across = measured(report, latency(report).name)
+    for name in FOOTPRINT:
+        pairs = zip(across, measured(report, name), strict=True)
+        if sum(x is not None and y is not None and x.known and y.known for x, y in pairs) > 1:
+            return name
+    return ""
+
+
 def points(report: Report) -> list[Point]:
     """Return the variants of which both numbers were measured."""
-    across, up = latency(report).name, accuracy(report)
+    across, up = latency(report).name, upright(report)
     found = []
     for row, css in zip(report.rows, series(report.rows), strict=True):
         x, y = row.get(across), row.get(up)
@@ -38,7 +51,7 @@ def points(report: Report) -> list[Point]:
 
 def front(found: Sequence[Point]) -> list[Point]:
     """Return the points that no other one beats in both respects, fastest first."""
-    sign = -1 if found and found[0].y.name in ERRORS else 1
+    sign = -1 if found and found[0].y.name in (*ERRORS, *FOOTPRINT) else 1
     best: list[Point] = []
     for point in sorted(found, key=lambda item: (item.x.value, -sign * item.y.value)):
         if not best or sign * point.y.value > sign * best[-1].y.value:
@@ -61,6 +74,8 @@ def _axes(found: Sequence[Point], aim: Latency, least: float | None, frame: Box)
         ys.append(least)
     if found[0].y.name in ERRORS:
         return across, axis_for(ys, top, bottom, zero=True)
+    if found[0].y.name in FOOTPRINT:
+        return across, axis_for(ys, bottom, top, zero=True)
     low, high = min(ys), max(ys)
     room = (high - low) * 0.08 or 0.02
     most = 1.0 if is_share(found[0].y) and high <= 1 else high + room
@@ -99,7 +114,7 @@ def _background(canvas: Canvas, first: Point, across: Axis, up: Axis, frame: Box
         canvas.line(left, up(value), right, up(value), "grid")
         canvas.text(left - 6, up(value) + 4, tick(value * factor), "tick", "end")
     canvas.across(across, bottom, top, 9 if canvas.width > 500 else 5)
-    better = "better is up: smaller" if first.y.name in ERRORS else ("%" if factor == 100 else "")
+    better = "better is up: smaller" if first.y.name in ERRORS else unit(first.y)
     canvas.text(0, 12, ", ".join(part for part in (label(first.y.name), better) if part), "note")
     scale = " (logarithmic)" if across.log else ""
     canvas.text(right, bottom + 32, f"{label(first.x.name)}, {first.x.unit}{scale}", "note", "end")
@@ -109,7 +124,7 @@ def _limits(canvas: Canvas, across: Axis, up: Axis, aim: Latency, least: float |
     left, top, right, bottom = frame
     boxes: list[Box] = []
     if aim.limit is not None and across.holds(aim.limit):
-        spot, text = across(aim.limit), f"limit {tick(aim.limit)} ms"
+        spot, text = across(aim.limit), f"{aim.word} {tick(aim.limit)} ms"
         canvas.add("rect", "outside", x=spot, y=top, width=right - spot, height=bottom - top)
         canvas.line(spot, top, spot, bottom, "limit")
         canvas.text(spot - 5, bottom - 8, text, "limit-text", "end")

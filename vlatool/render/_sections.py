@@ -10,8 +10,8 @@ from html import escape
 
 from vlatool.render._format import aside, label, limit, plain, quantity, span
 from vlatool.render._svg import series
+from vlatool.render._tables import Table
 from vlatool.render._view import (
-    Table,
     brackets,
     dimension,
     error_groups,
@@ -23,6 +23,7 @@ from vlatool.render._view import (
     names,
     notes,
     other_names,
+    percentile_names,
     place,
     places,
     role,
@@ -48,14 +49,15 @@ def section(title: str, body: str, sub: str = "", kind: str = "", css: str = "",
     return f"<section{attributes}><h2>{tag}{safe(title)}</h2>{below}{body}</section>"
 
 
-def head(report: Report) -> str:
-    """Return title, verdict, summary and limits."""
+def head(report: Report, trust: str = "") -> str:
+    """Return title, verdict, summary, whether the measurement can be trusted, and limits."""
     made = " · ".join(part for part in (f"vlatool {report.kind} report", report.created) if part)
     first, *more = report.summary or (report.title,)
     badge = f'<span class="badge {report.verdict}">{f"{MARKS[report.verdict]} {report.verdict}".strip()}</span>'
     parts = [f'<header><div class="over">{safe(made)}</div><h1>{safe(report.title)}</h1>']
     parts.append(f'<div class="result">{badge}<p>{safe(first)}</p></div>')
     parts += [f"<p>{safe(sentence)}</p>" for sentence in more]
+    parts.append(trust)
     if report.limits:
         asked = [limit(name, wanted) for name, wanted in report.limits.items()]
         items = "".join(f"<li><span>{safe(name)}</span> {safe(wanted)}</li>" for name, wanted in asked)
@@ -224,7 +226,7 @@ def _error_line(name: str, rows: Iterable[Row], tints: dict[str, str]) -> str:
 def others(report: Report) -> str:
     """Return the measured numbers that stand nowhere else, and why some could not be had."""
     shown = other_names(report)
-    missing = unmeasured(report)
+    missing = unmeasured(report, percentile_names(report))
     body = numbers(report, shown, "measured", None) if shown else ""
     if remarks := notes(report, "measured", lambda item: item.known):
         body += "<h3>Methods</h3>" + _notes([f"{', '.join(labels)}: {note}" for note, labels in remarks.items()])

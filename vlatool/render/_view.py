@@ -4,28 +4,37 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
-from vlatool.render._format import cell, fixed, interval, is_usual, label, plain
+from vlatool.render._format import cell, interval, is_usual, label, plain
 from vlatool.report import Measurement, Report, Row
 
 ACCURACY = ("success", "agreement", "agreement_expert", "agreement_baseline")
 ERRORS = ("error", "error_expert", "error_baseline")
 ROLES = {"subject": "measured", "within": "within limits", "outside": "outside limits"}
 ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
+PERCENTILES = ("latency_p50", "latency_p90", "latency_p95", "latency_p99", "latency_p99.9", "latency_max")
+ORDER = (
+    *(
+        "speedup",
+        "throughput",
+        "jitter",
+        "deadline_misses",
+        "age_p50",
+        "age_p99",
+        "age_max",
+        "wakeup_p50",
+        "wakeup_p99",
+    ),
+    *("latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu"),
+    *("size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max"),
+)
+"""The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
+ABSENT = "unmeasured"
+"""The details table that says what could not be had; shown with the numbers that are NaN."""
 SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of texts; ``numeric`` tells which columns to align right."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    numeric: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,11 @@ class Latency:
     name: str
     limit: float | None
     limit_name: str = ""
+
+    @property
+    def word(self) -> str:
+        """What the limit is called in a drawing."""
+        return "deadline" if "deadline" in self.limit_name else "limit"
 
 
 def measured(report: Report, name: str) -> list[Measurement | None]:
@@ -62,8 +76,20 @@ def headline(report: Report) -> list[str]:
 
 def other_names(report: Report) -> list[str]:
     """Return the measured names that neither the headline nor the error table shows."""
-    shown = set(headline(report))
-    return [name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name)]
+    shown = {*headline(report), *percentile_names(report)}
+    return in_order(name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name))
+
+
+def percentile_names(report: Report) -> list[str]:
+    """Return the measured percentiles of the latency when there are enough of them for a table of their own."""
+    present = names(report)
+    found = [name for name in PERCENTILES if name in present]
+    return found if len(found) > 2 else []
+
+
+def in_order(found: Iterable[str]) -> list[str]:
+    """Return names of measurements in the order in which a reader asks for them."""
+    return sorted(found, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
 
 
 def short(name: str) -> str:
@@ -154,19 +180,34 @@ def matrix(
     return [report.rows[index].name for index in kept], cells
 
 
-def unmeasured(report: Report) -> list[str]:
-    """Return a sentence for each number that could not be had."""
-    found = []
+def unmeasured(report: Report, passed_over: Iterable[str] = ()) -> list[str]:
+    """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
+
+    Args:
+        report: The report.
+        passed_over: Names of measurements whose reason stands elsewhere.
+    """
+    left = set(passed_over)
+    found: dict[tuple[str, str], list[str]] = {}
     for row in report.rows:
-        for item in row.measurements:
-            if not item.known:
-                reason = f": {plain(item.note)}" if item.note else ""
-                found.append(
-                    f"{plain(row.name)}, {label(item.name)}, {item.origin} for {plain(item.where)}{reason}"
-                    if item.origin == "predicted"
-                    else f"{plain(row.name)}, {label(item.name)}{reason}"
-                )
-    return found
+        missing = [
+            (
+                f"{label(item.name)}{f', predicted for {plain(item.where)}' if item.origin == 'predicted' else ''}",
+                item.note,
+            )
+            for item in row.measurements
+            if not item.known and item.name not in left
+        ]
+        told = [(record.get("what", ""), record.get("why", "")) for record in row.details.get(ABSENT, ())]
+        for what, why in [*missing, *told]:
+            rows = found.setdefault((plain(what), plain(why)), [])
+            if row.name not in rows:
+                rows.append(row.name)
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for (what, why), rows in found.items():
+        whose = "" if len(rows) == len(report.rows) else f"{', '.join(plain(name) for name in rows)}, "
+        grouped.setdefault((whose, why), []).append(what)
+    return [f"{whose}{', '.join(what)}{f': {why}' if why else ''}" for (whose, why), what in grouped.items()]
 
 
 def role(row: Row) -> str:
@@ -175,16 +216,26 @@ def role(row: Row) -> str:
 
 
 def latency(report: Report) -> Latency:
-    """Return which latency percentile the limit speaks of, and the limit."""
+    """Return which latency percentile the limit speaks of, and the limit.
+
+    A benchmark at a rate (``hz``) without one has its period as the deadline, and so have several that are compared.
+    The rate that ``optimize`` was asked for is no limit on this host.
+    """
     present = names(report)
     for name, wanted in report.limits.items():
-        numeric = isinstance(wanted, int | float) and not isinstance(wanted, bool)
-        if numeric and name.endswith("_ms") and ("latency" in name or "deadline" in name):
-            hit = re.search(r"p\d+", name)
+        if _number(wanted) and name.endswith("_ms") and ("latency" in name or "deadline" in name):
+            hit = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
             chosen = f"latency_{hit[0]}" if hit else "latency_p50"
             if chosen in present:
                 return Latency(chosen, float(wanted), plain(name))
+    rate = report.limits.get("hz")
+    if report.kind in ("benchmark", "compare") and _number(rate) and rate > 0:
+        return Latency("latency_p50", 1e3 / rate, "deadline")
     return Latency("latency_p50", None)
+
+
+def _number(wanted: Any) -> TypeGuard[int | float]:
+    return isinstance(wanted, int | float) and not isinstance(wanted, bool)
 
 
 def accuracy(report: Report) -> str:
@@ -219,53 +270,3 @@ def facts(environment: Mapping[str, Any], prefix: str = "") -> list[tuple[str, s
         else:
             found.append((name, cell(content)))
     return found
-
-
-def details(report: Report) -> list[Table]:
-    """Return the details of all rows; the same table of several variants becomes one, with a column for the variant."""
-    by_title: dict[str, list[tuple[str, dict[str, Any]]]] = {}
-    for row in report.rows:
-        for title, records in row.details.items():
-            records = [record for record in records if record]
-            by_title.setdefault(title, []).extend((row.name, dict(record)) for record in records)
-    return [_details_table(plain(title), records) for title, records in by_title.items() if records]
-
-
-def _details_table(title: str, records: list[tuple[str, dict[str, Any]]]) -> Table:
-    columns = list(dict.fromkeys(key for _, record in records for key in record))
-    several = len({name for name, _ in records}) > 1
-    if several:
-        order = list(dict.fromkeys(cell(record.get(columns[0])) for _, record in records))
-        records = sorted(records, key=lambda item: order.index(cell(item[1].get(columns[0]))))
-    numeric = [
-        all(
-            isinstance(record.get(key), int | float | None) and not isinstance(record.get(key), bool)
-            for _, record in records
-        )
-        for key in columns
-    ]
-    by_column = [_cells([record.get(key) for _, record in records]) for key in columns]
-    rows = list(zip(*by_column, strict=True))
-    heads = tuple(plain(key) for key in columns)
-    if not several:
-        only = plain(records[0][0])
-        return Table(f"{title}: {only}", heads, tuple(rows), tuple(numeric))
-    lead: list[tuple[str, ...]] = []
-    group = ""
-    for (name, _), row in zip(records, rows, strict=True):
-        again = bool(lead) and row[0] == group
-        group = row[0]
-        lead.append(("" if again and not numeric[0] else row[0], plain(name), *row[1:]))
-    return Table(title, (heads[0], "variant", *heads[1:]), tuple(lead), (numeric[0], False, *numeric[1:]))
-
-
-def _cells(contents: list[Any]) -> list[str]:
-    """Return the texts of one column; its floats get the same decimals."""
-    floats = [item for item in contents if isinstance(item, float) and math.isfinite(item)]
-    texts = [f"{item:.4g}" for item in floats]
-    if any("e" in text for text in texts):
-        return [cell(item) for item in contents]
-    decimals = max((len(text.partition(".")[2]) for text in texts), default=0)
-    return [
-        fixed(item, decimals) if isinstance(item, float) and math.isfinite(item) else cell(item) for item in contents
-    ]

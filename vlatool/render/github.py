@@ -1,11 +1,15 @@
-"""The report as workflow commands of GitHub Actions: one annotation for each claim that is not kept."""
+"""The report as workflow commands of GitHub Actions: one annotation for each claim that is not kept.
+
+Each reason not to trust the measurement is one more: a warning where it is suspect, an error where it is invalid.
+"""
 
 from __future__ import annotations
 
-from vlatool.render.junit import claims
+from vlatool.render._trust import findings, reason, remedy, sentence
+from vlatool.render.junit import cases_of
 from vlatool.report import Report
 
-COMMANDS = {"fail": "error", "inconclusive": "warning"}
+COMMANDS = {"fail": "error", "inconclusive": "warning", "invalid": "error", "suspect": "warning"}
 
 
 class GithubRenderer:
@@ -13,7 +17,7 @@ class GithubRenderer:
 
     def render(self, report: Report) -> str:
         """Return the lines; a notice when nothing is wrong."""
-        cases = claims(report) or [("verdict", report.verdict, " ".join(report.summary) or report.title)]
+        cases = [*cases_of(report), *_trust(report)]
         lines = [
             f"::{COMMANDS[verdict]} title={field(f'{report.title}: {name} {verdict}')}::{data(said)}"
             for name, verdict, said in cases
@@ -21,6 +25,17 @@ class GithubRenderer:
         ]
         first = report.summary[0] if report.summary else report.title
         return "\n".join(lines or [f"::notice title={field(report.title)}::{data(first)}"]) + "\n"
+
+
+def _trust(report: Report) -> list[tuple[str, str, str]]:
+    """Return (name, effect, text) of each finding; of the judgement alone when no finding says why."""
+    found = [
+        ("measurement", each.effect, " ".join(part for part in (reason(each), remedy(each)) if part))
+        for each in findings(report)
+    ]
+    if any(effect == report.validity for _, effect, _ in found):
+        return found
+    return [("measurement", report.validity, sentence(report)), *found]
 
 
 def data(text: str) -> str:

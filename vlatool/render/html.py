@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from vlatool.render import _sections as part
 from vlatool.render._boards import KIND, by_state, chart
 from vlatool.render._boards_html import boards_section, cost_section
 from vlatool.render._css import stylesheet
-from vlatool.render._distribution import beyond, distribution, left_out, over_time, sampled
+from vlatool.render._distribution import Sampled, beyond, distribution, left_out, sampled
 from vlatool.render._format import label
-from vlatool.render._scatter import points, scatter
-from vlatool.render._view import accuracy, details, latency, measured_where
+from vlatool.render._measured_html import BARS, bars, percentile_section, trust
+from vlatool.render._scatter import FOOTPRINT, points, scatter, upright
+from vlatool.render._tables import details
+from vlatool.render._timeline import MOST_GAUGES, along_the_run, gauges, over_time, throttled, timed, untimed
+from vlatool.render._view import latency, measured_where
 from vlatool.report import Report
 
 WIDTHS = {"wide": 996, "narrow": 366}
@@ -23,18 +26,24 @@ class HtmlRenderer:
     def render(self, report: Report) -> str:
         """Return the page."""
         if report.kind == KIND:
-            return self._page(report, part.head(report) + self._boards(report) + part.circumstances(report))
+            return self._page(
+                report, part.head(report, trust(report)) + self._boards(report) + part.circumstances(report)
+            )
+        variants = sampled(report)
         body = "".join(
             (
-                part.head(report),
+                part.head(report, trust(report)),
                 part.variants(report),
-                self._spread(report),
+                percentile_section(report),
+                self._spread(report, variants),
+                self._over_time(report, timed(variants)),
                 self._trade(report),
+                bars(report),
                 part.errors(report),
                 part.others(report),
-                part.tables(details(report)),
+                part.tables(details(report, tuple(BARS))),
                 part.predicted(report),
-                self._time(report),
+                self._along(report, untimed(variants)),
                 part.circumstances(report),
             )
         )
@@ -58,35 +67,48 @@ class HtmlRenderer:
             f"<style>{stylesheet()}</style></head>\n<body><main>{body}</main></body></html>\n"
         )
 
-    def _spread(self, report: Report) -> str:
-        if not sampled(report):
+    def _spread(self, report: Report, variants: Sequence[Sampled]) -> str:
+        if not variants:
             return ""
-        limit = latency(report).limit
-        sub = "Each curve climbs to the share of inferences that were at least as fast. Below, the same samples as "
-        sub += f"histograms; the two ticks are median and 99th percentile. {beyond(report, limit)} {left_out(report)}"
-        drawing = self._both(lambda width: distribution(report, limit, width))
-        return part.section("How latency is spread", drawing, f"{measured_where(report)}. {sub}", "measured")
+        aim = latency(report)
+        sub = "Each curve climbs to the share of inferences that were at least as fast; the dots are p50, p90 and p99. "
+        sub += f"Below, the same samples as histograms with the same marks. {beyond(variants, aim.limit)} "
+        drawing = self._both(lambda width: distribution(variants, aim, width))
+        where = f"{measured_where(report)}. {sub}{left_out(report)}"
+        return part.section("How latency is spread", drawing, where, "measured")
 
     def _trade(self, report: Report) -> str:
         found = points(report)
         if len(found) < 2:
             return ""
-        title = f"{label(accuracy(report))} against {label(latency(report).name)}"
-        sub = (
-            "Up and to the left is better. Lines through the points are intervals; the dotted line joins the variants "
-        )
-        sub += "that no other beats in both. Square: baseline. Ringed: chosen. Hollow: outside the limits."
+        name = upright(report)
+        title = f"{label(name)} against {label(latency(report).name)}"
+        better = "Down" if name in FOOTPRINT else "Up"
+        sub = f"{better} and to the left is better. Lines through the points are intervals; the dotted line joins the "
+        sub += "variants that no other beats in both. Square: baseline. Ringed: chosen. Hollow: outside the limits."
         drawing = self._both(lambda width: scatter(report, width))
         return part.section(part.capital(title), drawing, f"{measured_where(report)}. {sub}", "measured")
 
-    def _time(self, report: Report) -> str:
-        if not sampled(report):
+    def _over_time(self, report: Report, variants: Sequence[Sampled]) -> str:
+        if not variants:
             return ""
-        limit = latency(report).limit
-        sub = "Line: median of consecutive samples. Band: smallest to largest. A slope means warming up or throttling. "
+        aim, most = latency(report), len(gauges(report)) - MOST_GAUGES
+        sub = "Line: median of a stretch of time. Dark band: the middle 80 %. Light band: smallest to largest. "
+        sub += "Each has its own scale, latency in ms; a band that touches the top goes beyond it. "
+        sub += "Vertical lines: moments of throttling. " if throttled(report) else ""
+        sub += f"{most} more gauges in report.json. " if most > 0 else ""
+        drawing = self._both(lambda width: over_time(report, variants, aim, width))
+        return part.section("Latency over time", drawing, f"{measured_where(report)}. {sub}", "measured")
+
+    def _along(self, report: Report, variants: Sequence[Sampled]) -> str:
+        if not variants:
+            return ""
+        aim = latency(report)
+        sub = "Line: median of consecutive samples. Dark band: the middle 80 %. Light band: smallest to largest. "
+        sub += "A slope means warming up or throttling. "
         sub += "Each variant has its own scale in ms; a band that touches the top goes beyond it. "
         sub += left_out(report)
-        drawing = self._both(lambda width: over_time(report, limit, width))
+        drawing = self._both(lambda width: along_the_run(variants, aim, width))
         return part.section("Latency along the run", drawing, f"{measured_where(report)}. {sub}", "measured")
 
     def _both(self, draw: Callable[[int], str]) -> str:

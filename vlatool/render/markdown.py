@@ -7,9 +7,12 @@ from collections.abc import Iterable, Sequence
 
 from vlatool.render._boards import HEADS, KIND, by_state, cells, costs, reasons
 from vlatool.render._format import full, label, limit, plain
+from vlatool.render._percentiles import percentiles
+from vlatool.render._tables import details
+from vlatool.render._trust import MARKS as TRUST
+from vlatool.render._trust import findings, reason, remedy, sentence
 from vlatool.render._view import (
     brackets,
-    details,
     error_groups,
     facts,
     headline,
@@ -40,6 +43,7 @@ class MarkdownRenderer:
         blocks = [
             *_head(report),
             *_variants(report),
+            *_percentiles(report),
             *_predicted(report),
             *_further(report),
             *_details(report),
@@ -90,10 +94,33 @@ def _head(report: Report) -> list[str]:
         blocks.append(f"**{inline(report.title)}**" + (f" · {inline(report.created)}" if report.created else ""))
     if more:
         blocks.append(" ".join(inline(sentence) for sentence in more))
+    blocks += _trust(report)
     if report.limits:
         asked = ", ".join(" ".join(limit(name, wanted)) for name, wanted in report.limits.items())
         blocks.append(f"Limits asked for: {inline(asked)}")
     return blocks
+
+
+def _trust(report: Report) -> list[str]:
+    """Return whether the measurement can be trusted, and each reason with its remedy."""
+    told = [f"**{TRUST[report.validity]} {inline(sentence(report))}**"] if report.validity else []
+    lines = [
+        f"- *{found.effect}*: " + " ".join(inline(part) for part in (reason(found), remedy(found)) if part)
+        for found in findings(report)
+    ]
+    return told + (["\n".join(lines)] if lines else [])
+
+
+def _percentiles(report: Report) -> list[str]:
+    found = percentiles(report)
+    if found is None:
+        return []
+    heads, body = ["latency, ms"], [[name] for name in found.names]
+    for column, variant in enumerate(found.variants):
+        heads += [variant, found.bound] if found.bounded else [variant]
+        for line, values, bounds in zip(body, found.values, found.bounds, strict=True):
+            line += [values[column], bounds[column] or "–"] if found.bounded else [values[column]]
+    return [_table(heads, body), *([found.about()] if found.about() else [])]
 
 
 def _variants(report: Report) -> list[str]:

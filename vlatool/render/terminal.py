@@ -10,21 +10,25 @@ from rich.text import Text
 
 from vlatool.render._boards import HEADS as BOARD_HEADS
 from vlatool.render._boards import KIND, by_state, cells, costs, reasons
-from vlatool.render._format import UNMEASURED, aside, count, label, limit, plain, quantity, span
+from vlatool.render._format import aside, count, label, limit, plain, quantity, span
 from vlatool.render._grid import grid
+from vlatool.render._percentiles import percentiles
 from vlatool.render._samples import finite, sparkline
+from vlatool.render._tables import details
+from vlatool.render._trust import findings, reason, remedy, sentence
 from vlatool.render._view import (
     brackets,
-    details,
     error_groups,
     facts,
     headline,
+    in_order,
     matrix,
     measured,
     measured_where,
     names,
     notes,
     other_names,
+    percentile_names,
     place,
     places,
     role,
@@ -34,6 +38,7 @@ from vlatool.render._view import (
 from vlatool.report import Report, Row
 
 STYLES = {"pass": "bold green", "fail": "bold red", "inconclusive": "bold yellow", "info": "bold cyan"}
+TRUST = {"": "", "valid": "green", "suspect": "bold yellow", "invalid": "bold red", "note": ""}
 MOST_RECORDS = 24
 HEADING = "bold"
 
@@ -106,16 +111,31 @@ class TerminalRenderer:
         lines = self._wrapped(first, f"{verdict}  ", indent)
         lines = lines or [Text(verdict)]
         lines[0].stylize(STYLES[report.verdict], 0, len(verdict))
-        for sentence in more:
-            lines += self._wrapped(sentence, indent)
+        for each in more:
+            lines += self._wrapped(each, indent)
+        lines += self._trust(report, indent)
         about = " · ".join(part for part in (report.title if report.summary else "", report.created) if part)
         lines += self._wrapped(about, indent, style="dim")
         asked = ", ".join(" ".join(limit(name, wanted)) for name, wanted in report.limits.items())
         return lines + (self._wrapped(asked, "Limits asked for: ", "  ") if asked else [])
 
+    def _trust(self, report: Report, indent: str) -> list[Text]:
+        """Return whether the measurement can be trusted, each reason, and its remedy below."""
+        lines = self._wrapped(sentence(report), indent, style=TRUST[report.validity])
+        for found in findings(report):
+            lines += self._wrapped(
+                f"{found.effect}: {reason(found)}", f"{indent}- ", f"{indent}  ", TRUST[found.effect]
+            )
+            lines += self._wrapped(remedy(found), f"{indent}  ")
+        return lines
+
     def _variants(self, report: Report) -> list[Text]:
         if not report.rows:
             return self._heading("The report has no rows")
+        if self._alone(report):
+            reasons = self._reasons(report)
+            return [*self._percentiles(report, self._origin(report)), *self._numbers(report),
+                    *([Text(), *reasons] if reasons else []), *self._spread(report)]  # fmt: skip
         shown = headline(report)
         same = [self._same_count(report, name) for name in shown]
         body = [["", *same]] if any(same) else []
@@ -127,6 +147,40 @@ class TerminalRenderer:
         lines += self._table(["variant", *(short(name) for name in shown)], body, styles=styles)
         lines += self._wrapped(brackets(report, "measured"), style="dim")
         return [*lines, Text(), *self._reasons(report), *self._spread(report)]
+
+    def _alone(self, report: Report) -> bool:
+        """Return whether there is one variant, so that one list holds all of its numbers."""
+        return len(report.rows) == 1 and bool(percentile_names(report))
+
+    def _percentiles(self, report: Report, heading: str) -> list[Text]:
+        found = percentiles(report)
+        if found is None:
+            return []
+        title, several = "latency, ms", len(found.variants) > 1
+        if several:
+            heads = [title, *found.variants]
+            body = [[name, *cells] for name, cells in zip(found.names, found.beside(), strict=True)]
+        else:
+            heads = [title, "value", *([found.bound] if found.bounded else [])]
+            bounds = ([f"≤ {line[0]}" if line[0] and "most" in found.bound else line[0]] for line in found.bounds)
+            body = [[name, line[0], *(bound if found.bounded else [])]
+                    for name, line, bound in zip(found.names, found.values, bounds, strict=True)]  # fmt: skip
+        meaning = f"≤: {found.bound}. " if several and found.bounded else ""
+        return [
+            *self._heading(heading),
+            *self._table(heads, body),
+            *self._wrapped(f"{meaning}{found.about()}", style="dim"),
+        ]
+
+    def _numbers(self, report: Report) -> list[Text]:
+        """Return the other numbers of the one variant: a number a line, its interval and its count beside it."""
+        (row,) = report.rows
+        shown = in_order(name for name in names(report) if name not in percentile_names(report))
+        items = [item for name in shown if (item := row.get(name)) and item.known]
+        body = [[label(item.name), quantity(item), span(item), count(item.samples)] for item in items]
+        kept = [place for place in range(4) if place < 2 or any(line[place] for line in body)]
+        heads = [("measured", "value", "interval", "")[place] for place in kept]
+        return [Text(), *self._table(heads, [[line[place] for place in kept] for line in body])] if body else []
 
     def _origin(self, report: Report) -> str:
         return measured_where(report).replace("Measured", "MEASURED", 1)
@@ -161,10 +215,10 @@ class TerminalRenderer:
         for row in report.rows:
             samples = finite(row.raw.get("latency_ms") or [])
             if len(samples) > 1:
-                tail = row.get("latency_p99")
+                tail = None if percentile_names(report) else row.get("latency_p99")
                 beside = f"{quantity(tail)} ({aside(tail)})" if tail and aside(tail) else quantity(tail) if tail else ""
                 body.append([plain(row.name), sparkline(samples, 20), beside or count(len(samples))])
-        heads = ["spread of latency", "min … p99", "latency p99"]
+        heads = ["spread of latency", "min … p99", "calls" if percentile_names(report) else "latency p99"]
         return [Text(), *self._table(heads, body, [False, False, True])] if body else []
 
     def _further(self, report: Report) -> list[Text]:
@@ -174,14 +228,18 @@ class TerminalRenderer:
             *(name for name in other_names(report) if name != "latency_p99" or not self._spread(report)),
         ]
         lines: list[Text] = []
-        if shown:
+        if not self._alone(report):
+            lines += self._percentiles(report, "Percentiles of the latency")
+        if shown and not self._alone(report):
             lines += [
                 *self._heading(f"Further, {self._origin(report)}"),
                 *self._matrix(report, shown, "measured", None),
             ]
         lines += self._notes(notes(report, "measured", lambda item: item.known))
-        for sentence in unmeasured(report):
-            lines += self._wrapped(sentence, f"{UNMEASURED}: ", "  ", "yellow")
+        missing = unmeasured(report)
+        lines += self._heading("Unmeasured") if missing else []
+        for each in missing:
+            lines += self._wrapped(each, "  ", "    ")
         return lines
 
     def _notes(self, found: Mapping[str, Iterable[str]]) -> list[Text]:

@@ -1,0 +1,250 @@
+"""Reports that were made apart, as one: what differs between the machines, and what can be said across them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import DataError, UsageError
+from vlatool.report import REPORT, VALIDITIES, Finding, Measurement, Report, Row, read_report
+
+COMPARABLE = ("benchmark", "optimize", "evaluate", "compare")
+MACHINE = ("cpu", "architecture", "board", "cores", "cpu_quota")
+CLOCKS = ("governor", "clock_min_mhz", "clock_max_mhz", "turbo")
+ENGINES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-openvino", "openvino", "tensorrt", "torch")
+APART = "against {name}; the two runs were not interleaved"
+HERE = "this host"
+
+
+def read_reports(paths: Sequence[Path]) -> list[Report]:
+    """Read reports that can be compared.
+
+    Raises:
+        DataError: when one cannot be read, or has no rows; names the file.
+        UsageError: when one is given twice, is of a kind that measures nothing, or shares no number with the others.
+    """
+    seen: dict[Path, Path] = {}
+    for path in paths:
+        places = (path, path / REPORT, path / "reports" / REPORT)
+        file = next((place for place in places if place.is_file()), path).resolve()
+        if file in seen:
+            raise UsageError(f"{seen[file]} and {path} are the same report; compare takes each once.")
+        seen[file] = path
+    reports = [_read(path) for path in paths]
+    for path, report in zip(paths, reports, strict=True):
+        if report.kind not in COMPARABLE:
+            raise UsageError(
+                f"{path} is a report of the kind {report.kind!r}, which compare cannot put beside another; "
+                f"allowed: {', '.join(COMPARABLE)}."
+            )
+        if not report.rows:
+            raise DataError(f"The report {path} has no rows, so there is nothing to compare.")
+    first = _measured(reports[0])
+    for path, report in zip(paths[1:], reports[1:], strict=True):
+        if not first & _measured(report):
+            raise UsageError(
+                f"{paths[0]} ({reports[0].kind}) and {path} ({report.kind}) have no measurement in common.",
+                "compare reports of the same kind",
+            )
+    return reports
+
+
+def side_by_side(paths: Sequence[Path], reports: Sequence[Report]) -> Report:
+    """Return one report with the rows of all, the first row with a latency as the reference."""
+    labels = short_names(paths)
+    findings = [*differences(labels, reports), *_carried(labels, reports)]
+    same = len({_machine(report) for report in reports}) == 1 and reports[0].environment.get("cpu") is not None
+    rows = _rows(labels, reports, same)
+    limits = {
+        name: wanted
+        for name, wanted in reports[0].limits.items()
+        if all(name in report.limits and report.limits[name] == wanted for report in reports)
+    }
+    return Report(
+        "compare",
+        f"{len(reports)} reports side by side",
+        summary=_summary(rows, same),
+        rows=tuple(rows),
+        limits=limits,
+        environment=_environment(labels, reports),
+        warnings=tuple(
+            f"{label}: {text}" for label, report in zip(labels, reports, strict=True) for text in report.warnings
+        ),
+        validity=_validity([report.validity for report in reports], findings),
+        findings=tuple(findings),
+    )
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Return the shortest endings of the paths that tell them apart; ``report.json`` and ``reports`` name nothing."""
+    parts = [list(path.absolute().parts) for path in paths]
+    for names in parts:
+        if len(names) > 1 and names[-1] == REPORT:
+            names.pop()
+        if len(names) > 1 and names[-1] == "reports":
+            names.pop()
+        names[-1] = names[-1].removesuffix(".json") or names[-1]
+    for depth in range(1, max(map(len, parts)) + 1):
+        found = ["/".join(names[-depth:]).replace("//", "/") for names in parts]
+        if len(set(found)) == len(found):
+            return found
+    return [str(path) for path in paths]
+
+
+def differences(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
+    """Return what makes the reports hard to compare: other machine, engine, threads or clocks."""
+    machines, clocks = ([_facts(each, keys) for each in reports] for keys in (MACHINE, CLOCKS))
+    groups = (
+        ("The machines differ", "repeat the runs on one machine", machines),
+        ("The versions differ", "measure again with the same versions", [_versions(each) for each in reports]),
+        ("The numbers of threads differ", "measure with the same --threads", [_threads(each) for each in reports]),
+        ("The clocks were set differently", "set the same governor and clocks", clocks),
+    )
+    found = []
+    for what, remedy, facts in groups:
+        keys = dict.fromkeys(key for each in facts for key in each)
+        told = [text for key in keys if (text := _differs(key, labels, facts))]
+        if told:
+            how = f"{remedy}, or compare the bundles themselves"
+            found.append(Finding("suspect", f"{what}: {'; '.join(told)}", how))
+    return found
+
+
+def _validity(judged: Sequence[str], findings: Sequence[Finding]) -> str:
+    """Return the worst judgement; nothing when a report was not judged and nothing speaks against it."""
+    worst = max([*judged, *(found.effect for found in findings if found.effect != "note")], key=VALIDITIES.index)
+    return "" if worst == "valid" and "" in judged else worst
+
+
+def _differs(key: str, labels: Sequence[str], facts: Sequence[Mapping[str, Any]]) -> str:
+    """Return ``cores 4 (a), 8 (b)``; nothing when all reports that know it agree."""
+    by_value: dict[str, list[str]] = {}
+    for label, each in zip(labels, facts, strict=True):
+        if each.get(key) is not None:
+            by_value.setdefault(_text(each[key]), []).append(label)
+    if len(by_value) < 2:
+        return ""
+    told = [f"{value} ({', '.join(names)})" for value, names in by_value.items()]
+    return f"{key.replace('_', ' ')} {', '.join(told)}"
+
+
+def _text(value: Any) -> str:
+    """Return a fact as text; clocks that all cores share are one number."""
+    if isinstance(value, list):
+        return " ".join(dict.fromkeys(f"{item:g}" if isinstance(item, float) else str(item) for item in value))
+    return str(value)
+
+
+def _facts(report: Report, keys: Sequence[str]) -> dict[str, Any]:
+    return {key: report.environment.get(key) for key in keys}
+
+
+def _versions(report: Report) -> dict[str, Any]:
+    versions = report.environment.get("versions")
+    return {name: versions.get(name) for name in ENGINES} if isinstance(versions, Mapping) else {}
+
+
+def _threads(report: Report) -> dict[str, Any]:
+    told = [record.get("threads") for row in report.rows for record in row.details.get("engine", ())]
+    known = {threads for threads in told or [report.environment.get("threads")] if threads is not None}
+    return {"threads": sorted(known, key=str)} if known else {}
+
+
+def _machine(report: Report) -> str:
+    return str(_facts(report, MACHINE))
+
+
+def _measured(report: Report) -> set[str]:
+    return {item.name for row in report.rows for item in row.measurements if item.origin == "measured" and item.known}
+
+
+def _read(path: Path) -> Report:
+    try:
+        return read_report(path)
+    except DataError as error:
+        if str(path) in error.message:
+            raise
+        raise DataError(f"{path}: {error.message}", error.fix) from error
+
+
+def _carried(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
+    """Return the findings of the reports themselves, with their report's name."""
+    return [
+        replace(found, reason=f"{label}: {found.reason}")
+        for label, report in zip(labels, reports, strict=True)
+        for found in report.findings
+    ]
+
+
+def _rows(labels: Sequence[str], reports: Sequence[Report], same: bool) -> list[Row]:
+    """Return the rows of all reports; those of later ones lose the speed-up over their own baseline."""
+    reference = _reference(reports[0])
+    rows: list[Row] = []
+    names = _row_names(labels, reports)
+    for place, report in enumerate(reports):
+        for row in report.rows:
+            name = names[len(rows)]
+            items = row.measurements
+            if place:
+                items = tuple(item for item in items if not (item.name == "speedup" and item.origin == "measured"))
+                items += _speedup(row, reference, names[reports[0].rows.index(reference)]) if same and reference else ()
+            if not same:
+                where = f"{labels[place]}: {report.environment.get('cpu') or 'an unknown machine'}"
+                items = tuple(replace(item, where=where) if item.where == HERE else item for item in items)
+            role = "baseline" if row is reference else "failed" if row.role == "failed" else "subject"
+            reason = row.reason if role == "failed" else ""
+            rows.append(replace(row, name=name, role=role, reason=reason, measurements=items))
+    return rows
+
+
+def _reference(report: Report) -> Row | None:
+    """Return the baseline of the first report, else its first row with a latency."""
+    timed = [row for row in report.rows if math.isfinite(row.value("latency_p50"))]
+    return next((row for row in timed if row.role == "baseline"), timed[0] if timed else None)
+
+
+def _speedup(row: Row, reference: Row, name: str) -> tuple[Measurement, ...]:
+    value, base = row.value("latency_p50"), reference.value("latency_p50")
+    if not math.isfinite(value) or value <= 0:
+        return ()
+    return (Measurement("speedup", base / value, "x", note=APART.format(name=name)),)
+
+
+def _row_names(labels: Sequence[str], reports: Sequence[Report]) -> list[str]:
+    """Return the names of the rows where they are unique; else those of the reports, with the row's where needed."""
+    own = [row.name for report in reports for row in report.rows]
+    if len(set(own)) == len(own):
+        return own
+    if all(len(report.rows) == 1 for report in reports):
+        return list(labels)
+    return [f"{label}: {row.name}" for label, report in zip(labels, reports, strict=True) for row in report.rows]
+
+
+def _summary(rows: Sequence[Row], same: bool) -> tuple[str, ...]:
+    timed = [row for row in rows if math.isfinite(row.value("latency_p50"))]
+    if len(timed) < 2:
+        return ()
+    medians = ", ".join(f"{row.name} {row.value('latency_p50'):.3g} ms" for row in timed)
+    apart = "The runs were not interleaved: what else ran on the machine may differ between them."
+    other = "The reports are of different machines, or do not name theirs, so no speed-up is computed."
+    return (f"Median latency: {medians}.", apart if same else other)
+
+
+def _environment(labels: Sequence[str], reports: Sequence[Report]) -> dict[str, Any]:
+    """Return the facts that all reports share, and what is left of each under its name."""
+    first = dict(reports[0].environment)
+    if all(dict(report.environment) == first for report in reports):
+        return first
+    shared = {
+        key: value
+        for key, value in first.items()
+        if all(key in report.environment and report.environment[key] == value for report in reports)
+    }
+    own = {
+        f"report {label}": {key: value for key, value in report.environment.items() if key not in shared}
+        for label, report in zip(labels, reports, strict=True)
+    }
+    return {**shared, **own}
