@@ -1,0 +1,102 @@
+"""Try many times whether a measurement that must not be trusted is caught, and whether one that can be is left alone.
+
+    python tests/soak/trust_trials.py --trials 100
+
+A policy that answers from memory, one that returns garbage once it is called often, one that stalls for 50 ms in every
+1,000th call, and an honest one, each measured through the benchmark's own loop; and traces of a board that throttles
+by 5 to 40 % at a random moment, against traces of one that does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmark"))
+
+from _policies import Garbage, Memoising, Stalling  # noqa: E402
+
+from vlatool.benchmark._canary import drift  # noqa: E402
+from vlatool.benchmark._contest import Contestant, latency_measurements  # noqa: E402
+from vlatool.benchmark._job import Job  # noqa: E402
+from vlatool.benchmark._trust import MOVED, findings  # noqa: E402
+from vlatool.benchmark._worker import measure  # noqa: E402
+from vlatool.bundle import Bundle  # noqa: E402
+from vlatool.data import observations_for  # noqa: E402
+from vlatool.runtime.policy import Action, Policy  # noqa: E402
+from vlatool.spec import PolicySpec, TensorSpec  # noqa: E402
+
+
+def main() -> int:
+    """Run the trials and print the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("--trials", type=int, default=100)
+    given = parser.parse_args()
+    bundle = Bundle.open(given.bundle)
+    policy = Policy.open(bundle, threads=1, seed=0)
+    counts: dict[str, int] = {
+        "honest, invalid": sum(invalid(policy, bundle) for _ in range(given.trials)),
+        "from memory, invalid": sum(invalid(Memoising(policy), bundle) for _ in range(given.trials)),
+        "garbage under load, invalid": sum(invalid(Garbage(policy, 60), bundle) for _ in range(given.trials)),
+        "stalls in p99.9 and max": sum(stalls_show() for _ in range(given.trials)),
+        "stalls in p99.9, max and misses at 100 Hz": sum(stalls_show(100.0) for _ in range(max(1, given.trials // 10))),
+    }
+    draw = np.random.default_rng(0)
+    counts["throttled traces found, of 200"] = sum(throttled(draw, True) for _ in range(200))
+    counts["steady traces found throttled, of 500"] = sum(throttled(draw, False) for _ in range(500))
+    print(json.dumps({name: int(count) for name, count in counts.items()}, indent=1))
+    return 0
+
+
+def invalid(policy: Policy, bundle: Bundle) -> bool:
+    """Say whether a short run of a policy is found invalid."""
+    contestant = Contestant("x", bundle, policy, observations_for(bundle, 16))
+    found = measure([contestant], Job((str(bundle.path),), iterations=200, warmup=2), lambda *_: None, lambda: None)
+    return any(each.effect == "invalid" for each in findings(found))
+
+
+class Quick:
+    """A policy that does next to nothing, so that many calls take little time."""
+
+    spec = PolicySpec((TensorSpec("x", (1, 1)),), (TensorSpec("action", (1, 1, 1)),), control_hz=100)
+    engine, golden_error = "none", None
+    bundle = SimpleNamespace(manifest=SimpleNamespace(graphs={}))
+
+    def infer(self, observation: dict[str, object]) -> Action:
+        """Return the same action."""
+        return Action(np.zeros((1, 1), np.float32), ("x",), 0.0, 0, {})
+
+    def reset(self) -> None:
+        """Forget nothing."""
+
+
+def stalls_show(rate: float = 0.0) -> bool:
+    """Say whether stalls of 50 ms in every 1,000th call show in the 99.9th percentile and the maximum."""
+    quick = Quick()
+    contestant = Contestant("x", quick.bundle, Stalling(quick, 1000), [{"x": 0.0}])
+    calls = 2000 if rate else 20_000
+    job = Job(("x",), iterations=calls, warmup=0, rate=rate, check=False)
+    found = measure([contestant], job, lambda *_: None, lambda: None)["policies"][0]
+    samples = [value for block in found["blocks_ms"] for value in block]
+    told = {each.name: each for each in latency_measurements(np.random.default_rng(0).permutation(samples))}
+    if rate:
+        return told["latency_p99"].high >= 10 and told["latency_max"].value >= 50 and found["paced"]["misses"] >= 5
+    return told["latency_p99.9"].high >= 50 and told["latency_max"].value >= 50
+
+
+def throttled(draw: np.random.Generator, really: bool) -> bool:
+    """Say whether a trace of canaries is found to have moved."""
+    trace = 0.25 * (1 + np.abs(draw.normal(0, 0.01, 21)))
+    if really:
+        trace[draw.integers(5, 16) :] *= 1 + draw.uniform(0.07, 0.4)
+    return bool(abs(drift(list(trace))) > MOVED)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
