@@ -14,6 +14,8 @@ from pathlib import Path
 BLOCK = 4096
 PREFIX = "vlatool-run-"
 LOCK = "lock"
+MADE = "made"
+"""File that names the directories which the first run made; the last run removes them."""
 
 
 class Refused(Exception):
@@ -30,7 +32,7 @@ class Place:
 
     def __init__(self) -> None:
         self._path: Path | None = None
-        self._parents: list[Path] = []
+        self._shared: Path | None = None
 
     @property
     def path(self) -> Path:
@@ -57,15 +59,16 @@ class Place:
 
     def _cache(self) -> Path:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        missing = [parent for parent in (cache, *cache.parents) if not parent.exists()]
-        remote = cache / "vlatool" / "remote"
-        self._parents = [remote, remote.parent, *missing]
-        remote.mkdir(mode=0o700, parents=True, exist_ok=True)
-        sweep(remote)
-        return Path(tempfile.mkdtemp(prefix=PREFIX, dir=remote))
+        self._shared = cache / "vlatool" / "remote"
+        missing = [str(parent) for parent in (cache, *cache.parents) if not parent.exists()]
+        self._shared.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if missing:
+            (self._shared / MADE).write_text("\0".join(missing), encoding="utf-8", errors="surrogateescape")
+        sweep(self._shared)
+        return Path(tempfile.mkdtemp(prefix=PREFIX, dir=self._shared))
 
     def _temporary(self) -> Path:
-        self._parents = []
+        self._shared = None
         folder = Path(os.environ.get("TMPDIR") or "/tmp")
         sweep(folder)
         return Path(tempfile.mkdtemp(prefix=PREFIX, dir=folder))
@@ -97,8 +100,17 @@ class Place:
         return str(path) if path and path.exists() else ""
 
     def _remove_parents(self) -> None:
+        """Remove the directories that runs made, when this is the last run in them; vlatool's own when empty."""
+        if self._shared is None:
+            return
         with contextlib.suppress(OSError):
-            for parent in self._parents:
+            made = self._shared / MADE
+            found = os.listdir(self._shared)
+            parents = [self._shared, self._shared.parent]
+            if found == [MADE]:
+                parents += map(Path, made.read_text(encoding="utf-8", errors="surrogateescape").split("\0"))
+                made.unlink()
+            for parent in parents:
                 parent.rmdir()
 
 
