@@ -464,7 +464,7 @@ def test_the_connection_ends_while_files_are_sent(there, large, server, how):
 def test_the_connection_ends_while_it_measures(there, bundle, server, how):
     def tell(what: str, _share: float | None) -> None:
         if what == "waiting":
-            assert there.processes("sleep 600")
+            until(lambda: there.processes("sleep 600"), "the process of the agent")
             server.drop() if how == "server" else kill_client()
 
     with pytest.raises(TargetError, match=r"The connection to .* ended while it measured: .+") as caught:
@@ -497,7 +497,7 @@ def test_a_killed_command_ends_the_run_there(there, bundle, tmp_path):
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as local:
         assert local.stdout is not None
         assert "waiting\n" in iter(local.stdout.readline, "")
-        assert there.processes("sleep 600")
+        until(lambda: there.processes("sleep 600"), "the process of the agent")
         local.kill()
     there.check()
 

@@ -158,7 +158,7 @@ def _follow(line: Line, agent: subprocess.Popen[bytes]) -> bytes:
     streams, rest, log = [said, logged], b"", b""
     heard, ended = time.monotonic(), 0.0
     while streams or agent.poll() is None:
-        ready = select.select([0, *streams], [], [], 1)[0]
+        ready = select.select([0, *streams], [], [], 1 if streams else 0.02)[0]
         now = time.monotonic()
         if 0 in ready:
             line.listen()
