@@ -7,6 +7,8 @@ the directories that the run made are gone.
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import io
 import os
 import platform
 import shutil
@@ -14,6 +16,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tarfile
 import textwrap
 import uuid
 from collections.abc import Callable, Iterator
@@ -33,7 +36,7 @@ from vlatool.errors import (
     TargetError,
     UsageError,
 )
-from vlatool.launch import _connection, ssh
+from vlatool.launch import _bootstrap, _connection, _place, _push, ssh
 from vlatool.manifest import Manifest
 from vlatool.spec import PolicySpec
 
@@ -73,6 +76,11 @@ elif job["do"] == "wait":
     subprocess.Popen(["sleep", "600"])
     say(progress=["waiting", None])
     time.sleep(600)
+elif job["do"] == "chat":
+    for _ in range(25):
+        time.sleep(0.1)
+        say(progress=["still at it", None])
+    say(result={"all": "said"})
 elif job["do"] == "raise":
     say(**{"vlatool error": job["kind"], "message": job["bundles"][0] + " is refused.", "fix": "export it again"})
 elif job["do"] == "die":
@@ -472,6 +480,45 @@ def test_the_connection_ends_while_it_measures(there, bundle, server, how):
     assert "run it again" in caught.value.fix
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The target gives up after two seconds without a sign of life."""
+    text = ssh._probe.program()
+    assert "\nQUIET_S = 60\n" in text
+    monkeypatch.setattr(ssh._probe, "program", lambda: text.replace("\nQUIET_S = 60\n", "\nQUIET_S = 2\n"))
+    monkeypatch.setattr(_connection, "ALIVE_S", 0.2)
+
+
+def test_a_connection_that_falls_silent_ends_the_run_there(there, bundle, impatient):
+    def tell(what: str, _share: float | None) -> None:
+        if what == "waiting":
+            (client,) = [child for child in psutil.Process().children() if child.name() == "ssh"]
+            client.suspend()
+            until(lambda: not there.runs() and not there.processes("stand_in"), "the end of the run")
+            client.resume()
+
+    with pytest.raises(TargetError, match="ended while it measured"):
+        there.measure(bundle, do="wait", tell=tell)
+
+
+def test_signs_of_life_are_sent_while_the_agent_talks(there, bundle, impatient):
+    assert there.measure(bundle, do="chat")["all"] == "said"
+
+
+def test_a_target_that_takes_nothing(there, large, monkeypatch):
+    monkeypatch.setattr(_connection, "STALLED_S", 0.5)
+    monkeypatch.setattr(_connection, "CLEANING_S", 0.5)
+
+    def tell(what: str, share: float | None) -> None:
+        if what.startswith("sending") and share == 0:
+            os.kill(bootstraps(there)[0], signal.SIGSTOP)
+
+    with pytest.raises(TargetError, match=r"took nothing for 0\.5 s while files were sent") as caught:
+        there.measure(large, tell=tell)
+    assert "run it again" in caught.value.fix
+    os.kill(bootstraps(there)[0], signal.SIGCONT)
+
+
 def test_an_interrupt_ends_the_run_there(there, bundle):
     def tell(what: str, _share: float | None) -> None:
         if what == "waiting":
@@ -500,6 +547,57 @@ def test_a_killed_command_ends_the_run_there(there, bundle, tmp_path):
         until(lambda: there.processes("sleep 600"), "the process of the agent")
         local.kill()
     there.check()
+
+
+# what is sent
+
+
+def test_the_same_files_give_the_same_bytes_and_no_owner_or_time(large, tmp_path):
+    one, other = (list(_push.load_of([large], ssh.PACKAGE).packed()) for _ in range(2))
+    assert one == other
+    assert sum(size for _, size in one) == _push.load_of([large], ssh.PACKAGE).size
+    with tarfile.open(fileobj=io.BytesIO(one[0][0])) as pack:
+        members = pack.getmembers()
+    assert {(each.uid, each.gid, each.uname, each.mtime, each.mode) for each in members} == {(0, 0, "", 0, 0o600)}
+    names = [each.name for each in members]
+    assert "package/vlatool/launch/ssh.py" in names
+    assert not any("__pycache__" in name or name.endswith(".pyc") for name in names)
+    for packed, _ in one:
+        _bootstrap.unpack(packed, tmp_path / "out")
+    assert Bundle.open(next((tmp_path / "out/bundles").glob("*/*"))).hash == large.hash
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("/etc/over", tarfile.REGTYPE),
+        ("a/../../over", tarfile.REGTYPE),
+        ("link", tarfile.SYMTYPE),
+        ("hard", tarfile.LNKTYPE),
+        ("pipe", tarfile.FIFOTYPE),
+        ("folder", tarfile.DIRTYPE),
+    ],
+)
+def test_only_files_below_the_directory_are_unpacked(tmp_path, name, kind):
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w") as pack:
+        member = tarfile.TarInfo(name)
+        member.type, member.linkname = kind, "/etc/passwd"
+        pack.addfile(member)
+    with pytest.raises(_place.Refused, match="is not a file below the directory"):
+        _bootstrap.unpack(packed.getvalue(), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_directories_of_dead_runs_are_removed(tmp_path):
+    for name in ("vlatool-run-dead", "vlatool-run-without-lock", "vlatool-run-alive", "another"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "vlatool-run-link").symlink_to(tmp_path / "another")
+    (tmp_path / "vlatool-run-dead" / _place.LOCK).touch()
+    with (tmp_path / "vlatool-run-alive" / _place.LOCK).open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        _place.sweep(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["another", "vlatool-run-alive", "vlatool-run-link"]
 
 
 # what runs there

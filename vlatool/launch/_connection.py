@@ -84,6 +84,7 @@ class Connection:
         self.doing = "before anything ran there"
         self._target = target
         self._answered = False
+        self._due = 0.0
         self._buffer = b""
         self._messages: deque[dict[str, Any]] = deque()
         self._said: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115
@@ -149,21 +150,21 @@ class Connection:
         Raises:
             TargetError: when the connection ends, or nothing comes in time.
         """
-        start, due = time.monotonic(), time.monotonic() + ALIVE_S
-        while not self._messages:
+        start = time.monotonic()
+        while True:
+            if alive and time.monotonic() >= self._due:
+                self._due = time.monotonic() + ALIVE_S
+                with contextlib.suppress(BlockingIOError, BrokenPipeError):
+                    os.write(self._in.fileno(), b"\n")
+            if self._messages:
+                return self._messages.popleft()
             poll = select.poll()
             poll.register(self._out, select.POLLIN)
             ready = poll.poll(500)
-            now = time.monotonic()
             if ready and not self._take():
                 raise self.ended()
-            if timeout_s is not None and now - start > timeout_s and not self._messages:
+            if timeout_s is not None and time.monotonic() - start > timeout_s and not self._messages:
                 raise TargetError(f"{self._target} said nothing for {timeout_s:g} s {self.doing}.", self._try())
-            if alive and now >= due:
-                due = now + ALIVE_S
-                with contextlib.suppress(BlockingIOError, BrokenPipeError):
-                    os.write(self._in.fileno(), b"\n")
-        return self._messages.popleft()
 
     def ended(self) -> TargetError:
         """Return the error for a connection that is no more: what ssh said, and what it means."""
