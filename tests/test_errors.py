@@ -19,6 +19,7 @@ EXIT_CODES = {
     "ProfileError": 3,
     "RecipeError": 3,
     "OutputError": 3,
+    "TargetError": 3,
     "MissingExtra": 4,
     "GateFailed": 1,
     "Inconclusive": 5,

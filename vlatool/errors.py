@@ -10,7 +10,8 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── GraphError               a graph that an engine refuses, or that computes wrong values
 │   ├── ProfileError             a hardware profile
 │   ├── RecipeError              a recipe or stage options
-│   └── OutputError              the place to write to: exists, read-only, full
+│   ├── OutputError              the place to write to: exists, read-only, full
+│   └── TargetError              the machine that a benchmark should run on: unreachable, or it ends
 ├── MissingExtra              4  an optional dependency is absent; names the extra
 ├── GateFailed                1  measured, and outside the limits
 └── Inconclusive              5  measured, and the samples cannot decide
@@ -89,6 +90,10 @@ class RecipeError(InputError):
 
 class OutputError(InputError):
     """The place to write to exists already, is read-only or is full."""
+
+
+class TargetError(InputError):
+    """The machine that a benchmark should run on cannot be reached or used, or what runs there ends."""
 
 
 class MissingExtra(VlatoolError):
