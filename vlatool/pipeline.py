@@ -303,7 +303,8 @@ def _latency_rows(
         if eager is not None:
             own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
             named[BASELINE] = replace(named[BASELINE], measurements=(*named[BASELINE].measurements, own))
-    return named, (*report.warnings, *(kept if report.created < begun else ()))
+    told = [f"{each.reason}; {each.remedy}" for each in report.findings if each.effect != "note"]
+    return named, (*report.warnings, *told, *(kept if report.created < begun else ()))
 
 
 def _report(

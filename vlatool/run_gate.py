@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import median
 
 from vlatool.benchmark._pairs import Job
-from vlatool.benchmark.latency import busy_warning
+from vlatool.benchmark._trust import busy
 from vlatool.bundle import Bundle
 from vlatool.claims import accuracy, deadline, growth, latency
 from vlatool.claims._found import Found, worst
@@ -54,7 +55,8 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     name = candidate.manifest.name
     rows = (_row("baseline", baseline, timed, found), _row("candidate", candidate, timed, found))
     return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found), _summary(name, found), rows,
-                  command=context.command, environment=host, warnings=busy_warning(host))  # fmt: skip
+                  command=context.command, environment=host,
+                  findings=tuple(replace(each, effect="note") for each in busy(host)))  # fmt: skip
 
 
 def _check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:

@@ -11,7 +11,7 @@ import pytest
 from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.benchmark._memory import peak_rss_mb, resident_mb
 from vlatool.benchmark._probe import cold_start, main
-from vlatool.benchmark.latency import Latency, busy_warning
+from vlatool.benchmark.latency import Latency
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, UsageError
 from vlatool.hwselect._workload import workload
@@ -164,12 +164,6 @@ def test_a_percentile_needs_enough_samples_for_its_upper_bound(count, wanted):
     refused = {each.name: each for each in latency_measurements(samples, refusals=True) if not each.known}
     assert set(refused) == {f"latency_p{name}" for name in ("90", "95", "99", "99.9")} - set(found)
     assert all("independent calls" in each.note and "--iterations" in each.note for each in refused.values())
-
-
-def test_a_busy_host_is_a_warning():
-    assert busy_warning({"load_average": [0.5, 9, 9], "cores": 2}) == ()
-    assert busy_warning({"load_average": None, "cores": 2}) == ()
-    assert "load 6.0 on 2 cores" in busy_warning({"load_average": [6.0, 0, 0], "cores": 2})[0]
 
 
 # ---- the probe

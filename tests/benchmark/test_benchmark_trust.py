@@ -45,6 +45,12 @@ def test_answers_from_memory_are_invalid():
     assert findings(found(policy={"memory": memory | {"remembers": False}})) == ()
 
 
+def test_a_busy_host_is_suspect():
+    assert findings(found(host={"load_average": [0.5, 9, 9], "cores": 2})) == ()
+    assert findings(found(host={"load_average": None, "cores": 2})) == ()
+    assert "load 6.0 on 2 cores" in only(found(host={"load_average": [6.0, 0, 0], "cores": 2})).reason
+
+
 def test_a_contended_processor_is_suspect():
     one = only(found(switches=5000))
     assert (one.effect, "500 times in a second" in one.reason) == ("suspect", True)

@@ -19,17 +19,17 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmark"))
 
-from _policies import Garbage, Memoising, Stalling  # noqa: E402
+from _policies import Garbage, Memoising, Stalling
 
-from vlatool.benchmark._canary import drift  # noqa: E402
-from vlatool.benchmark._contest import Contestant, latency_measurements  # noqa: E402
-from vlatool.benchmark._job import Job  # noqa: E402
-from vlatool.benchmark._trust import MOVED, findings  # noqa: E402
-from vlatool.benchmark._worker import measure  # noqa: E402
-from vlatool.bundle import Bundle  # noqa: E402
-from vlatool.data import observations_for  # noqa: E402
-from vlatool.runtime.policy import Action, Policy  # noqa: E402
-from vlatool.spec import PolicySpec, TensorSpec  # noqa: E402
+from vlatool.benchmark._canary import drift
+from vlatool.benchmark._contest import Contestant, latency_measurements
+from vlatool.benchmark._job import Job
+from vlatool.benchmark._trust import MOVED, findings
+from vlatool.benchmark._worker import measure
+from vlatool.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.runtime.policy import Action, Policy
+from vlatool.spec import PolicySpec, TensorSpec
 
 
 def main() -> int:

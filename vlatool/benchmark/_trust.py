@@ -30,7 +30,8 @@ def findings(found: Mapping[str, Any], duration_is_sustained: bool = False) -> t
     """
     seen = [
         *_answers(found["policies"]),
-        *_busy(found),
+        *busy(found.get("host") or {}),
+        *_contended(found),
         *_clock(found, duration_is_sustained),
         *_later(found["policies"], duration_is_sustained),
         *_memory(found),
@@ -67,7 +68,18 @@ def _answers(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
             )
 
 
-def _busy(found: Mapping[str, Any]) -> Iterator[Finding]:
+def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
+    """Tell of other work before the run: the load average says more than this process can have caused."""
+    load, cores = host.get("load_average"), host.get("cores")
+    if load and cores and load[0] > max(1.5, 0.75 * cores):
+        yield Finding(
+            "suspect",
+            f"this host was busy (load {load[0]:.1f} on {cores} cores): the latencies are those of a contended machine",
+            "repeat on an idle machine; ratios within the run still compare, absolute values do not",
+        )
+
+
+def _contended(found: Mapping[str, Any]) -> Iterator[Finding]:
     wall = max(float(found["wall_s"]), 1e-9)
     counters = (found.get("telemetry") or {}).get("counters", {})
     stolen = counters.get("process.machine_steal")

@@ -161,7 +161,6 @@ class Latency(Measure):
             summary=(self._sentence(rows[0], host, valid, seen),),
             rows=tuple(rows),
             environment={**host, **({"target": found["target"]} if "target" in found else {})},
-            warnings=busy_warning(host),
             validity=valid,
             findings=seen,
         )
@@ -225,14 +224,3 @@ def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:
         return {WORK: [{**whole_work(workload(bundle)), "engine": engine}]}
     except (MissingExtra, GraphError):
         return {}
-
-
-def busy_warning(host: Mapping[str, Any]) -> tuple[str, ...]:
-    """Warn when other work was running: the load average says more than this process can have caused."""
-    load, cores = host.get("load_average"), host.get("cores")
-    if not load or not cores or load[0] <= max(1.5, 0.75 * cores):
-        return ()
-    return (
-        f"this host was busy (load {load[0]:.1f} on {cores} cores): the latencies are those of a contended machine; "
-        "ratios within the run still compare, absolute values do not; repeat on an idle machine",
-    )

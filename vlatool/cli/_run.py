@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, progress, refuse_existing, show
-from vlatool.errors import BundleError, MissingExtra
+from vlatool.errors import BundleError, MissingExtra, UsageError
 from vlatool.launch import cache_directory, run_transform
 from vlatool.report import Report
 from vlatool.stage import Context, Measure, Transform
@@ -110,10 +111,28 @@ def opened(source: str, context: Context) -> Bundle:
     return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
 
 
+REMOTE_FLAGS = (
+    _flag(
+        "target", str, "", "--target", help="run on this machine, through ssh: user@host, or a Host of your ssh config"
+    ),
+    _flag("remote_python", str, "", "--remote-python", help="Python of the target, such as ~/venv/bin/python"),
+)
+
+
 def measure(
-    stage: Measure, source: str, out: Path | None, profile: str | None, workers: int | None, force: bool, as_json: bool
+    stage: Measure,
+    source: str,
+    out: Path | None,
+    profile: str | None,
+    workers: int | None,
+    force: bool,
+    as_json: bool,
+    target: str = "",
+    remote_python: str = "",
 ) -> None:
-    """Measure a bundle, or a policy that is exported first."""
+    """Measure a bundle, or a policy that is exported first; here, or on a target."""
+    if remote_python and not target:
+        raise UsageError("--remote-python is the Python of a target.", "name it: --target user@host")
     refuse_existing(out, force)
     board = None
     if profile:
@@ -123,6 +142,10 @@ def measure(
     with progress(workers or default_workers()) as context:
         bundle = opened(source, context)
         stage.check(bundle, board)
+        if target:
+            from vlatool.launch.ssh import measure_on
+
+            context = replace(context, elsewhere=partial(measure_on, target, python=remote_python))
         report = (stage if board is None else stage.on(board)).run(bundle, context)
     if board is not None:
         report = with_predictions(report, board, bundle)

@@ -67,6 +67,8 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         else:
             _run.transform(typing.cast(Any, built), **given)
 
+    if issubclass(stage, Measure) and stage.remotely:
+        common = (*common, *_run.REMOTE_FLAGS)
     parameters = [_run.SOURCE_FLAG, *own.values(), *common]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
