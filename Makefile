@@ -7,7 +7,9 @@ OUT ?= out
 TORCH := torch==2.13.0
 SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
-.PHONY: peers help install demo test check robot docs format clean metaworld
+BASE ?=
+
+.PHONY: gate peers help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -46,6 +48,9 @@ robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnx
 	@test -x $(OUT)/robot/venv/bin/python || $(PYTHON310) -m venv $(OUT)/robot/venv
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 numpy
 	PYTHONPATH=. $(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
+
+gate: $(BIN)/vlatool  ## hold the sample policies against those that the commit before makes (BASE=COMMIT names another)
+	$(BIN)/python tests/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate
 
 peers:  ## measure other tools and our bundles on six workloads, interleaved (about an hour)
 	@test -x $(OUT)/peers/venv/bin/python || $(PYTHON) -m venv $(OUT)/peers/venv
