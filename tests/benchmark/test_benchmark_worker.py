@@ -125,9 +125,9 @@ def test_nothing_to_run_is_refused(float_bundle, copied):
 
 
 def test_the_process_waits_for_the_word_and_says_what_it_found(float_bundle: Bundle):
-    lines = json.dumps(job(float_bundle, iterations=20).to_dict()) + "\n\n"
+    lines = json.dumps(job(float_bundle, iterations=20).to_dict()) + "\n\n\n"
     done = subprocess.run([sys.executable, "-m", "vlatool.benchmark._worker"], input=lines, text=True,
                           capture_output=True, check=True, env=environment())  # fmt: skip
     told = [json.loads(line) for line in done.stdout.splitlines()]
-    assert {"progress", "ready", "result"} == {key for line in told for key in line}
+    assert {"progress", "ready", "timed", "result"} == {key for line in told for key in line}
     assert np.concatenate(told[-1]["result"]["policies"][0]["blocks_ms"]).shape == (20,)

@@ -84,9 +84,12 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
                     recorder = recording.enter_context(Recorder(_readers(int(line["ready"])), PERIOD_S))
                     worker.stdin.write("\n")
                     worker.stdin.flush()
+                elif "timed" in line:
+                    recording.close()
+                    worker.stdin.write("\n")
+                    worker.stdin.flush()
                 elif "result" in line:
                     found: dict[str, Any] = line["result"]
-                    recording.close()
                     return {**found, "telemetry": plain(recorder.recorded) if recorder else None}
                 else:
                     raise_said(line, limits)

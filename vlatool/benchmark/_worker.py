@@ -1,8 +1,9 @@
 """The process that calls the policies: ``python -m vlatool.benchmark._worker``.
 
 It reads a job (one line of JSON), opens and warms up, says ``{"ready": PID}`` and waits for a line: whoever started it
-begins to record the board then. It says ``{"progress": [what, share]}`` meanwhile and ``{"result": ...}``, or what it
-raised, in the end. It imports what a robot imports, so that its memory is that of a robot's process.
+begins to record the board then, and ends it when the worker says ``{"timed": true}`` and waits again. It says
+``{"progress": [what, share]}`` meanwhile and ``{"result": ...}``, or what it raised, in the end. It imports what a robot
+imports, so that its memory is that of a robot's process.
 """
 
 from __future__ import annotations
@@ -44,7 +45,11 @@ def main() -> dict[str, Any]:
         _say({"ready": os.getpid()})
         sys.stdin.readline()
 
-    return {"result": run_job(job, lambda what, share: _say({"progress": [what, share]}), wait)}
+    def timed() -> None:
+        _say({"timed": True})
+        sys.stdin.readline()
+
+    return {"result": run_job(job, lambda what, share: _say({"progress": [what, share]}), wait, timed)}
 
 
 def _say(line: dict[str, Any]) -> None:
@@ -52,13 +57,16 @@ def _say(line: dict[str, Any]) -> None:
     sys.stdout.flush()
 
 
-def run_job(job: Job, tell: Tell, wait: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def run_job(
+    job: Job, tell: Tell, wait: Callable[[], None] = lambda: None, timed: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
     """Measure in this process.
 
     Args:
         job: What to measure.
         tell: What is being done, and the share that is done.
         wait: Called when all is open and warm, before the first call that counts.
+        timed: Called after the last one.
 
     Returns:
         JSON values; ``policies`` has an entry for each bundle.
@@ -69,10 +77,16 @@ def run_job(job: Job, tell: Tell, wait: Callable[[], None] = lambda: None) -> di
     tell("opening", None)
     contestants = [opened(path, job) for path in job.bundles]
     unique_names(contestants)
-    return measure(contestants, job, tell, wait)
+    return measure(contestants, job, tell, wait, timed)
 
 
-def measure(contestants: Sequence[Contestant], job: Job, tell: Tell, wait: Callable[[], None]) -> dict[str, Any]:
+def measure(
+    contestants: Sequence[Contestant],
+    job: Job,
+    tell: Tell,
+    wait: Callable[[], None] = lambda: None,
+    timed: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
     """Measure policies that are open."""
     for contestant in contestants:
         tell("warming up", None)
@@ -99,6 +113,7 @@ def measure(contestants: Sequence[Contestant], job: Job, tell: Tell, wait: Calla
         run_interleaved(contestants, job.iterations, 0, tell, job.duration, lambda: canaries.append(canary_ms()))
     ended = time.monotonic()
     found: dict[str, Any] = {"begun_s": begun, "ended_s": ended, "canary_ms": canaries, **_used(before, _usage())}
+    timed()
     found["peak_rss_mb"] = peak_rss_mb()
     found["policies"] = [_policy(each, job, begun, tell) for each in contestants]
     found["policies"][0]["paced"] = paced

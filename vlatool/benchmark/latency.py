@@ -160,6 +160,7 @@ class Latency(Measure):
             verdict="inconclusive" if valid == "invalid" else "info",
             summary=(self._sentence(rows[0], host, valid, seen),),
             rows=tuple(rows),
+            limits={"hz": self.rate} if self.rate else {},
             environment={**host, **({"target": found["target"]} if "target" in found else {})},
             validity=valid,
             findings=seen,

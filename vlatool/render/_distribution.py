@@ -39,6 +39,11 @@ class Sampled:
     known: Mapping[float, float]
     times: list[float]
 
+    @property
+    def marks(self) -> dict[str, float]:
+        """The percentiles that are marked, name -> share: those that the report has, all where it has none."""
+        return {name: share for name, share in MARKED.items() if share in self.known or not self.known}
+
     def at(self, share: float) -> float:
         """Return a quantile in ms; the reported one where the report has it."""
         return self.known.get(share) or quantile(self.ordered, share)
@@ -135,14 +140,18 @@ def _cumulative(canvas: Canvas, variant: Sampled, axis: Axis, up: Axis, named: b
     line = [(points[0][0], up(0)), *points]
     if variant.ordered[-1] <= axis.high:
         line.append((axis.end, up(1)))
-    tip = f"{variant.name}: median {significant(variant.at(0.5))} ms, p99 {significant(variant.at(0.99))} ms"
+    tip = f"{variant.name}: {_numbers(variant)}"
     canvas.steps(line, f"line {variant.css}", tip)
-    for name, share in MARKED.items():
+    for name, share in variant.marks.items():
         if axis.holds(variant.at(share)):
             x, y = axis(variant.at(share)), up(share)
             canvas.add("circle", f"dot {variant.css}", f"{name} {significant(variant.at(share))} ms", cx=x, cy=y, r=3.5)
             if named:
                 canvas.text(x + 7, y + 14, name, "tick halo")
+
+
+def _numbers(variant: Sampled) -> str:
+    return " · ".join(f"{name} {significant(variant.at(share))}" for name, share in variant.marks.items()) + " ms"
 
 
 def _strip(canvas: Canvas, variant: Sampled, axis: Axis, top: float) -> None:
@@ -156,11 +165,11 @@ def _strip(canvas: Canvas, variant: Sampled, axis: Axis, top: float) -> None:
     )
     canvas.add("path", f"fill {variant.css}", f"{variant.name}: {len(variant.samples)} samples", d=bars or "M0 0")
     canvas.line(axis.start, base, axis.end, base, "axis")
-    for share in MARKED.values():
+    for share in variant.marks.values():
         if axis.holds(variant.at(share)):
             spot = axis(variant.at(share))
             canvas.line(spot, base - 2, spot, base + 5, f"mark {variant.css}")
-    numbers = f"{' · '.join(f'{name} {significant(variant.at(share))}' for name, share in MARKED.items())} ms"
+    numbers = _numbers(variant)
     room = canvas.width - len(numbers) * 6.2 - 20
     canvas.text(0, top + 4, shorten(variant.name, room), f"name halo ink {variant.css}")
     canvas.text(axis.end, top + 4, numbers, "tick halo", "end")
