@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from vlatool import run_gate as run_gate_module
 from vlatool.benchmark._pairs import Job, Pairs
 from vlatool.bundle import Bundle
 from vlatool.claims import _timed
@@ -15,6 +16,7 @@ from vlatool.gate import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
 from vlatool.report import Report
 from vlatool.run_gate import run_gate
 from vlatool.stage import Context
+from vlatool.telemetry._reading import THROTTLE, Reader, gauge
 
 QUICK = Gate(memory=None, latency=LatencyClaim(looks=(10,)))
 
@@ -130,3 +132,23 @@ def test_what_cannot_be_examined_is_said_before_anything_is_measured(
     with pytest.raises(DataError, match="Accuracy is claimed"):
         run_gate(resealed(bare), float_bundle, QUICK, Context())
     assert jobs == []
+
+
+def test_a_board_that_throttled_makes_the_measurement_suspect(float_bundle: Bundle, as_fast, monkeypatch) -> None:
+    class Hot(Reader):
+        name = "pi"
+
+        @classmethod
+        def open(cls, root=None, run=None):
+            return cls()
+
+        def read(self):
+            return gauge("pi.throttled", 1.0, THROTTLE, "soft temperature limit")
+
+    as_fast(0.0)
+    gate = QUICK.model_copy(update={"accuracy": None, "size": None})
+    assert run_gate(float_bundle, float_bundle, gate, Context()).validity == "valid"
+    monkeypatch.setattr(run_gate_module, "open_all", lambda: [Hot()])
+    report = run_gate(float_bundle, float_bundle, gate, Context())
+    assert (report.verdict, report.validity) == ("pass", "suspect")
+    assert "soft temperature limit" in report.findings[0].reason

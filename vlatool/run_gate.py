@@ -7,7 +7,7 @@ from dataclasses import replace
 from statistics import median
 
 from vlatool.benchmark._pairs import Job
-from vlatool.benchmark._trust import busy
+from vlatool.benchmark._trust import busy, throttled, validity
 from vlatool.bundle import Bundle
 from vlatool.claims import accuracy, deadline, growth, latency
 from vlatool.claims._found import Found, worst
@@ -18,8 +18,11 @@ from vlatool.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context
+from vlatool.telemetry import Recorder, open_all
 
 KIND = "gate"
+PERIOD_S = 1.0
+"""Seconds between two looks at the board."""
 
 
 def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, seed: int = 0) -> Report:
@@ -48,15 +51,16 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
         found.append(growth.examine_memory(candidate, baseline, gate.memory, how, context))
     if gate.accuracy:
         found.append(accuracy.examine(candidate, baseline, gate.accuracy, context))
-    if gate.latency:
-        found.append(latency.examine(timed, gate.latency))
-    if gate.deadline:
-        found.append(deadline.examine(timed, gate.deadline))
+    with Recorder(open_all(), PERIOD_S) as board:
+        if gate.latency:
+            found.append(latency.examine(timed, gate.latency))
+        if gate.deadline:
+            found.append(deadline.examine(timed, gate.deadline))
+    seen = (*throttled(board.recorded.throttling), *(replace(each, effect="note") for each in busy(host)))
     name = candidate.manifest.name
     rows = (_row("baseline", baseline, timed, found), _row("candidate", candidate, timed, found))
     return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found), _summary(name, found), rows,
-                  command=context.command, environment=host,
-                  findings=tuple(replace(each, effect="note") for each in busy(host)))  # fmt: skip
+                  command=context.command, environment=host, validity=validity(seen), findings=seen)  # fmt: skip
 
 
 def _check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:

@@ -26,8 +26,8 @@ def recorded(root, seconds):
 
 
 def found(telemetry=None, calls=100, **more):
-    policy = {"name": "int8", "blocks_ms": [[2.0] * 5] * (calls // 5), "at_s": [0.1 * number for number in range(calls)],
-              "paced": None} | more  # fmt: skip
+    times = [0.1 * number for number in range(calls)]
+    policy = {"name": "int8", "blocks_ms": [[2.0] * 5] * (calls // 5), "at_s": times, "paced": None} | more
     return {"begun_s": 1000.0, "ended_s": 1020.0, "wall_s": 20.0, "cpu_s": 30.0, "policies": [policy],
             "telemetry": telemetry}  # fmt: skip
 

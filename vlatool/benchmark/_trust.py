@@ -100,12 +100,16 @@ def _contended(found: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
+def throttled(causes: Sequence[str], effect: str = "suspect") -> Iterator[Finding]:
+    """Tell of a board that throttled, from what throttled it in words."""
+    if causes:
+        told = "; ".join(causes)
+        yield Finding(effect, f"the board was throttled: {told}", "cool it, or choose a power mode that it can hold")
+
+
 def _clock(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
     telemetry = found.get("telemetry") or {}
-    if telemetry.get("throttled"):
-        told = "; ".join(telemetry["throttling"])
-        effect = "note" if sustained else "suspect"
-        yield Finding(effect, f"the board was throttled: {told}", "cool it, or choose a power mode that it can hold")
+    yield from throttled(telemetry.get("throttling") or (), "note" if sustained else "suspect")
     moved = drift(found.get("canary_ms") or ())
     if abs(moved) > MOVED:
         word = "slower" if moved > 0 else "faster"

@@ -2,8 +2,8 @@
 
 It reads a job (one line of JSON), opens and warms up, says ``{"ready": PID}`` and waits for a line: whoever started it
 begins to record the board then, and ends it when the worker says ``{"timed": true}`` and waits again. It says
-``{"progress": [what, share]}`` meanwhile and ``{"result": ...}``, or what it raised, in the end. It imports what a robot
-imports, so that its memory is that of a robot's process.
+``{"progress": [what, share]}`` meanwhile and ``{"result": ...}``, or what it raised, in the end. It imports what a
+robot imports, so that its memory is that of a robot's process.
 """
 
 from __future__ import annotations
