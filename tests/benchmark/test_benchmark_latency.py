@@ -11,9 +11,9 @@ import pytest
 from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.benchmark._memory import peak_rss_mb, resident_mb
 from vlatool.benchmark._probe import cold_start, main
-from vlatool.benchmark.latency import Latency
+from vlatool.benchmark.latency import Latency, processors
 from vlatool.bundle import Bundle
-from vlatool.errors import BundleError, UsageError
+from vlatool.errors import BundleError, ProfileError, UsageError
 from vlatool.hwselect._workload import workload
 from vlatool.stage import Context
 
@@ -211,3 +211,112 @@ def test_the_peak_of_memory_is_the_processs_own(tmp_path):
     (tmp_path / "status").write_text("Name:\tx\n")
     assert peak_rss_mb(tmp_path / "status") > 1
     assert resident_mb(tmp_path / "status") > 1
+
+
+# ---- options
+
+
+def benchmarked(bundle, context=None, **options):
+    stage = Latency(**({"iterations": 20, "warmup": 1, "duration": 0, "cold": False, "phase": False} | options))
+    stage.check(bundle, None)
+    return stage.run(bundle, context or Context())
+
+
+def test_a_run_alone_says_whether_it_can_be_trusted_and_keeps_what_it_saw(float_bundle):
+    report = benchmarked(float_bundle, phase=True)
+    assert report.validity in ("valid", "suspect")
+    row = report.rows[0]
+    assert {"throughput", "jitter", "cpu", "size"} <= names(row)
+    assert len(row.raw["at_s"]) == len(row.raw["latency_ms"]) == 20
+    assert {"engine", "time by phase", "telemetry", "workload"} <= set(row.details)
+    assert row.details["engine"][0]["providers"] == "CPUExecutionProvider"
+
+
+def test_a_paced_run_has_misses_and_its_rate_as_the_limit(float_bundle):
+    report = benchmarked(float_bundle, rate=200.0)
+    assert report.limits == {"hz": 200.0}
+    assert {"deadline_misses", "age_p50", "wakeup_p99", "jitter"} <= names(report.rows[0])
+    assert "throughput" not in names(report.rows[0])
+    assert "at 200 Hz" in report.summary[0]
+    assert "from the moment at which the tick was due" in report.rows[0].get("latency_p50").note
+
+
+def test_a_sustained_run_lasts_and_compares(float_bundle):
+    report = benchmarked(float_bundle, sustained=0.3, answers=False)
+    assert report.rows[0].get("sustained_slowdown").unit == "x"
+    assert sum(report.rows[0].raw["latency_ms"]) / 1e3 < 5
+    assert report.rows[0].raw["at_s"][-1] > 0.2
+
+
+def test_an_invalid_measurement_decides_nothing(float_bundle, monkeypatch):
+    from vlatool.benchmark import _agent
+
+    honest = _agent.measure
+
+    def strays(job, tell):
+        found = honest(job, tell)
+        found["policies"][0]["answers"]["strays"] = 7
+        return found
+
+    monkeypatch.setattr(_agent, "measure", strays)
+    report = benchmarked(float_bundle)
+    assert (report.verdict, report.validity) == ("inconclusive", "invalid")
+    assert "The measurement is invalid" in report.summary[0]
+
+
+def test_a_board_is_emulated_with_its_processors_and_memory(float_bundle):
+    from vlatool.profile import load_profile
+
+    board = load_profile("raspberry-pi-5")
+    stage = Latency(emulate=True, iterations=20, duration=0, cold=False, threads=1)
+    stage.check(float_bundle, board)
+    limited = stage.on(board)
+    assert (limited.cores, limited.memory_mb) == (4, 1e3 * board.usable_memory_gb.value)
+    report = limited.run(float_bundle, Context())
+    notes = [each for each in report.findings if "emulation" in each.reason]
+    assert notes
+    assert notes[0].effect == "note"
+    assert "raspberry-pi-5" in notes[0].reason
+    assert report.rows[0].measurements[0].where == "this host, limited as raspberry-pi-5"
+    with pytest.raises(UsageError, match="--threads is 9; raspberry-pi-5 has 4 processors"):
+        stage.model_copy(update={"threads": 9}).on(board)
+    with pytest.raises(ProfileError, match="no power mode 'turbo'"):
+        stage.model_copy(update={"mode": "turbo"}).on(board)
+    assert Latency().on(board) == Latency()
+
+
+def test_a_job_runs_elsewhere_where_the_context_says_so(float_bundle):
+    from vlatool.benchmark._agent import measure
+    from vlatool.benchmark._job import Job
+
+    asked = []
+
+    def elsewhere(job, bundles, tell):
+        asked.append((job, bundles))
+        return {**measure(Job.from_dict(job), tell), "target": {"python": "3.10"}}
+
+    report = benchmarked(float_bundle, Context(elsewhere=elsewhere))
+    assert asked[0][1] == [float_bundle.path]
+    assert report.environment["target"] == {"python": "3.10"}
+    assert report.rows[0].measurements[0].where != "this host"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"rate": 10, "against": ["x"]}, "--rate paces one policy"),
+        ({"rate": 10, "sustained": 5}, "--sustained calls back to back"),
+        ({"emulate": True}, "--emulate needs a board"),
+        ({"mode": "15W"}, "--mode is the power mode that --emulate takes"),
+        ({"pin": "a-b"}, "--pin is 'a-b'"),
+        ({"pin": "3-1"}, "names no processor"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(float_bundle, options, told):
+    with pytest.raises(UsageError, match=told):
+        Latency(**options).check(float_bundle, None)
+
+
+@pytest.mark.parametrize(("text", "wanted"), [("", ()), ("0", (0,)), ("0-2,5", (0, 1, 2, 5)), ("3,3,1", (1, 3))])
+def test_processors_are_read_as_lists_of_ranges(text, wanted):
+    assert processors(text) == wanted

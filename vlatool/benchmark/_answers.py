@@ -26,7 +26,7 @@ REMEMBERS = 1.10
 """Fresh observations that take longer than this times a repeated one mean a memory (the margin of TEST04)."""
 ALPHA = 0.001
 PAIRS = 40
-FEWEST = 12
+FEWEST = 10
 
 
 class Answers:

@@ -44,14 +44,15 @@ def measurements(
         measured = [Measurement(**{**vars(each), "note": each.note or note}) for each in measured]
         measured += paced_measurements(policy["paced"], len(samples), rate)
     else:
-        measured.append(_throughput(found, samples))
-        measured.append(_jitter(samples))
+        measured.append(_throughput(samples))
+    measured.append(_jitter(samples))
     busy = float(found["cpu_s"]) / max(float(found["wall_s"]), 1e-9)
     measured.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
-    return [*measured, *_board(found, len(samples)), *cold(policy)]
+    inferences = len(policy["paced"]["wakeup_ms"]) if policy.get("paced") else len(samples)
+    return [*measured, *_board(found, inferences), *cold(policy)]
 
 
-def _throughput(found: Mapping[str, Any], samples: Sequence[float]) -> Measurement:
+def _throughput(samples: Sequence[float]) -> Measurement:
     return Measurement("throughput", 1e3 / float(np.mean(samples)), "1/s", samples=len(samples), note="back to back")
 
 
