@@ -158,7 +158,7 @@ class Latency(Measure):
             "benchmark",
             f"Latency of {bundles[0].manifest.name}",
             verdict="inconclusive" if valid == "invalid" else "info",
-            summary=(self._sentence(rows[0], host, valid, seen),),
+            summary=(self._sentence(rows, host, valid, seen),),
             rows=tuple(rows),
             limits={"hz": self.rate} if self.rate else {},
             environment={**host, **({"target": found["target"]} if "target" in found else {})},
@@ -166,11 +166,14 @@ class Latency(Measure):
             findings=seen,
         )
 
-    def _sentence(self, row: Row, host: Mapping[str, Any], valid: str, seen: Sequence[Finding]) -> str:
+    def _sentence(self, rows: Sequence[Row], host: Mapping[str, Any], valid: str, seen: Sequence[Finding]) -> str:
         if valid == "invalid":
             return f"The measurement is invalid: {seen[0].reason}."
         where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
+        row, others = rows[0], rows[1:]
         told = f"{row.name}: {row.value('latency_p50'):.3g} ms median latency on {where}"
+        for other in others:
+            told += f"; {other.name}: {other.value('latency_p50'):.3g} ms ({other.value('speedup'):.3g}x as fast)"
         if self.rate:
             misses = row.value("deadline_misses")
             late = f"{misses:.2%} of the ticks are late" if misses else "no tick is late"
