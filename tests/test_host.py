@@ -164,3 +164,21 @@ def test_odd_content_is_absent(tmp_path: Path) -> None:
 def test_versions_lists_what_is_installed() -> None:
     assert list(host.versions(["no-such-distribution"])) == []
     assert host.versions(["numpy"])["numpy"].count(".") >= 1
+
+
+def test_processors_that_are_busy_are_counted_over_a_while(tmp_path, monkeypatch):
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "sys/devices/system/cpu").mkdir(parents=True)
+    (tmp_path / "sys/devices/system/cpu/online").write_text("0-3")
+    stat = tmp_path / "proc/stat"
+    stat.write_text("cpu  100 0 100 1000 50 0 0 10 0 0\ncpu0 1 2\n")
+    monkeypatch.setattr(host.time, "sleep", lambda seconds: stat.write_text("cpu  140 0 110 1040 55 0 0 15 0 0\n"))
+    assert host.busy_processors(tmp_path) == pytest.approx(4 * 55 / 100)
+    assert host.busy_processors(tmp_path) is None, "no tick has passed"
+    stat.write_text("cpu  1 2 3\n")
+    assert host.busy_processors(tmp_path) is None
+
+
+def test_processors_of_this_machine_are_between_none_and_all():
+    found = host.busy_processors(seconds=0.05)
+    assert found is None or 0 <= found <= host.online_cores()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import platform
 import re
+import time
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -230,6 +231,29 @@ def frequency(root: Path = ROOT) -> dict[str, Any]:
     boost = read_number(root, "sys/devices/system/cpu/cpufreq/boost")
     turbo = (no_turbo == 0) if no_turbo is not None else (boost == 1) if boost is not None else None
     return {"governor": ", ".join(dict.fromkeys(governors)) or None, **clocks, "turbo": turbo}
+
+
+def busy_processors(root: Path = ROOT, seconds: float = 0.3) -> float | None:
+    """Return how many processors were computing meanwhile, waited for; None where nothing tells.
+
+    Time that the host of a virtual machine took counts, time spent waiting for disks does not.
+    """
+    before = _processor_time(root)
+    time.sleep(seconds)
+    after = _processor_time(root)
+    if before is None or after is None or after[1] <= before[1]:
+        return None
+    cores = online_cores(root) or 1
+    return round(cores * (after[0] - before[0]) / (after[1] - before[1]), 2)
+
+
+def _processor_time(root: Path) -> tuple[int, int] | None:
+    """Return the ticks that all processors were busy, and all their ticks (``/proc/stat``, proc.rst of Linux)."""
+    found = re.search(r"^cpu +([\d ]+)", read_text(root, "proc/stat") or "", re.MULTILINE)
+    ticks = [int(part) for part in found[1].split()][:8] if found else []
+    if len(ticks) < 8:
+        return None
+    return sum(ticks) - ticks[3] - ticks[4], sum(ticks)
 
 
 def os_name(root: Path = ROOT) -> str | None:

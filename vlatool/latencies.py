@@ -60,6 +60,7 @@ def percentile(
     percent: float,
     confidence: float = CONFIDENCE,
     processes: Sequence[int] | None = None,
+    most: float = math.inf,
 ) -> Percentile:
     """Return a percentile with its upper confidence bound, from dependent calls.
 
@@ -68,6 +69,7 @@ def percentile(
         processes: Which process each call was made in; all in one when None.
         percent: Above 0 and below 100.
         confidence: Of the bound, one-sided.
+        most: Independent calls that the series is worth at most, where something else than the order tells.
 
     Raises:
         ValueError: when there is no sample, one is not finite, or the percentage is none.
@@ -82,7 +84,7 @@ def percentile(
     if not len(series) or not np.isfinite(series).all():
         raise ValueError("no sample, or one that is not finite")
     share = percent / 100
-    worth = worth_of(series, share, processes)
+    worth = min(most, worth_of(series, share, processes))
     needed = floor(share, confidence)
     if worth < needed:
         return Percentile(percent, math.nan, math.nan, needed, worth, confidence)

@@ -42,7 +42,7 @@ def module(kind: str, name: str) -> ModuleType:
     """
     wanted = name.replace("-", "_")
     if wanted not in names(kind):
-        raise UsageError(f"There is no {kind} '{name}'; {nearest(wanted, names(kind))}.")
+        raise UsageError(f"There is no {kind.removesuffix('s')} '{name}'; {nearest(wanted, names(kind))}.")
     return importlib.import_module(f"{package_of(kind)}.{wanted}")
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from vlatool.benchmark._agent import measure
 from vlatool.benchmark._job import Job, Limits
-from vlatool.errors import BundleError, GateFailed, UsageError
+from vlatool.errors import BundleError, GateFailed, GraphError, UsageError
 from vlatool.processes import environment
 
 
@@ -38,7 +38,7 @@ def test_what_does_not_fit_fails(float_bundle):
 def test_errors_of_the_worker_come_back(tmp_path, float_bundle):
     with pytest.raises(BundleError, match="There is no bundle at"):
         measure(Job((str(tmp_path / "none"),)), quiet)
-    with pytest.raises(UsageError, match="There is no engines 'foo'"):
+    with pytest.raises(UsageError, match="There is no engine 'foo'"):
         measure(Job((str(float_bundle.path),), engine="foo"), quiet)
 
 
@@ -50,3 +50,41 @@ def test_the_agent_speaks_json_lines(float_bundle, tmp_path):
         told = [json.loads(each) for each in done.stdout.splitlines()]
         assert last in told[-1]
         assert all("progress" in each for each in told[:-1])
+
+
+def test_a_cold_start_that_fails_costs_nothing_else(float_bundle, monkeypatch):
+    from vlatool.benchmark import _agent
+    from vlatool.benchmark._rows import cold
+
+    def fails(*_):
+        raise GraphError("the bundle has gone.")
+
+    monkeypatch.setattr(_agent, "cold_start", fails)
+    found = measure(Job((str(float_bundle.path),), iterations=20, warmup=1, cold=1), quiet)
+    (one,) = cold(found["policies"][0])
+    assert not one.known
+    assert one.note == "the bundle has gone."
+
+
+def test_nobody_is_left_when_telling_fails(float_bundle):
+    import psutil
+
+    def broken(what, share):
+        raise BrokenPipeError
+
+    with pytest.raises(BrokenPipeError):
+        measure(Job((str(float_bundle.path),), iterations=20), broken)
+    left = [each for each in psutil.Process().children(recursive=True) if "_worker" in " ".join(each.cmdline())]
+    assert left == []
+
+
+def test_a_worker_that_is_killed_is_named(float_bundle):
+    import psutil
+
+    def kill(what, share):
+        if what == "measuring latency":
+            for child in psutil.Process().children(recursive=True):
+                child.kill()
+
+    with pytest.raises(GraphError, match=r"was killed \(SIGKILL\) while it was measured"):
+        measure(Job((str(float_bundle.path),), iterations=20, limits=Limits(memory_mb=2000)), kill)

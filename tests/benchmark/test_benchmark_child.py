@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import pytest
 
 from vlatool.benchmark import _child
-from vlatool.benchmark._child import SAID, answer, ask
+from vlatool.benchmark._child import SAID, answer, ask, ended, raise_said
+from vlatool.benchmark._job import Limits
 from vlatool.bundle import Bundle
-from vlatool.errors import GraphError, MissingExtra, UsageError
+from vlatool.errors import GateFailed, GraphError, MissingExtra, UsageError
 
 
 def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -25,7 +26,7 @@ def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_real_process_says_what_is_wrong(float_bundle: Bundle) -> None:
-    with pytest.raises(UsageError, match="There is no engines 'foo'") as caught:
+    with pytest.raises(UsageError, match="There is no engine 'foo'") as caught:
         ask("vlatool.benchmark._probe", (str(float_bundle.path), "foo", "1"), "", "x")
     assert caught.value.exit_code == 2
 
@@ -33,3 +34,27 @@ def test_a_real_process_says_what_is_wrong(float_bundle: Bundle) -> None:
 def test_a_process_that_dies_is_named() -> None:
     with pytest.raises(GraphError, match=r"x cannot be run in a fresh process: .*no_such_module"):
         ask("vlatool.no_such_module", (), "", "x")
+
+
+@pytest.mark.parametrize(
+    ("code", "log", "told"),
+    [
+        (-9, "", "was killed (SIGKILL) while it was measured, as it is when memory runs out"),
+        (-11, "noise", "ended with SIGSEGV while it was measured"),
+        (3, "first\nlast line", "last line"),
+        (1, "", "exit code 1"),
+    ],
+)
+def test_how_a_process_ended_is_told(code, log, told) -> None:
+    error = ended("x", code, log, Limits(), "while it was measured")
+    assert isinstance(error, GraphError)
+    assert told in error.message
+
+
+def test_a_process_under_a_limit_did_not_fit_only_where_memory_ended_it() -> None:
+    limits = Limits(memory_mb=50)
+    assert isinstance(ended("x", -9, "", limits), GraphError), "something else killed it"
+    assert isinstance(ended("x", 1, "MemoryError", limits), GateFailed)
+    with pytest.raises(GateFailed, match="more than 50 MB"):
+        raise_said({SAID: "GraphError", "message": "std::bad_alloc", "fix": ""}, limits)
+    raise_said({"result": 1}, limits)

@@ -193,14 +193,14 @@ def test_the_probe_in_this_process(float_bundle):
     assert set(main([str(float_bundle.path), "ort_cpu", "1"])) == PROBED | {"begun_ns", "acted_ns"}
 
 
-def test_a_bundle_without_golden_values_is_probed_without_an_inference(float_bundle, copied):
+def test_a_bundle_without_golden_values_is_probed_on_another_observation(float_bundle, copied):
     from vlatool.bundle import seal
 
     bare = copied(float_bundle)
     seal(bare.path, replace(bare.manifest, golden=""))
     found = main([str(bare.path), "ort_cpu", "1"])
-    assert "first" not in found["rss_mb"]
-    assert found["first_ms"] == 0
+    assert "first" in found["rss_mb"]
+    assert found["first_ms"] > 0
 
 
 def test_the_peak_of_memory_is_the_processs_own(tmp_path):

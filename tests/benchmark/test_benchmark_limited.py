@@ -4,12 +4,13 @@ import json
 import os
 import subprocess
 import sys
+import time
 
 import pytest
 
 from vlatool.benchmark import _limited
 from vlatool.benchmark._job import Job, Limits
-from vlatool.benchmark._limited import chosen, command, grouped
+from vlatool.benchmark._limited import chosen, command, grouped, ran_out
 from vlatool.errors import UsageError
 from vlatool.processes import environment
 
@@ -73,3 +74,46 @@ def test_what_needs_more_memory_is_stopped(tmp_path):
 def test_a_job_goes_through_json_and_back():
     job = Job(("a", "b"), rate=5.0, limits=Limits((1, 2), 2, 3.5))
     assert Job.from_dict(json.loads(json.dumps(job.to_dict()))) == job
+
+
+def test_a_group_says_whether_it_ended_a_process(tmp_path):
+    limits = Limits(memory_mb=5, cgroup=str(tmp_path))
+    assert not ran_out(Limits(memory_mb=5))
+    assert not ran_out(limits)
+    (tmp_path / "memory.oom_control").write_text("oom_kill_disable 0\nunder_oom 0\noom_kill 0\n")
+    assert not ran_out(limits)
+    (tmp_path / "memory.oom_control").write_text("oom_kill_disable 0\nunder_oom 0\noom_kill 2\n")
+    assert ran_out(limits)
+    (tmp_path / "memory.events").write_text("low 0\noom 1\noom_kill 0\n")
+    assert not ran_out(limits)
+
+
+def test_groups_of_runs_that_were_killed_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(_limited, "GROUPS", ((tmp_path, "memory.max", ("memory.swap.max", "0")),))
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for name in (f"vlatool-{gone.pid}-a", f"vlatool-{os.getpid()}-b", "vlatool-x-c", "other"):
+        (tmp_path / name).mkdir()
+    with grouped(Limits(cores=1)):
+        pass
+    assert {each.name for each in tmp_path.iterdir()} == {f"vlatool-{os.getpid()}-b", "vlatool-x-c", "other"}
+
+
+def test_a_process_ends_with_the_one_that_started_it(tmp_path):
+    child = "import sys, time; from vlatool.benchmark._limited import die_with_parent; die_with_parent(); " + (
+        "print('up', flush=True); time.sleep(60)"
+    )
+    parent = (
+        f"import subprocess, sys; child = subprocess.Popen([sys.executable, '-c', {child!r}]); "
+        "print(child.pid, flush=True); child.wait()"
+    )
+    started = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, env=environment())
+    lines = {started.stdout.readline().strip() for _ in range(2)}
+    (number,) = lines - {"up"}
+    started.kill()
+    started.wait()
+    started.stdout.close()
+    end = time.monotonic() + 10
+    while os.path.exists(f"/proc/{number}") and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not os.path.exists(f"/proc/{number}")

@@ -2,7 +2,8 @@
 
 import pytest
 
-from vlatool.benchmark._paced import paced_measurements, run_paced
+from vlatool.benchmark._contest import latency_measurements
+from vlatool.benchmark._paced import overloaded, paced_measurements, run_paced
 
 
 class Loop:
@@ -66,14 +67,44 @@ def test_a_policy_that_is_too_slow_for_the_rate_is_late_at_every_tick():
 def test_progress_is_told_now_and_then():
     told = []
     Loop(1.0).run(120, tell=lambda what, share: told.append((what, share)))
-    assert told == [("serving ticks at 100 Hz", 50 / 120), ("serving ticks at 100 Hz", 100 / 120)]
+    assert [what for what, _ in told] == ["serving ticks at 100 Hz"] * 2, "at once, and every second"
+    assert [share for _, share in told] == pytest.approx([0, 100 / 120], abs=0.01)
 
 
 def test_the_numbers_of_a_loop():
-    found = {each.name: each for each in paced_measurements(Loop(*[1.0] * 9, 52.0).run(1000).to_dict(), 1000, 100.0)}
+    found = {each.name: each for each in paced_measurements(Loop(*[1.0] * 999, 32.0).run(3000).to_dict(), 3000, 100.0)}
     assert set(found) == {"deadline_misses", "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99"}
     misses = found["deadline_misses"]
     assert misses.low < misses.value < misses.high
-    assert misses.value == pytest.approx(5 / 14, abs=0.01)
+    assert misses.value == pytest.approx(2 * 3 / 3000, abs=0.001)
     assert "passed over" in misses.note
-    assert found["age_max"].value == pytest.approx(60)
+    assert found["age_max"].value == pytest.approx(40)
+
+
+def test_nothing_is_bounded_where_many_ticks_share_an_inference():
+    seen = Loop(25.0).run(1000).to_dict()
+    assert seen["inferences"] < 600
+    assert overloaded(seen, 1000)
+    misses = paced_measurements(seen, 1000, 100.0)[0]
+    assert (misses.value, misses.low, misses.high) == (1.0, None, None)
+    wanted = latency_measurements([25.0] * 1000, refusals=True, most=0)
+    assert [each.name for each in wanted if each.known] == ["latency_p50", "latency_max"]
+    assert "lower --rate" in wanted[1].note
+
+
+def test_a_loop_that_never_slept_says_nothing_of_waking_up():
+    seen = Loop(25.0).run(50).to_dict()
+    assert len(seen["wakeup_ms"]) <= 1
+    assert not any(each.name.startswith("wakeup") for each in paced_measurements({**seen, "wakeup_ms": []}, 50, 100.0))
+
+
+def test_ticks_that_share_an_inference_count_for_less():
+    seen = Loop(*[1.0] * 99, 52.0).run(300).to_dict()
+    assert seen["worth"] == pytest.approx(300**2 / (seen["inferences"] - 2 + 2 * 25), rel=0.1)
+
+
+def test_there_is_time_for_other_things_while_the_loop_has_slack():
+    called = []
+    Loop(1.0).run(20, between=called.append)
+    assert called == pytest.approx([tick / 20 for tick in range(1, 21)])
+    Loop(25.0).run(20, between=lambda share: pytest.fail("no slack"))

@@ -46,9 +46,32 @@ def test_answers_from_memory_are_invalid():
 
 
 def test_a_busy_host_is_suspect():
-    assert findings(found(host={"load_average": [0.5, 9, 9], "cores": 2})) == ()
-    assert findings(found(host={"load_average": None, "cores": 2})) == ()
-    assert "load 6.0 on 2 cores" in only(found(host={"load_average": [6.0, 0, 0], "cores": 2})).reason
+    assert findings(found(host={"processors_busy": 0.3, "cores_online": 2})) == ()
+    assert findings(found(host={"processors_busy": None, "cores_online": 2})) == ()
+    assert "kept 1.0 of 2 processors busy" in only(found(host={"processors_busy": 1.0, "cores_online": 2})).reason
+
+
+def test_threads_that_share_processors_are_told_and_not_blamed_on_others():
+    one = only(found(switches=5000, job={"threads": 8, "limits": {"cpus": [0, 1]}}, host={"cores": 4}))
+    assert "8 threads share 2 processors" in one.reason
+    assert one.remedy == "--threads 2, or fewer"
+    assert findings(found(job={"threads": 4, "limits": {}}, host={"cores": 4})) == ()
+    assert "share 1 processor:" in only(found(job={"threads": 2, "limits": {"cores": 1}}, host={"cores": 4})).reason
+
+
+def test_a_golden_action_that_is_off_is_suspect():
+    assert "0.12" in only(found(policy={"golden_error": 0.12})).reason
+    assert findings(found(policy={"golden_error": 0.001})) == ()
+
+
+def test_answers_that_were_not_looked_at_are_noted():
+    assert only(found(policy={"engines": [{"graph": "main"}]})).effect == "note"
+
+
+def test_a_run_that_was_full_is_noted():
+    what = found(policy={"at_s": range(2_000_000)}, job={"iterations": 200})
+    assert "2,000,000 calls" in only(what).reason
+    assert findings(found(policy={"at_s": range(2_000_000)}, job={"iterations": 2_000_000})) == ()
 
 
 def test_a_contended_processor_is_suspect():
@@ -74,7 +97,10 @@ def test_a_processor_that_changes_its_speed_is_suspect(last, told):
 
 def test_a_policy_that_becomes_slower_is_suspect():
     blocks = [[1.0] * 10] * 15 + [[1.1] * 10] * 5
-    assert "10% slower" in only(found(policy={"blocks_ms": blocks})).reason
+    one = only(found(policy={"blocks_ms": blocks}))
+    assert "10% slower" in one.reason
+    assert "--sustained 600" in one.remedy
+    assert "--duration 600" in only(found(policy={"blocks_ms": blocks}, job={"rate": 50.0})).remedy
     assert findings(found(policy={"blocks_ms": blocks}), duration_is_sustained=True) == ()
     assert findings(found(policy={"blocks_ms": [[1.0]] * 15 + [[2.0]] * 5})) == (), "too few to say"
 

@@ -52,7 +52,6 @@ def test_every_call_is_kept_with_its_time(float_bundle, int8_bundle):
     assert len(found["canary_ms"]) == 21
     assert found["cpu_s"] > 0
     assert 0 < found["wall_s"] <= found["ended_s"] - found["begun_s"] + 0.1
-    assert found["peak_rss_mb"] > 10
 
 
 def test_the_run_lasts_as_long_as_it_should(policy, float_bundle):

@@ -51,7 +51,7 @@ def test_headline_measured_and_predicted() -> None:
     assert measured < predicted < text.index("35.4 ms (23.6–59.0)")
     assert "(computed by a model, not measured)" in text
     assert "unmeasured: engine refused" in text
-    assert "Limits asked for: latency p50 25 ms, max success drop 2 points, strict yes" in text
+    assert "Asked for: latency p50 25 ms, max success drop 2 points, strict yes" in text
 
 
 def test_long_details_are_cut() -> None:

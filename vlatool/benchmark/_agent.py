@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,7 +24,8 @@ from vlatool.benchmark._job import Job, Limits
 from vlatool.benchmark._limited import chosen, command, grouped
 from vlatool.benchmark._probe import cold_start
 from vlatool.bundle import Bundle
-from vlatool.host import fingerprint
+from vlatool.errors import VlatoolError
+from vlatool.host import busy_processors, fingerprint
 from vlatool.processes import environment
 from vlatool.telemetry import Absent, Recorded, Recorder, open_all
 from vlatool.telemetry.process import ProcessReader
@@ -36,66 +38,86 @@ def measure(job: Job, tell: Tell) -> dict[str, Any]:
     """Measure on this machine.
 
     Returns:
-        JSON values: ``host``, ``begun_s``, ``ended_s``, ``canary_ms``, ``cpu_s``, ``wall_s``, ``switches``,
-        ``policies`` (one for each bundle) and ``telemetry``.
+        JSON values: ``job``, ``host`` (with ``processors_busy`` before the run), ``begun_s``, ``ended_s``,
+        ``canary_ms``, ``cpu_s``, ``wall_s``, ``switches``, ``policies`` (one for each bundle) and ``telemetry``.
 
     Raises:
         VlatoolError: what a bundle raises; GraphError when a process ends; GateFailed when it needs more memory than
             the limits leave.
     """
-    host = fingerprint()  # before the run itself loads the machine
-    with grouped(chosen(job.limits)) as limits:
-        found = _run_worker(job, limits, tell)
-        for number, (path, policy) in enumerate(zip(job.bundles, found["policies"], strict=True)):
-            if job.cold and Bundle.open(Path(path), verify=False).manifest.graphs:
-                tell("cold start of each in a fresh process", number / len(job.bundles))
-                starts = [cold_start(Path(path), job.engine, job.threads, limits) for _ in range(job.cold)]
-                policy["cold"] = starts
-    _fits(found, job.limits)
-    return {"host": host, **found}
+    limits = chosen(job.limits)
+    if limits.memory_mb:
+        tell("whether it fits into the memory", None)
+        with grouped(limits) as limited:
+            for path in job.bundles:
+                _fits(_probed(path, job, limited), limited)
+    host = {**fingerprint(), "processors_busy": busy_processors()}  # before the run itself loads the machine
+    free = replace(limits, memory_mb=0.0)  # the worker also holds observations and every sample
+    found = _run_worker(job, free, tell)
+    for number, (path, policy) in enumerate(zip(job.bundles, found["policies"], strict=True)):
+        if job.cold and policy["engines"]:
+            tell("cold start of each in a fresh process", number / len(job.bundles))
+            try:
+                policy["cold"] = [_probed(path, job, free) for _ in range(job.cold)]
+            except VlatoolError as error:  # the latencies are measured, and stay
+                policy["cold_error"] = error.message
+    return {"job": {**job.to_dict(), "bundles": len(job.bundles)}, "host": host, **found}
 
 
-def _fits(found: Mapping[str, Any], limits: Limits) -> None:
+def _probed(path: str, job: Job, limits: Limits) -> dict[str, Any]:
+    return cold_start(Path(path), job.engine, job.threads, limits) if _has_graphs(path) else {"peak_rss_mb": 0.0}
+
+
+def _has_graphs(path: str) -> bool:
+    return bool(Bundle.open(Path(path), verify=False).manifest.graphs)
+
+
+def _fits(start: Mapping[str, Any], limits: Limits) -> None:
     """Refuse what a control group lets through: pages of files that others have read already.
 
     Raises:
         GateFailed: when more was resident than the limit.
     """
-    peaks = [each["peak_rss_mb"] for policy in found["policies"] for each in policy.get("cold", ())]
-    peak = max(peaks or [found["peak_rss_mb"]])
-    if limits.memory_mb and peak > limits.memory_mb:
-        raise too_large(limits, f": {peak:,.0f} MB")
+    if start["peak_rss_mb"] > limits.memory_mb:
+        raise too_large(limits, f": {start['peak_rss_mb']:,.0f} MB")
 
 
 def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
     about = ", ".join(job.bundles)
-    with tempfile.TemporaryFile("w+") as log, _started(command(limits, WORKER), log) as worker:
-        assert worker.stdin is not None
+    with (
+        tempfile.TemporaryFile("w+") as log,
+        _started(command(limits, WORKER), log) as worker,
+        contextlib.ExitStack() as recording,
+    ):
         assert worker.stdout is not None
         recorder: Recorder | None = None
-        with contextlib.suppress(BrokenPipeError), contextlib.ExitStack() as recording:
-            worker.stdin.write(json.dumps(job.to_dict()) + "\n")
-            worker.stdin.flush()
-            for text in worker.stdout:
-                line: dict[str, Any] = json.loads(text) if text.startswith("{") else {}
-                if "progress" in line:
-                    tell(*line["progress"])
-                elif "ready" in line:
-                    recorder = recording.enter_context(Recorder(_readers(int(line["ready"])), PERIOD_S))
-                    worker.stdin.write("\n")
-                    worker.stdin.flush()
-                elif "timed" in line:
-                    recording.close()
-                    worker.stdin.write("\n")
-                    worker.stdin.flush()
-                elif "result" in line:
-                    found: dict[str, Any] = line["result"]
-                    return {**found, "telemetry": plain(recorder.recorded) if recorder else None}
-                else:
-                    raise_said(line, limits)
+        _answer(worker, json.dumps(job.to_dict()))
+        for text in worker.stdout:
+            line: dict[str, Any] = json.loads(text) if text.startswith("{") else {}
+            if "progress" in line:
+                tell(*line["progress"])
+            elif "ready" in line:
+                recorder = recording.enter_context(Recorder(_readers(int(line["ready"])), PERIOD_S))
+                _answer(worker)
+            elif "timed" in line:
+                recording.close()
+                _answer(worker)
+            elif "result" in line:
+                found: dict[str, Any] = line["result"]
+                return {**found, "telemetry": plain(recorder.recorded) if recorder else None}
+            else:
+                raise_said(line, limits)
         code = worker.wait()
         log.seek(0)
-        raise ended(about, code, log.read(), limits)
+        raise ended(about, code, log.read(), limits, "while it was measured")
+
+
+def _answer(worker: subprocess.Popen[str], line: str = "") -> None:
+    """Send a line to the worker; one that has ended says so with its output."""
+    assert worker.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        worker.stdin.write(line + "\n")
+        worker.stdin.flush()
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 
 from vlatool import errors
 from vlatool.benchmark._job import Limits
-from vlatool.benchmark._limited import command
+from vlatool.benchmark._limited import command, ran_out
 from vlatool.errors import GateFailed, GraphError, VlatoolError
 from vlatool.processes import environment
 
@@ -80,12 +80,16 @@ def raise_said(found: Mapping[str, Any], limits: Limits = Limits()) -> None:  # 
     raise raised(message, str(found["fix"]))
 
 
-def ended(about: str, code: int, log: str, limits: Limits) -> VlatoolError:
-    """Return the error of a process that ended without a result."""
-    if limits.memory_mb and (code in (-signal.SIGKILL, -signal.SIGABRT) or any(sign in log for sign in NO_MEMORY)):
+def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fresh process") -> VlatoolError:
+    """Return the error of a process that ended without a result, from its exit code and what it wrote to stderr."""
+    if limits.memory_mb and (ran_out(limits) or any(sign in log for sign in NO_MEMORY)):
         return too_large(limits)
     if code == -signal.SIGKILL:
-        return GraphError(f"{about}: the process was killed, most likely since memory ran out.", "use a smaller policy")
+        return GraphError(
+            f"{about}: the process was killed (SIGKILL) {when}, as it is when memory runs out.", "use a smaller policy"
+        )
+    if code < 0:
+        return GraphError(f"{about}: the process ended with {signal.Signals(-code).name} {when}.")
     last = (log.strip() or f"exit code {code}").splitlines()[-1]
     return GraphError(f"{about} cannot be run in a fresh process: {last}")
 

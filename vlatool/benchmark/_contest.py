@@ -97,15 +97,16 @@ def _time(contestant: Contestant, count: int, seconds: float) -> None:
     contestant.blocks.append(taken)
 
 
-def latency_measurements(samples: Sequence[float], refusals: bool = False) -> list[Measurement]:
+def latency_measurements(samples: Sequence[float], refusals: bool = False, most: float = math.inf) -> list[Measurement]:
     """Return the percentiles and the maximum in ms, each percentile with its upper bound at 99 %.
 
     The median is always given; without a bound where the samples are too few for one. Any other percentile that is not
-    bounded is left out, or, with ``refusals``, named with what it would take.
+    bounded is left out, or, with ``refusals``, named with what it would take. ``most`` is how many independent calls
+    the samples are worth at most; 0 where nothing can be said.
     """
     found = []
     for percent in PERCENTILES:
-        seen = percentile(samples, percent)
+        seen = percentile(samples, percent, most=most)
         name = f"latency_{seen.name}"
         if seen.known:
             found.append(
@@ -114,15 +115,19 @@ def latency_measurements(samples: Sequence[float], refusals: bool = False) -> li
         elif percent == PERCENTILES[0]:
             found.append(Measurement(name, float(np.median(samples)), "ms", samples=len(samples)))
         elif refusals:
-            found.append(Measurement(name, math.nan, "ms", samples=len(samples), note=_wanting(seen, len(samples))))
+            note = _wanting(seen, len(samples), sum(samples) / 1e3)
+            found.append(Measurement(name, math.nan, "ms", samples=len(samples), note=note))
     return [*found, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
 
 
-def _wanting(seen: Percentile, calls: int) -> str:
+def _wanting(seen: Percentile, calls: int, seconds: float) -> str:
     """Return what a percentile lacks; calls that follow each other count for less than independent ones."""
+    if not seen.worth:
+        return "ticks share inferences, so nothing bounds it; pass a lower --rate"
     more = math.ceil(1.1 * seen.needed * max(1.0, calls / seen.worth) / 100) * 100
     worth = f"{calls:,} calls" if seen.worth >= calls else f"{calls:,} calls that are worth {int(seen.worth):,}"
-    return f"needs {seen.needed:,} independent calls, this run has {worth}; pass --iterations {more}"
+    advice = f"pass --iterations {more} (about {seconds * more / calls:.0f} s)"
+    return f"needs {seen.needed:,} independent calls, this run has {worth}; {advice}"
 
 
 def speedup(contestant: Contestant, reference: Contestant) -> Measurement:

@@ -60,7 +60,8 @@ class Job:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON values."""
-        return dataclasses.asdict(self)
+        found = dataclasses.asdict(self)
+        return {**found, "bundles": list(self.bundles), "limits": {**found["limits"], "cpus": list(self.limits.cpus)}}
 
     @classmethod
     def from_dict(cls, found: Mapping[str, Any]) -> Job:

@@ -6,12 +6,15 @@ The limits are set before anything is imported that could take memory or start t
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import resource
 import runpy
+import signal
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,6 +22,8 @@ from pathlib import Path
 from vlatool.benchmark._job import Limits
 from vlatool.errors import UsageError
 
+PR_SET_PDEATHSIG = 1
+"""Of ``prctl(2)``."""
 GROUPS = (
     (Path("/sys/fs/cgroup"), "memory.max", ("memory.swap.max", "0")),
     (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", ("memory.memsw.limit_in_bytes", "")),
@@ -41,13 +46,51 @@ def grouped(limits: Limits) -> Iterator[Limits]:
     Memory that a control group limits is what the kernel counts as resident, as on the board. Elsewhere each process
     limits its private writable memory (``RLIMIT_DATA``), which counts what is reserved and not touched, too.
     """
+    _sweep()
     made = _made(limits) if limits.memory_mb else None
     try:
         yield limits if made is None else replace(limits, cgroup=str(made))
     finally:
         if made is not None:
-            with contextlib.suppress(OSError):
-                made.rmdir()
+            _remove(made)
+
+
+def _sweep() -> None:
+    """Remove the groups of runs that were killed."""
+    for base, *_ in GROUPS:
+        for left in base.glob("vlatool-*-*"):
+            number = left.name.split("-")[1]
+            if number.isdigit() and not Path("/proc", number).exists():
+                _remove(left, 0.0)
+
+
+def _remove(group: Path, patience_s: float = 1.0) -> None:
+    """Remove a group once its last process has been reaped."""
+    end = time.monotonic() + patience_s
+    while True:
+        try:
+            group.rmdir()
+        except FileNotFoundError:
+            return
+        except OSError:
+            if time.monotonic() >= end:
+                return
+            time.sleep(0.02)
+        else:
+            return
+
+
+def ran_out(limits: Limits) -> bool:
+    """Say whether a control group has ended a process for its memory."""
+    if not limits.cgroup:
+        return False
+    for name in ("memory.events", "memory.oom_control"):
+        with contextlib.suppress(OSError):
+            text = (Path(limits.cgroup) / name).read_text(encoding="ascii")
+            counted = dict(line.split() for line in text.splitlines() if len(line.split()) == 2)
+            if "oom_kill" in counted:
+                return int(counted["oom_kill"]) > 0
+    return False
 
 
 def _made(limits: Limits) -> Path | None:
@@ -55,7 +98,7 @@ def _made(limits: Limits) -> Path | None:
     for base, name, (swap, value) in GROUPS:
         found = None
         try:
-            found = Path(tempfile.mkdtemp(prefix="vlatool-", dir=base))
+            found = Path(tempfile.mkdtemp(prefix=f"vlatool-{os.getpid()}-", dir=base))
             if not (found / name).exists():  # no group, but a plain directory: nothing is mounted there
                 raise FileNotFoundError(found / name)
             (found / name).write_text(size, encoding="ascii")
@@ -101,8 +144,15 @@ def limit_this_process(limits: Limits) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (size, size))
 
 
+def die_with_parent() -> None:
+    """Let the kernel kill this process when the one that started it ends, however that ends (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 def main() -> None:
     """Set the limits and become the module."""
+    die_with_parent()
     read = json.loads(sys.argv[1])
     limit_this_process(Limits(**{**read, "cpus": tuple(read["cpus"])}))
     module = sys.argv[2]

@@ -19,8 +19,13 @@ from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
 from vlatool.statistics import wilson
 
-MANY = 50
-"""Ticks between two reports of progress."""
+TELL_S = 1.0
+"""Seconds between two reports of progress."""
+SLACK_S = 4e-3
+"""Time until the next tick in which ``between`` may be called."""
+OVERLOADED = 0.01
+"""Share of ticks that are passed over from which a loop is too fast for the policy: ticks that share an inference are
+no independent samples, and no bound is given for them."""
 
 
 def _doubles() -> array[float]:
@@ -35,7 +40,8 @@ class Ticks:
         period_ms: Between two ticks.
         response_ms: From the moment at which a tick was due to the action that served it.
         due_s: When it was due, ``time.monotonic``.
-        wakeup_ms: How late the loop began a tick that it served itself.
+        wakeup_ms: How late the loop woke up for a tick that it slept until.
+        served: For each inference, the ticks that it served.
         age_ms: How old the observation behind the newest action was when the tick was due; from the second action on.
         passed_over: Ticks that began and ended while the policy computed.
     """
@@ -45,6 +51,7 @@ class Ticks:
     due_s: array[float] = field(default_factory=_doubles)
     wakeup_ms: array[float] = field(default_factory=_doubles)
     age_ms: array[float] = field(default_factory=_doubles)
+    served: array[int] = field(default_factory=lambda: array("q"))
     passed_over: int = 0
 
     @property
@@ -60,6 +67,8 @@ class Ticks:
             "age_ms": list(self.age_ms),
             "misses": self.misses,
             "passed_over": self.passed_over,
+            "inferences": len(self.served),
+            "worth": sum(self.served) ** 2 / max(1, sum(count * count for count in self.served)),
         }
 
 
@@ -72,6 +81,7 @@ def run_paced(
     tell: Callable[[str, float | None], None] = lambda what, share: None,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
+    between: Callable[[float], None] = lambda share: None,
 ) -> Ticks:
     """Serve ticks of a control loop.
 
@@ -83,26 +93,30 @@ def run_paced(
         answers: What the policy is expected to answer.
         tell: What is being done, and the share that is done.
         clock, sleep: In seconds; other ones in tests.
+        between: Called with the share of ticks that are done, where there is time until the next.
     """
     period = 1.0 / rate
     found = Ticks(period * 1e3)
     begun = clock() + period
-    tick, served, last_told = 0, 0, 0
+    tick, served, told = 0, 0, -TELL_S
     actions: list[tuple[float, float]] = []  # the last two: when the observation was taken, when the action was there
     while tick < ticks:
-        due = begun + tick * period
-        if (left := due - clock()) > 0:
-            sleep(left)
-        now = clock()
-        newest = min(ticks - 1, max(tick, int((now - begun) / period)))
         place = served % len(observations)
         if not place:
             policy.reset()
-        began = clock()
+        if (now := clock()) - told >= TELL_S:
+            tell(f"serving ticks at {rate:g} Hz", tick / ticks)
+            told = now
+        due = begun + tick * period
+        if (left := due - clock()) > 0:
+            sleep(left)
+            found.wakeup_ms.append((clock() - due) * 1e3)
+        now = clock()
+        newest = min(ticks - 1, max(tick, int((now - begun) / period)))
         action = policy.infer(observations[place])
         done = clock()
-        found.wakeup_ms.append((began - (begun + newest * period)) * 1e3)
         found.passed_over += newest - tick
+        found.served.append(newest + 1 - tick)
         for each in range(tick, newest + 1):
             when = begun + each * period
             found.due_s.append(when)
@@ -113,28 +127,35 @@ def run_paced(
         served, tick = served + 1, newest + 1
         if answers is not None:
             answers.look(place, action.outputs)
-        if tick - last_told >= MANY:
-            tell(f"serving ticks at {rate:g} Hz", tick / ticks)
-            last_told = tick
+        if begun + tick * period - clock() > SLACK_S:
+            between(tick / ticks)
     return found
 
 
 def paced_measurements(found: Mapping[str, Any], ticks: int, rate: float) -> list[Measurement]:
     """Return misses, ages and lateness of a loop from ``Ticks.to_dict``."""
     misses, period = int(found["misses"]), float(found["period_ms"])
-    low, high = wilson(misses, ticks)
+    worth = 0 if overloaded(found, ticks) else int(found["worth"])
+    low, high = wilson(min(worth, round(misses * worth / ticks)), worth) if worth else (None, None)
     note = f"ticks at {rate:g} Hz whose action came after the next tick, {period:g} ms later; "
-    note += f"{found['passed_over']} of them were passed over while the policy computed"
+    note += f"{found['inferences']:,} inferences, {found['passed_over']:,} ticks passed over while the policy computed"
     measured = [Measurement("deadline_misses", misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
     ages, late = sorted(found["age_ms"]), sorted(found["wakeup_ms"])
     about = "age of the observation behind the newest action when a tick is due"
     for name, share in (("age_p50", 0.5), ("age_p99", 0.99), ("age_max", 1.0)):
         if ages:
             measured.append(Measurement(name, _at(ages, share), "ms", samples=len(ages), note=about))
-    about = "how late the loop begins a tick"
+    about = "how late the loop wakes up for a tick that it slept until"
     for name, share in (("wakeup_p50", 0.5), ("wakeup_p99", 0.99)):
+        if not late:
+            break
         measured.append(Measurement(name, _at(late, share), "ms", samples=len(late), note=about))
     return measured
+
+
+def overloaded(found: Mapping[str, Any], ticks: int) -> bool:
+    """Say whether so many ticks share an inference that nothing can be bounded."""
+    return bool(found["passed_over"] > OVERLOADED * ticks)
 
 
 def _at(ordered: Sequence[float], share: float) -> float:

@@ -21,6 +21,7 @@ from statistics import median
 from typing import Any
 
 from vlatool.benchmark._child import answer, ask
+from vlatool.benchmark._limited import die_with_parent
 
 WARMUP_MS = 200.0
 """How long each bundle runs before its first call that counts, at least ``Job.warmup`` calls."""
@@ -122,4 +123,5 @@ def _warm_up(policy: Any, observations: Sequence[Any], calls: int) -> None:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     answer(lambda: dataclasses.asdict(run_job(Job(**json.loads(sys.stdin.readline())))))

@@ -12,6 +12,7 @@ from typing import Any
 
 from vlatool.benchmark._child import answer, ask
 from vlatool.benchmark._job import Limits
+from vlatool.benchmark._limited import die_with_parent
 from vlatool.benchmark._memory import peak_rss_mb, resident_mb
 
 MORE = 5
@@ -46,12 +47,13 @@ def cold_start(bundle: Path, engine: str, threads: int, limits: Limits = Limits(
 
 
 def main(arguments: list[str]) -> dict[str, Any]:
-    """Load and run once in this process."""
+    """Load and run in this process."""
+    die_with_parent()
     begun = time.monotonic_ns()  # the same clock in every process of a machine
     rss = {"interpreter": resident_mb()}
     from vlatool.bundle import Bundle
     from vlatool.runtime import load
-    from vlatool.runtime.policy import DEFAULT_ENGINE, load_golden
+    from vlatool.runtime.policy import DEFAULT_ENGINE
 
     imported = time.monotonic_ns()
     rss["imported"] = resident_mb()
@@ -62,16 +64,14 @@ def main(arguments: list[str]) -> dict[str, Any]:
     policy = load(arguments[0], engine=arguments[1], threads=int(arguments[2]), warmup=0)
     loaded = time.monotonic_ns()
     rss["loaded"] = resident_mb()
-    golden: Any = load_golden(policy.bundle)
+    observation, noise = _observation(policy)
     before = time.monotonic_ns()
-    acted = before
-    if golden is not None:
-        policy.infer(golden[0], noise=golden[1])
-        acted = time.monotonic_ns()
-        rss["first"] = resident_mb()
-        for _ in range(MORE):
-            policy.infer(golden[0], noise=golden[1])
-        rss["more"] = resident_mb()
+    policy.infer(observation, noise=noise)
+    acted = time.monotonic_ns()
+    rss["first"] = resident_mb()
+    for _ in range(MORE):
+        policy.infer(observation, noise=noise)
+    rss["more"] = resident_mb()
     return {
         "begun_ns": begun,
         "import_ms": (imported - begun) / 1e6,
@@ -82,6 +82,18 @@ def main(arguments: list[str]) -> dict[str, Any]:
         "peak_rss_mb": peak_rss_mb(),
         "rss_mb": rss,
     }
+
+
+def _observation(policy: Any) -> tuple[Any, Any]:
+    """Return the golden observation with its noise, or a recorded or synthetic one where there is no golden."""
+    from vlatool.runtime.policy import load_golden
+
+    golden = load_golden(policy.bundle)
+    if golden is not None:
+        return golden[0], golden[1]
+    from vlatool.data import observations_for
+
+    return observations_for(policy.bundle, 1)[0], None
 
 
 def _import_engine(name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
@@ -9,12 +10,16 @@ from typing import Any
 import numpy as np
 
 from vlatool.benchmark._contest import latency_measurements, speedup_of
-from vlatool.benchmark._paced import paced_measurements
+from vlatool.benchmark._paced import overloaded, paced_measurements
 from vlatool.benchmark._probe import PARTS
 from vlatool.report import Measurement
 
 ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
+OWN = ("process.cpu", "process.involuntary_switches")
+"""Counters that the measurements hold over exactly the timed part."""
+OTHER_BOARDS = ("this is no ", "virtual machine or ", "NVIDIA card", "NVML tells nothing")
+"""What the reason says where a source of telemetry belongs to another kind of board: told in one line."""
 WINDOW = 0.1
 """Share of a sustained run that is its start, and its end."""
 
@@ -35,21 +40,22 @@ def measurements(
         reference: What its speed is compared with; None when it ran alone.
         rate: Ticks in a second; 0 for calls back to back.
     """
-    samples = samples_of(policy)
-    measured = latency_measurements(samples, refusals=reference is None)
+    samples, paced = samples_of(policy), policy.get("paced")
+    most = math.inf if not paced else 0.0 if overloaded(paced, len(samples)) else float(paced["worth"])
+    measured = latency_measurements(samples, refusals=reference is None, most=most)
     if reference is not None:
         return [*measured, speedup_of(policy["blocks_ms"], reference["blocks_ms"], reference["name"]), *cold(policy)]
-    if policy.get("paced"):
+    if paced:
         note = "from the moment at which the tick was due"
         measured = [Measurement(**{**vars(each), "note": each.note or note}) for each in measured]
-        measured += paced_measurements(policy["paced"], len(samples), rate)
+        measured += paced_measurements(paced, len(samples), rate)
     else:
         measured.append(_throughput(samples))
     measured.append(_jitter(samples))
     busy = float(found["cpu_s"]) / max(float(found["wall_s"]), 1e-9)
     measured.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
-    inferences = len(policy["paced"]["wakeup_ms"]) if policy.get("paced") else len(samples)
-    return [*measured, *_board(found, inferences), *cold(policy)]
+    inferences = int(paced["inferences"]) if paced else len(samples)
+    return [*measured, *_board(found, inferences), *_golden(policy), *cold(policy)]
 
 
 def _throughput(samples: Sequence[float]) -> Measurement:
@@ -84,9 +90,17 @@ def _board(found: Mapping[str, Any], actions: int) -> list[Measurement]:
     return measured
 
 
+def _golden(policy: Mapping[str, Any]) -> list[Measurement]:
+    error = policy.get("golden_error")
+    note = "relative difference of the golden action from the recorded one"
+    return [] if error is None else [Measurement("golden_error", float(error), "1", samples=1, note=note)]
+
+
 def cold(policy: Mapping[str, Any]) -> list[Measurement]:
     """Return the cold start and the memory of fresh processes."""
     starts = policy.get("cold")
+    if policy.get("cold_error"):
+        return [Measurement("cold_start", math.nan, "ms", note=policy["cold_error"])]
     if not starts:
         return []
     count = len(starts)
@@ -94,10 +108,17 @@ def cold(policy: Mapping[str, Any]) -> list[Measurement]:
     peak = median(each["peak_rss_mb"] for each in starts)
     steady = median(list(each["rss_mb"].values())[-1] for each in starts)
     total = median(each["total_ms"] for each in starts)
+    cached = f"start of the process to the first action, its files in the page cache; {note}"
     return [
         Measurement("peak_rss", peak, "MB", samples=count, note=f"import, load, inferences in a {note}"),
         Measurement("steady_rss", steady, "MB", samples=count, note=f"after some inferences in a {note}"),
-        Measurement("cold_start", total, "ms", samples=count, note=f"start of the process to the first action; {note}"),
+        Measurement(
+            "cold_start",
+            total,
+            "ms",
+            samples=count,
+            note=cached,
+        ),
     ]
 
 
@@ -171,8 +192,19 @@ def _telemetry(telemetry: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
         for name, each in telemetry["gauges"].items()
     ]  # fmt: skip
     counters = [
-        {"reading": f"{name} (difference)", "unit": each["unit"], "mean": round(each["difference"], 4)}
+        {"reading": name, "unit": each["unit"], "difference": round(each["difference"], 4)}
         for name, each in telemetry["counters"].items()
+        if name not in OWN
     ]
-    absent = [{"what": each["reader"], "why": each["reason"]} for each in telemetry["unmeasured"]]
+    absent = _absent(telemetry["unmeasured"])
     return {"telemetry": [*gauges, *counters], **({"unmeasured": absent} if absent else {})}
+
+
+def _absent(unmeasured: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
+    """Return what is unmeasured and why; sources of other kinds of boards in one line."""
+    others = [each["reader"] for each in unmeasured if any(sign in each["reason"] for sign in OTHER_BOARDS)]
+    told = [{"what": each["reader"], "why": each["reason"]} for each in unmeasured if each["reader"] not in others]
+    if others:
+        why = "this machine does not have them; vlatool telemetry says more"
+        told.append({"what": ", ".join(sorted(others)), "why": why})
+    return told

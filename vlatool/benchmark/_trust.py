@@ -19,6 +19,10 @@ LATER = 0.05
 FEWEST = 40
 GROWTH_MB = 5.0
 GROWTH = 0.05
+BUSY, BUSY_SHARE = 0.15, 0.1
+"""Processors that may be busy before the run: so many, and so many more for each that there is."""
+GOLDEN = 1e-2
+"""Relative difference of the golden action that another processor's rounding explains in int8."""
 
 
 def findings(found: Mapping[str, Any], duration_is_sustained: bool = False) -> tuple[Finding, ...]:
@@ -30,13 +34,15 @@ def findings(found: Mapping[str, Any], duration_is_sustained: bool = False) -> t
     """
     seen = [
         *_answers(found["policies"]),
+        *_golden(found["policies"]),
+        *_threads(found),
         *busy(found.get("host") or {}),
         *_contended(found),
         *_clock(found, duration_is_sustained),
-        *_later(found["policies"], duration_is_sustained),
+        *_later(found, duration_is_sustained),
         *_memory(found),
         *_governor(found.get("host") or {}),
-        *_full(found["policies"]),
+        *_full(found),
     ]
     order = ("invalid", "suspect", "note")
     return tuple(sorted(seen, key=lambda each: order.index(each.effect)))
@@ -64,18 +70,50 @@ def _answers(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
                 "invalid",
                 f"{policy['name']} takes {memory['ratio']:.2f} times as long for observations that it has not seen "
                 f"(at least {memory['low']:.2f} times; allowed {REMEMBERS:g}): it answers repeated ones from memory",
-                "measure without the cache, or with --no-check if a robot's observations do repeat",
+                "measure without the cache, or with --no-answers if a robot's observations do repeat",
             )
 
 
 def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
-    """Tell of other work before the run: the load average says more than this process can have caused."""
-    load, cores = host.get("load_average"), host.get("cores")
-    if load and cores and load[0] > max(1.5, 0.75 * cores):
+    """Tell of other work right before the run."""
+    taken, cores = host.get("processors_busy"), host.get("cores_online") or 1
+    if taken is not None and taken > BUSY + BUSY_SHARE * cores:
         yield Finding(
             "suspect",
-            f"this host was busy (load {load[0]:.1f} on {cores} cores): the latencies are those of a contended machine",
+            f"other work kept {taken:.1f} of {cores} processors busy: the latencies are those of a contended machine",
             "repeat on an idle machine; ratios within the run still compare, absolute values do not",
+        )
+
+
+def _golden(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+    for policy in policies:
+        error = policy.get("golden_error")
+        if error is not None and error > GOLDEN:
+            yield Finding(
+                "suspect",
+                f"the golden action of {policy['name']} is off by {error:.2g} (relative) on this machine",
+                "see what its engine and processor compute in: vlatool explain, vlatool doctor",
+            )
+        if policy.get("engines") and policy.get("answers") is None:
+            yield Finding("note", f"the answers of {policy['name']} were not looked at (--no-answers)")
+
+
+def _crowded(found: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the threads of the engine, and the processors that they share."""
+    job, host = found.get("job") or {}, found.get("host") or {}
+    limits = job.get("limits") or {}
+    usable = int(host.get("cores") or 1)
+    pinned = len(limits.get("cpus") or ()) or usable
+    return int(job.get("threads") or 1), min(usable, pinned, int(limits.get("cores") or usable))
+
+
+def _threads(found: Mapping[str, Any]) -> Iterator[Finding]:
+    threads, processors = _crowded(found)
+    if threads > processors:
+        yield Finding(
+            "suspect",
+            f"{threads} threads share {processors} processor{'s' if processors > 1 else ''}: they wait for each other",
+            f"--threads {processors}, or fewer",
         )
 
 
@@ -85,7 +123,8 @@ def _contended(found: Mapping[str, Any]) -> Iterator[Finding]:
     stolen = counters.get("process.machine_steal")
     cores = (found.get("host") or {}).get("cores") or 1
     switches = float(found["switches"]) / wall
-    if switches > SWITCHES_A_SECOND:
+    threads, processors = _crowded(found)
+    if switches > SWITCHES_A_SECOND and threads <= processors:
         yield Finding(
             "suspect",
             f"other work took the processor from the measurement {switches:.0f} times in a second",
@@ -121,8 +160,9 @@ def _clock(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
         )
 
 
-def _later(policies: Sequence[Mapping[str, Any]], sustained: bool) -> Iterator[Finding]:
-    for policy in policies:
+def _later(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
+    paced = bool((found.get("job") or {}).get("rate"))
+    for policy in found["policies"]:
         samples = [value for block in policy["blocks_ms"] for value in block]
         quarter = len(samples) // 4
         if quarter < FEWEST or sustained:
@@ -133,7 +173,7 @@ def _later(policies: Sequence[Mapping[str, Any]], sustained: bool) -> Iterator[F
             yield Finding(
                 "suspect",
                 f"the last quarter of {policy['name']} was {abs(last / first - 1):.0%} {word} than the first",
-                "warm up longer (--warmup), or see how it goes on: --sustained 600",
+                f"warm up longer (--warmup), or see how it goes on: {'--duration' if paced else '--sustained'} 600",
             )
 
 
@@ -152,9 +192,10 @@ def _memory(found: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _full(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
-    for policy in policies:
-        if len(policy["at_s"]) == MOST:
+def _full(found: Mapping[str, Any]) -> Iterator[Finding]:
+    asked = (found.get("job") or {}).get("iterations", MOST)
+    for policy in found["policies"]:
+        if len(policy["at_s"]) == MOST > asked:
             yield Finding("note", f"{policy['name']} ended after {MOST:,} calls: every one of them is kept")
 
 

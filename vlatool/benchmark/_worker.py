@@ -21,9 +21,9 @@ from typing import Any
 from vlatool.benchmark._answers import expected_answers, remembered
 from vlatool.benchmark._canary import canary_ms
 from vlatool.benchmark._child import answer
-from vlatool.benchmark._contest import Contestant, Tell, run_interleaved, unique_names
+from vlatool.benchmark._contest import BLOCKS, Contestant, Tell, run_interleaved, unique_names
 from vlatool.benchmark._job import Job
-from vlatool.benchmark._memory import peak_rss_mb
+from vlatool.benchmark._limited import die_with_parent
 from vlatool.benchmark._paced import run_paced
 from vlatool.benchmark._phases import time_phases
 from vlatool.bundle import Bundle
@@ -39,17 +39,23 @@ EXTRA_S = 3.0
 
 def main() -> dict[str, Any]:
     """Run the job that standard input names."""
+    die_with_parent()
     job = Job.from_dict(json.loads(sys.stdin.readline()))
 
     def wait() -> None:
         _say({"ready": os.getpid()})
-        sys.stdin.readline()
+        _await()
 
     def timed() -> None:
         _say({"timed": True})
-        sys.stdin.readline()
+        _await()
 
     return {"result": run_job(job, lambda what, share: _say({"progress": [what, share]}), wait, timed)}
+
+
+def _await() -> None:
+    if not sys.stdin.readline():
+        raise SystemExit("whoever started the measurement has gone")
 
 
 def _say(line: dict[str, Any]) -> None:
@@ -104,17 +110,19 @@ def measure(
     paced = None
     if job.rate:
         only = contestants[0]
-        canaries.append(canary_ms())
         ticks = max(job.iterations, round(job.duration * job.rate))
-        seen = run_paced(only.policy, only.observations, job.rate, ticks, only.answers, tell)
+
+        def between(share: float) -> None:
+            if share * BLOCKS >= len(canaries):
+                canaries.append(canary_ms())
+
+        seen = run_paced(only.policy, only.observations, job.rate, ticks, only.answers, tell, between=between)
         only.blocks, only.starts, paced = [seen.response_ms], seen.due_s, seen.to_dict()
-        canaries.append(canary_ms())
     else:
         run_interleaved(contestants, job.iterations, 0, tell, job.duration, lambda: canaries.append(canary_ms()))
     ended = time.monotonic()
     found: dict[str, Any] = {"begun_s": begun, "ended_s": ended, "canary_ms": canaries, **_used(before, _usage())}
     timed()
-    found["peak_rss_mb"] = peak_rss_mb()
     found["policies"] = [_policy(each, job, begun, tell) for each in contestants]
     found["policies"][0]["paced"] = paced
     return found

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field, PrivateAttr
 
 from vlatool.benchmark import _agent
+from vlatool.benchmark._contest import MOST
 from vlatool.benchmark._job import Job, Limits
 from vlatool.benchmark._rows import measurements, raw, samples_of, sustained, tables
 from vlatool.benchmark._trust import findings, validity
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 COLD_STARTS = 3
+CALLS, FEWEST_TICKS = 200, 20
 HERE = "this host"
 
 
@@ -41,12 +43,14 @@ class Latency(Measure):
     remotely: ClassVar[bool] = True
 
     against: tuple[Path, ...] = Field((), description="further bundles, measured in the same run; compared with BUNDLE")
-    iterations: int = Field(200, ge=20, description="inferences of each policy, at least")
-    duration: float = Field(10.0, ge=0, le=86_400, description="seconds that each is timed for, at least")
+    iterations: int | None = Field(
+        None, ge=20, le=MOST, description="inferences of each policy, at least; 200, and with --rate 20, if unset"
+    )
+    duration: float = Field(10.0, ge=0, le=86_400, description="seconds that each policy is timed for, at least")
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
     rate: float = Field(0.0, ge=0, le=10_000, description="pace of a control loop in Hz; back to back when 0")
     sustained: float = Field(
-        0.0, ge=0, le=86_400, description="run so many seconds, and compare their end with the start"
+        0.0, ge=0, le=86_400, description="run each so many seconds, and compare their end with the start"
     )
     threads: int = Field(1, ge=1, description="intra-op threads")
     pin: str = Field("", description="processors to run on, such as 0-3 or 2,4; all when empty")
@@ -78,6 +82,11 @@ class Latency(Measure):
                 raise UsageError(f"--{name.replace('_', '-')} is {getattr(self, name)}; allowed: a number from 0.")
         if self.rate and self.against:
             raise UsageError("--rate paces one policy; measure the further ones in runs of their own.")
+        if self.rate * self.duration > MOST:
+            raise UsageError(
+                f"--rate {self.rate:g} for {self.duration:g} s are {self.rate * self.duration:,.0f} ticks; "
+                f"allowed: {MOST:,}, each of which is kept."
+            )
         if self.sustained and self.rate:
             raise UsageError("--sustained calls back to back; with --rate pass --duration.")
         if self.emulate and profile is None:
@@ -126,7 +135,7 @@ class Latency(Measure):
             bundles=tuple(str(bundle.path.resolve()) for bundle in bundles),
             engine=self.engine,
             threads=self.threads,
-            iterations=self.iterations,
+            iterations=self.iterations or (FEWEST_TICKS if self.rate else CALLS),
             duration=max(self.duration, self.sustained),
             warmup=self.warmup,
             rate=self.rate,
@@ -152,7 +161,7 @@ class Latency(Measure):
             role = "baseline" if policy is policies[0] and not alone else "subject"
             placed = tuple(replace(each, where=where) for each in measured)
             rows.append(Row(policy["name"], role, measurements=placed, raw=raw(found, policy, alone), details=told))
-        seen = (*findings(found, bool(self.sustained)), *self._limited(host))
+        seen = (*findings(found, bool(self.sustained)), *self._limited(host, where))
         valid = validity(seen)
         return Report(
             "benchmark",
@@ -161,7 +170,7 @@ class Latency(Measure):
             summary=(self._sentence(rows, host, valid, seen),),
             rows=tuple(rows),
             limits={"hz": self.rate} if self.rate else {},
-            environment={**host, **({"target": found["target"]} if "target" in found else {})},
+            environment={**host, "run": self._told(), **({"target": found["target"]} if "target" in found else {})},
             validity=valid,
             findings=seen,
         )
@@ -181,17 +190,24 @@ class Latency(Measure):
             told += f"its action, on {where}"
         return told + "."
 
-    def _limited(self, host: Mapping[str, Any]) -> list[Finding]:
+    def _told(self) -> dict[str, Any]:
+        """Return how it was measured, for the environment of the report: what makes two reports differ."""
+        told = {"threads": self.threads, "rate_hz": self.rate, "pin": self.pin, "cores": self.cores,
+                "memory_limit_mb": self.memory_mb, "emulates": self._board}  # fmt: skip
+        return {name: value for name, value in told.items() if value}
+
+    def _limited(self, host: Mapping[str, Any], where: str) -> list[Finding]:
         if not (self.cores or self.memory_mb):
             return []
-        name = self._board or "these limits"
-        what = [f"{self.cores} processors"] * bool(self.cores) + [f"{self.memory_mb:,.0f} MB"] * bool(self.memory_mb)
-        told = [Finding("note", f"emulation: limited to {' and '.join(what)} ({name}); the speed is that of this host")]
-        if self.cores > (host.get("cores") or self.cores):
-            told.append(
-                Finding("suspect", f"{name} has {self.cores} processors, this host {host['cores']}",
-                        "measure on a host with as many")
-            )  # fmt: skip
+        usable = int(host.get("cores") or self.cores)
+        what = [f"{min(self.cores, usable)} processors"] * bool(self.cores)
+        what += [f"{self.memory_mb:,.0f} MB of memory"] * bool(self.memory_mb)
+        board = f" as {self._board}" if self._board else ""
+        told = [Finding("note", f"emulation{board}: {' and '.join(what)}; the speed is that of {where.split(',')[0]}")]
+        if self.cores > usable:
+            effect = "suspect" if self.threads > usable else "note"
+            lacks = f"{self._board or 'the limit'} has {self.cores} processors, and this machine {usable}"
+            told.append(Finding(effect, lacks, "measure on a machine with as many"))
         return told
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from typing import Annotated, Any
 
 import typer
@@ -76,11 +78,24 @@ app.add_typer(profiles, name="profiles")
 app.add_typer(samples, name="samples")
 
 
+def _end_on_signals() -> None:
+    """Let SIGTERM and SIGHUP end the program as Ctrl-C does: what it started is ended, what it began is removed."""
+
+    def end(number: int, _frame: object) -> None:
+        sys.exit(128 + number)
+
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
+                signal.signal(getattr(signal, name), end)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit.
 
     0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
     """
+    _end_on_signals()
     try:
         with plain_warnings():
             code = app(arguments, standalone_mode=False) or 0
@@ -98,7 +113,8 @@ def main(arguments: list[str] | None = None) -> None:
             typer.echo(f"  fix: {error.fix}", err=True)
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        typer.echo("interrupted; finished stages are kept", err=True)
+        kept = "; finished stages are kept" if set(sys.argv[1:2]) & {"optimize", "export", "quantize"} else ""
+        typer.echo(f"interrupted{kept}", err=True)
         sys.exit(INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

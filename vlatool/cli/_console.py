@@ -64,7 +64,8 @@ def _plain_lines() -> Tell:
         kind = re.sub(r"[\d.,%]+", "", what)
         if kind != last[0]:
             last[0] = kind
-            typer.echo(f"... {what}", err=True)
+            with contextlib.suppress(OSError):  # nobody reads it any more: no reason to stop
+                typer.echo(f"... {what}", err=True)
 
     return tell
 
@@ -95,12 +96,24 @@ def refuse_existing(out: Path | None, force: bool) -> None:
     Raises:
         OutputError: when it does and --force was not given, or when it is a directory that vlatool did not write.
     """
-    if out is None or not os.path.exists(out):
+    if out is None:
+        return
+    if not os.path.exists(out):
+        _refuse_unwritable(out)
         return
     if not force:
         raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
     if out.is_dir() and any(out.iterdir()) and not any((out / name).exists() for name in OURS):
         raise OutputError(f"{out} was not written by vlatool, so --force does not replace it.", "remove it yourself")
+
+
+def _refuse_unwritable(out: Path) -> None:
+    """Refuse a place in which no directory can be made."""
+    above = next(each for each in out.absolute().parents if each.exists())
+    if not above.is_dir():
+        raise OutputError(f"{out} cannot be written: {above} is no directory.", "choose another output")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise OutputError(f"{out} cannot be written: {above} does not let this user write.", "choose another output")
 
 
 def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False) -> None:
@@ -114,10 +127,10 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
 
     now = datetime.now(timezone.utc).isoformat(timespec="seconds")
     report = replace(report, command=report.command or command_line(), created=report.created or now)
+    emit(report.to_json() if as_json else terminal_text(report))  # first, so that a full disk does not lose it
     if out is not None:
         with writing(out, force=force) as draft:
             write_reports(report, draft)
-    emit(report.to_json() if as_json else terminal_text(report))
     if out is not None and not as_json:
         emit(f"report: {out / 'report.html'}\n")
     leave(report)

@@ -113,9 +113,13 @@ def opened(source: str, context: Context) -> Bundle:
 
 REMOTE_FLAGS = (
     _flag(
-        "target", str, "", "--target", help="run on this machine, through ssh: user@host, or a Host of your ssh config"
+        "target",
+        str | None,
+        None,
+        "--target",
+        help="run there, through ssh: user@host, or a Host of your ssh config",
     ),
-    _flag("remote_python", str, "", "--remote-python", help="Python of the target, such as ~/venv/bin/python"),
+    _flag("remote_python", str | None, None, "--remote-python", help="Python of the target, such as ~/venv/bin/python"),
 )
 
 
@@ -127,11 +131,11 @@ def measure(
     workers: int | None,
     force: bool,
     as_json: bool,
-    target: str = "",
-    remote_python: str = "",
+    target: str | None = None,
+    remote_python: str | None = None,
 ) -> None:
     """Measure a bundle, or a policy that is exported first; here, or on a target."""
-    if remote_python and not target:
+    if remote_python is not None and target is None:
         raise UsageError("--remote-python is the Python of a target.", "name it: --target user@host")
     refuse_existing(out, force)
     board = None
@@ -142,10 +146,10 @@ def measure(
     with progress(workers or default_workers()) as context:
         bundle = opened(source, context)
         stage.check(bundle, board)
-        if target:
+        if target is not None:
             from vlatool.launch.ssh import measure_on
 
-            context = replace(context, elsewhere=partial(measure_on, target, python=remote_python))
+            context = replace(context, elsewhere=partial(measure_on, target, python=remote_python or ""))
         report = (stage if board is None else stage.on(board)).run(bundle, context)
     if board is not None:
         report = with_predictions(report, board, bundle)

@@ -14,6 +14,7 @@ from vlatool.report import REPORT, VALIDITIES, Finding, Measurement, Report, Row
 COMPARABLE = ("benchmark", "optimize", "evaluate", "compare")
 MACHINE = ("cpu", "architecture", "board", "cores", "cpu_quota")
 CLOCKS = ("governor", "clock_min_mhz", "clock_max_mhz", "turbo")
+RUN = ("rate_hz", "pin", "cores", "memory_limit_mb")
 ENGINES = ("onnxruntime", "onnxruntime-gpu", "onnxruntime-openvino", "openvino", "tensorrt", "torch")
 APART = "against {name}; the two runs were not interleaved"
 HERE = "this host"
@@ -97,19 +98,23 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 def differences(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
     """Return what makes the reports hard to compare: other machine, engine, threads or clocks."""
     machines, clocks = ([_facts(each, keys) for each in reports] for keys in (MACHINE, CLOCKS))
+    runs = [_run(each) for each in reports]
     groups = (
         ("The machines differ", "repeat the runs on one machine", machines),
         ("The versions differ", "measure again with the same versions", [_versions(each) for each in reports]),
         ("The numbers of threads differ", "measure with the same --threads", [_threads(each) for each in reports]),
         ("The clocks were set differently", "set the same governor and clocks", clocks),
+        ("The runs differ", "measure with the same --rate, --pin and limits", runs),
+        ("The engines differ", "that may be what is compared; else measure with the same --engine", _engines(reports)),
     )
     found = []
     for what, remedy, facts in groups:
         keys = dict.fromkeys(key for each in facts for key in each)
         told = [text for key in keys if (text := _differs(key, labels, facts))]
         if told:
-            how = f"{remedy}, or compare the bundles themselves"
-            found.append(Finding("suspect", f"{what}: {'; '.join(told)}", how))
+            engines = "engines" in what
+            how = remedy if engines else f"{remedy}, or compare the bundles themselves"
+            found.append(Finding("note" if engines else "suspect", f"{what}: {'; '.join(told)}", how))
     return found
 
 
@@ -147,14 +152,32 @@ def _versions(report: Report) -> dict[str, Any]:
     return {name: versions.get(name) for name in ENGINES} if isinstance(versions, Mapping) else {}
 
 
+def _run(report: Report) -> dict[str, Any]:
+    """Return how a report was measured; 0 for what was not asked for, so that it differs from what was."""
+    told = report.environment.get("run")
+    return {key: told.get(key, 0) for key in RUN} if isinstance(told, Mapping) else {}
+
+
+def _engines(reports: Sequence[Report]) -> list[dict[str, Any]]:
+    """Return the engines of each report; what is compared within one report is no difference between several."""
+    used = [
+        sorted({str(record["engine"]) for row in report.rows for record in row.details.get("engine", ())})
+        for report in reports
+    ]
+    return [{"engine": ", ".join(each)} if each else {} for each in used]
+
+
 def _threads(report: Report) -> dict[str, Any]:
+    run = report.environment.get("run")
+    if isinstance(run, Mapping) and run.get("threads") is not None:
+        return {"threads": run["threads"]}
     told = [record.get("threads") for row in report.rows for record in row.details.get("engine", ())]
     known = {threads for threads in told or [report.environment.get("threads")] if threads is not None}
     return {"threads": sorted(known, key=str)} if known else {}
 
 
 def _machine(report: Report) -> str:
-    return str(_facts(report, MACHINE))
+    return str(_facts(report, MACHINE)) + str(_run(report).get("rate_hz", 0))
 
 
 def _measured(report: Report) -> set[str]:

@@ -227,6 +227,8 @@ def full(measurement: Measurement) -> str:
 
 def limit(name: str, wanted: Any) -> tuple[str, str]:
     """Return a limit's name as words and its value with the unit that ends the name."""
+    if name == "hz":
+        return "rate", f"{cell(wanted)} Hz"
     words, _, last = name.rpartition("_")
     if words and last in LIMIT_UNITS:
         unit = "point" if last == "points" and wanted == 1 else LIMIT_UNITS[last]
@@ -241,7 +243,8 @@ def cell(content: Any) -> str:
     if isinstance(content, bool):
         return "yes" if content else "no"
     if isinstance(content, float):
-        return "–" if math.isnan(content) else f"{content:.4g}".replace("-", MINUS)
+        whole = 1e4 <= abs(content) < 1e7
+        return "–" if math.isnan(content) else (f"{content:,.0f}" if whole else f"{content:.4g}").replace("-", MINUS)
     if isinstance(content, list | tuple):
         return ", ".join(cell(item) for item in content)
     return plain(content)

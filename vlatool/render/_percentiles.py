@@ -25,6 +25,7 @@ class Percentiles:
         reasons: By percentile and variant: why it could not be had.
         bound: What the bounds are, as a column title: ``at most (99 %)``.
         counts: For each variant, the number of calls.
+        what: What is counted: ``calls``, or the ``ticks`` of a control loop.
     """
 
     names: list[str]
@@ -34,6 +35,7 @@ class Percentiles:
     reasons: list[list[str]]
     bound: str
     counts: list[str]
+    what: str = "calls"
 
     @property
     def bounded(self) -> bool:
@@ -55,7 +57,7 @@ class Percentiles:
     def about(self) -> str:
         """Return the number of calls in a sentence."""
         if len(set(self.counts)) == 1:
-            return f"{self.counts[0]} calls each." if len(self.counts) > 1 else f"{self.counts[0]} calls."
+            return f"{self.counts[0]} {self.what}{' each' if len(self.counts) > 1 else ''}."
         told = [f"{name} {number}" for name, number in zip(self.variants, self.counts, strict=True) if number]
         return f"Calls: {', '.join(told)}." if told else ""
 
@@ -77,6 +79,7 @@ def percentiles(report: Report) -> Percentiles | None:
         [[plain(item.note) if item is not None and not item.known else "" for item in line] for line in items],
         _title(flat),
         [_count([line[place] for line in items]) for place in range(len(rows))],
+        "ticks" if report.kind == "benchmark" and "hz" in report.limits else "calls",
     )
 
 

@@ -70,7 +70,7 @@ def headline(report: Report) -> list[str]:
     """Return the names of the few measured numbers that decide."""
     present = names(report)
     accuracy = ["success", "success_drop"] if "success" in present else [*ACCURACY[1:], *ERRORS]
-    wanted = ["latency_p50", "speedup", *accuracy, "size", "peak_rss"]
+    wanted = ["latency_p50", "deadline_misses", "speedup", *accuracy, "size", "peak_rss"]
     return [name for name in wanted if name in present]
 
 

@@ -97,7 +97,7 @@ def _head(report: Report) -> list[str]:
     blocks += _trust(report)
     if report.limits:
         asked = ", ".join(" ".join(limit(name, wanted)) for name, wanted in report.limits.items())
-        blocks.append(f"Limits asked for: {inline(asked)}")
+        blocks.append(f"Asked for: {inline(asked)}")
     return blocks
 
 

@@ -117,7 +117,7 @@ class TerminalRenderer:
         about = " · ".join(part for part in (report.title if report.summary else "", report.created) if part)
         lines += self._wrapped(about, indent, style="dim")
         asked = ", ".join(" ".join(limit(name, wanted)) for name, wanted in report.limits.items())
-        return lines + (self._wrapped(asked, "Limits asked for: ", "  ") if asked else [])
+        return lines + (self._wrapped(asked, "Asked for: ", "  ") if asked else [])
 
     def _trust(self, report: Report, indent: str) -> list[Text]:
         """Return whether the measurement can be trusted, each reason, and its remedy below."""
