@@ -58,9 +58,10 @@ def main() -> int:
         for which in ("bare", "whole") if number % 2 else ("whole", "bare"):
             found[which] = bare(graph, feeds, given.seconds) if which == "bare" else whole(given.bundle, given.seconds)
         for name in ratios:
-            ratios[name].append(found["whole"][name] / found["bare"][name])
-        print(", ".join(f"{name} {values[-1]:.3f}" for name, values in ratios.items()), flush=True)
-    print("middle: " + ", ".join(f"{name} {median(values):.3f}" for name, values in ratios.items()))
+            if found["whole"][name] is not None:  # a percentile without a bound is not given
+                ratios[name].append(found["whole"][name] / found["bare"][name])
+        print(", ".join(f"{name} {values[-1]:.3f}" for name, values in ratios.items() if values), flush=True)
+    print("middle: " + ", ".join(f"{name} {median(values):.3f}" for name, values in ratios.items() if values))
     return 0
 
 
