@@ -192,3 +192,32 @@ def test_the_front_of_reports_is_drawn_over_memory(vlatool, tmp_path):
 def test_names_are_the_shortest_that_differ(paths, names, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert short_names([Path(path) for path in paths]) == [name.format(here=tmp_path.name) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "said", "speedup"),
+    [
+        ({"threads": 1}, {"threads": 2}, "threads 1 (a), 2 (b)", True),
+        ({"threads": 1}, {"threads": 1, "rate_hz": 50.0}, "rate hz none (a), 50.0 (b)", False),
+        ({"threads": 1, "pin": "0"}, {"threads": 1}, "pin 0 (a), none (b)", True),
+        ({"threads": 1}, {"threads": 1, "memory_limit_mb": 500.0}, "memory limit mb none (a), 500.0 (b)", True),
+        ({"threads": 1}, {"threads": 1}, "", True),
+    ],
+)
+def test_runs_that_were_made_in_other_ways_are_told_apart(compared, mine, theirs, said, speedup):
+    one, other = (replace(made(), environment=host(run=run)) for run in (mine, theirs))
+    code, report, _ = compared(one, other)
+    assert code == 0
+    assert [said in each.reason for each in report.findings] == ([True] if said else [])
+    assert (report.rows[1].get("speedup") is not None) == speedup
+
+
+def test_other_engines_are_noted_and_compared(compared):
+    other = made(5.0)
+    row = replace(other.rows[0], details={"engine": [{"engine": "openvino", "threads": 1}]})
+    _, report, _ = compared(made(10.0), replace(other, rows=(row,)))
+    assert [(each.effect, "engine ort_cpu (a), openvino (b)" in each.reason) for each in report.findings] == [
+        ("note", True)
+    ]
+    assert report.validity == "valid"
+    assert report.rows[1].value("speedup") == 2.0

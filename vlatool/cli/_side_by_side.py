@@ -153,9 +153,9 @@ def _versions(report: Report) -> dict[str, Any]:
 
 
 def _run(report: Report) -> dict[str, Any]:
-    """Return how a report was measured; 0 for what was not asked for, so that it differs from what was."""
+    """Return how a report was measured; ``none`` for what was not asked for, so that it differs from what was."""
     told = report.environment.get("run")
-    return {key: told.get(key, 0) for key in RUN} if isinstance(told, Mapping) else {}
+    return {key: told.get(key, "none") for key in RUN} if isinstance(told, Mapping) else {}
 
 
 def _engines(reports: Sequence[Report]) -> list[dict[str, Any]]:
@@ -177,7 +177,7 @@ def _threads(report: Report) -> dict[str, Any]:
 
 
 def _machine(report: Report) -> str:
-    return str(_facts(report, MACHINE)) + str(_run(report).get("rate_hz", 0))
+    return str(_facts(report, MACHINE)) + str(_run(report).get("rate_hz", "none"))
 
 
 def _measured(report: Report) -> set[str]:
