@@ -74,7 +74,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_measurement(vlatoo
     (tmp_path / "file").write_text("")
     code, out, error = vlatool("benchmark", float_bundle.path, *QUICK, "-o", tmp_path / below)
     assert (code, out) == (3, "")
-    assert "is no directory" in error
+    assert "a part of the path is a file" in error
 
 
 def test_json_is_all_that_is_on_stdout(vlatool, float_bundle):

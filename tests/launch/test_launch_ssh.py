@@ -519,18 +519,8 @@ def test_a_target_that_takes_nothing(there, large, monkeypatch):
     os.kill(bootstraps(there)[0], signal.SIGCONT)
 
 
-def test_an_interrupt_ends_the_run_there(there, bundle):
-    def tell(what: str, _share: float | None) -> None:
-        if what == "waiting":
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        there.measure(bundle, do="wait", tell=tell)
-    assert there.processes() == []
-    assert not any(child.name() == "ssh" for child in psutil.Process().children())
-
-
-def test_a_killed_command_ends_the_run_there(there, bundle, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_command_that_is_ended_ends_the_run_there(there, bundle, tmp_path, number):
     code = f"""
     import sys
     from pathlib import Path
@@ -541,11 +531,13 @@ def test_a_killed_command_ends_the_run_there(there, bundle, tmp_path):
                    ssh_options={there.server.options()!r})
     """
     command = [sys.executable, "-c", textwrap.dedent(code)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as local:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as local:
         assert local.stdout is not None
         assert "waiting\n" in iter(local.stdout.readline, "")
         until(lambda: there.processes("sleep 600"), "the process of the agent")
-        local.kill()
+        local.send_signal(number)
+        error = local.communicate(timeout=30)[1]
+    assert ("KeyboardInterrupt" in error) == (number == signal.SIGINT)
     there.check()
 
 

@@ -48,7 +48,6 @@ def cold_start(bundle: Path, engine: str, threads: int, limits: Limits = Limits(
 
 def main(arguments: list[str]) -> dict[str, Any]:
     """Load and run in this process."""
-    die_with_parent()
     begun = time.monotonic_ns()  # the same clock in every process of a machine
     rss = {"interpreter": resident_mb()}
     from vlatool.bundle import Bundle
@@ -105,4 +104,5 @@ def _import_engine(name: str) -> None:
 
 
 if __name__ == "__main__":
+    die_with_parent()
     answer(lambda: main(sys.argv[1:]))

@@ -111,9 +111,9 @@ def _refuse_unwritable(out: Path) -> None:
     """Refuse a place in which no directory can be made."""
     above = next(each for each in out.absolute().parents if each.exists())
     if not above.is_dir():
-        raise OutputError(f"{out} cannot be written: {above} is no directory.", "choose another output")
+        raise OutputError(f"Cannot write {out}: a part of the path is a file ({above}).", "choose another output")
     if not os.access(above, os.W_OK | os.X_OK):
-        raise OutputError(f"{out} cannot be written: {above} does not let this user write.", "choose another output")
+        raise OutputError(f"Cannot write {out}: this user may not write to {above}.", "choose another output")
 
 
 def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False) -> None:
