@@ -320,3 +320,15 @@ def test_options_that_make_no_sense_are_refused(float_bundle, options, told):
 @pytest.mark.parametrize(("text", "wanted"), [("", ()), ("0", (0,)), ("0-2,5", (0, 1, 2, 5)), ("3,3,1", (1, 3))])
 def test_processors_are_read_as_lists_of_ranges(text, wanted):
     assert processors(text) == wanted
+
+
+def test_what_the_engine_logs_is_kept(float_bundle):
+    from vlatool.benchmark._agent import measure
+    from vlatool.benchmark._job import Job
+
+    def elsewhere(job, bundles, tell):
+        return {**measure(Job.from_dict(job), tell), "log": "".join(f"warning {number}\n" for number in range(50))}
+
+    lines = benchmarked(float_bundle, Context(elsewhere=elsewhere)).rows[0].details["log"]
+    assert [line["line"] for line in lines] == [f"warning {number}" for number in range(10, 50)]
+    assert "log" not in benchmarked(float_bundle).rows[0].details

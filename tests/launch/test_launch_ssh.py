@@ -194,6 +194,7 @@ def test_the_result_comes_back_with_what_the_target_is_and_not_who(there, bundle
     assert found["files"][1] == ["empty", "graphs/main.onnx", "manifest.json"]
     assert found["names"] == ["my_bundle", "large", "my_bundle"]
     assert found["private"] == "0o700"
+    assert "and one on standard error" in found["log"]
     assert found["target"] == {
         "python": platform.python_version(),
         "architecture": platform.machine(),

@@ -31,6 +31,7 @@ from vlatool.telemetry import Absent, Recorded, Recorder, open_all
 from vlatool.telemetry.process import ProcessReader
 
 PERIOD_S = 0.2
+LOG_CHARACTERS = 4000
 WORKER = "vlatool.benchmark._worker"
 
 
@@ -39,7 +40,8 @@ def measure(job: Job, tell: Tell) -> dict[str, Any]:
 
     Returns:
         JSON values: ``job``, ``host`` (with ``processors_busy`` before the run), ``begun_s``, ``ended_s``,
-        ``canary_ms``, ``cpu_s``, ``wall_s``, ``switches``, ``policies`` (one for each bundle) and ``telemetry``.
+        ``canary_ms``, ``cpu_s``, ``wall_s``, ``switches``, ``policies`` (one for each bundle), ``telemetry`` and
+        ``log``, the end of what the worker wrote to standard error.
 
     Raises:
         VlatoolError: what a bundle raises; GraphError when a process ends; GateFailed when it needs more memory than
@@ -85,7 +87,7 @@ def _fits(start: Mapping[str, Any], limits: Limits) -> None:
 def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
     about = ", ".join(job.bundles)
     with (
-        tempfile.TemporaryFile("w+") as log,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log,
         _started(command(limits, WORKER), log) as worker,
         contextlib.ExitStack() as recording,
     ):
@@ -104,12 +106,18 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
                 _answer(worker)
             elif "result" in line:
                 found: dict[str, Any] = line["result"]
-                return {**found, "telemetry": plain(recorder.recorded) if recorder else None}
+                told = plain(recorder.recorded) if recorder else None
+                return {**found, "telemetry": told, "log": _end_of(log)}
             else:
                 raise_said(line, limits)
         code = worker.wait()
-        log.seek(0)
-        raise ended(about, code, log.read(), limits, "while it was measured")
+        raise ended(about, code, _end_of(log), limits, "while it was measured")
+
+
+def _end_of(log: IO[str]) -> str:
+    """Return the last characters that the worker wrote to standard error."""
+    log.seek(0)
+    return log.read()[-LOG_CHARACTERS:]
 
 
 def _answer(worker: subprocess.Popen[str], line: str = "") -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 COLD_STARTS = 3
+LOG_LINES = 40
 CALLS, FEWEST_TICKS = 200, 20
 HERE = "this host"
 
@@ -158,6 +159,8 @@ class Latency(Measure):
             if bundle.manifest.graphs:
                 measured.append(Measurement("size", _graph_bytes(bundle) / 1e6, "MB", note="graphs on disk"))
             told = tables(found, policy, alone) | _work(bundle, policy["engine"])
+            if policy is policies[0] and (lines := found.get("log", "").strip().splitlines()):
+                told["log"] = [{"line": line} for line in lines[-LOG_LINES:]]
             role = "baseline" if policy is policies[0] and not alone else "subject"
             placed = tuple(replace(each, where=where) for each in measured)
             rows.append(Row(policy["name"], role, measurements=placed, raw=raw(found, policy, alone), details=told))

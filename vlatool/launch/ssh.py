@@ -57,7 +57,8 @@ def measure_on(
         connect_timeout_s: For ssh to connect.
 
     Returns:
-        The agent's result and ``target``: python, architecture, kernel and packages there; no host, user or address.
+        The agent's result, ``target``: python, architecture, kernel and packages there; no host, user or address; and
+        ``log``: the end of what the processes wrote to standard error.
 
     Raises:
         TargetError: when the target cannot be reached or used, or what runs there ends without a result.
@@ -218,7 +219,8 @@ def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) ->
         raise TargetError(
             f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}"
         )
-    return dict(answer["result"])
+    result = dict(answer["result"])
+    return {**result, "log": f"{ended['log']}{result.get('log', '')}"}
 
 
 def _name(code: int) -> str:
