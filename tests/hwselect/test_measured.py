@@ -89,6 +89,17 @@ def test_what_cannot_calibrate_says_why(report: Callable[..., Path], settings: d
     assert "--bundle" in caught.value.fix
 
 
+@pytest.mark.parametrize(
+    ("run", "why"),
+    [({"rate_hz": 50.0}, "it was paced"), ({"emulates": PI.name}, "it emulates raspberry-pi-5 on another")],
+)
+def test_a_run_that_was_paced_or_emulated_calibrates_nothing(report: Callable[..., Path], run: Any, why: str) -> None:
+    file = report() / "report.json"
+    file.write_text(replace(Report.from_json(file.read_text()), environment={"run": run}).to_json())
+    with pytest.raises(DataError, match=why):
+        measured_in(file, PI, None)
+
+
 def test_an_unknown_mode_is_refused(report: Callable[..., Path]) -> None:
     with pytest.raises(ProfileError, match="no power mode '9W'"):
         measured_in(report(), PI, "9W")

@@ -92,7 +92,12 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
     missing = 0
     name = mode or profile.default_mode
     profile.mode(name)
-    for row in read_report(report).rows:
+    told = read_report(report)
+    run = told.environment.get("run")
+    if isinstance(run, dict) and (run.get("rate_hz") or run.get("emulates")):
+        how = "was paced (--rate)" if run.get("rate_hz") else f"emulates {run['emulates']} on another machine"
+        raise DataError(f"{report} cannot calibrate {profile.name}: it {how}.", "measure back to back, on the board")
+    for row in told.rows:
         latency = row.get("latency_p50")
         if latency is None or not latency.known:
             continue
