@@ -103,6 +103,8 @@ def test_a_policy_that_becomes_slower_is_suspect():
     assert "--duration 600" in only(found(policy={"blocks_ms": blocks}, job={"rate": 50.0})).remedy
     assert findings(found(policy={"blocks_ms": blocks}), duration_is_sustained=True) == ()
     assert findings(found(policy={"blocks_ms": [[1.0]] * 15 + [[2.0]] * 5})) == (), "too few to say"
+    several = found(policy={"blocks_ms": blocks})
+    assert findings({**several, "policies": several["policies"] * 2}) == (), "several slow down together"
 
 
 def test_memory_that_grows_is_suspect():

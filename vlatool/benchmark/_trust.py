@@ -161,8 +161,9 @@ def _clock(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
 
 
 def _later(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
+    """Tell of a policy alone that did not settle; several in turns slow down together, and their ratios stand."""
     paced = bool((found.get("job") or {}).get("rate"))
-    for policy in found["policies"]:
+    for policy in found["policies"][:1] if len(found["policies"]) == 1 else ():
         samples = [value for block in policy["blocks_ms"] for value in block]
         quarter = len(samples) // 4
         if quarter < FEWEST or sustained:
