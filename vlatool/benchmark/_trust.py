@@ -12,7 +12,7 @@ from vlatool.benchmark._contest import MOST
 from vlatool.report import Finding
 
 SWITCHES_A_SECOND = 50.0
-"""Involuntary context switches of a process that has its processor for itself: a few in a second."""
+"""Involuntary context switches of a thread that has its processor for itself: a few in a second."""
 STOLEN = 0.01
 LATER = 0.05
 """Share by which the last quarter may be slower than the first."""
@@ -124,7 +124,7 @@ def _contended(found: Mapping[str, Any]) -> Iterator[Finding]:
     cores = (found.get("host") or {}).get("cores") or 1
     switches = float(found["switches"]) / wall
     threads, processors = _crowded(found)
-    if switches > SWITCHES_A_SECOND and threads <= processors:
+    if switches > SWITCHES_A_SECOND * threads and threads <= processors:
         yield Finding(
             "suspect",
             f"other work took the processor from the measurement {switches:.0f} times in a second",

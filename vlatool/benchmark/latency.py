@@ -183,13 +183,13 @@ class Latency(Measure):
             return f"The measurement is invalid: {seen[0].reason}."
         where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
         row, others = rows[0], rows[1:]
-        told = f"{row.name}: {row.value('latency_p50'):.3g} ms median latency on {where}"
+        told = f"{row.name}: {_ms(row)} median latency on {where}"
         for other in others:
-            told += f"; {other.name}: {other.value('latency_p50'):.3g} ms ({other.value('speedup'):.3g}x as fast)"
+            told += f"; {other.name}: {_ms(other)} ({other.value('speedup'):.3g}x as fast)"
         if self.rate:
             misses = row.value("deadline_misses")
             late = f"{misses:.2%} of the ticks are late" if misses else "no tick is late"
-            told = f"{row.name} at {self.rate:g} Hz: {late}, {row.value('latency_p50'):.3g} ms median from the tick to "
+            told = f"{row.name} at {self.rate:g} Hz: {late}, {_ms(row)} median from the tick to "
             told += f"its action, on {where}"
         return told + "."
 
@@ -229,6 +229,12 @@ def processors(text: str) -> tuple[int, ...]:
     if not found:
         raise UsageError(f"--pin is {text!r}, which names no processor; allowed: such as 0-3 or 2,4.")
     return tuple(found)
+
+
+def _ms(row: Row) -> str:
+    """Return the median latency with three digits, or with all before the point."""
+    value = row.value("latency_p50")
+    return f"{value:.3g} ms" if value < 1000 else f"{value:,.0f} ms"
 
 
 def _place(host: Mapping[str, Any]) -> str:
