@@ -152,3 +152,13 @@ def test_a_board_that_throttled_makes_the_measurement_suspect(float_bundle: Bund
     report = run_gate(float_bundle, float_bundle, gate, Context())
     assert (report.verdict, report.validity) == ("pass", "suspect")
     assert "soft temperature limit" in report.findings[0].reason
+
+
+def test_other_work_before_the_gate_is_noted(float_bundle: Bundle, as_fast, monkeypatch) -> None:
+    as_fast(0.0)
+    machine = {"cores_online": 2, "processors_busy": 1.2}
+    monkeypatch.setattr(run_gate_module, "before_run", lambda: machine)
+    report = run_gate(float_bundle, float_bundle, QUICK.model_copy(update={"accuracy": None}), Context())
+    assert [(each.effect, "1.2 of 2 processors" in each.reason) for each in report.findings] == [("note", True)]
+    assert report.validity == "valid"
+    assert report.environment == machine

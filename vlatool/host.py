@@ -233,6 +233,11 @@ def frequency(root: Path = ROOT) -> dict[str, Any]:
     return {"governor": ", ".join(dict.fromkeys(governors)) or None, **clocks, "turbo": turbo}
 
 
+def before_run(root: Path = ROOT) -> dict[str, Any]:
+    """Return the fingerprint and ``processors_busy``: the machine before a measurement loads it."""
+    return {**fingerprint(root), "processors_busy": busy_processors(root)}
+
+
 def busy_processors(root: Path = ROOT, seconds: float = 0.3) -> float | None:
     """Return how many processors were computing meanwhile, waited for; None where nothing tells.
 

@@ -14,7 +14,7 @@ from vlatool.claims._found import Found, worst
 from vlatool.claims._timed import Timed
 from vlatool.errors import BundleError
 from vlatool.gate import Gate, LatencyClaim
-from vlatool.host import fingerprint
+from vlatool.host import before_run
 from vlatool.report import Measurement, Report, Row
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context
@@ -40,7 +40,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
         GraphError: when a bundle cannot be run.
     """
     _check(candidate, baseline, gate)
-    host = fingerprint()  # before the run itself loads the machine
+    host = before_run()
     how = gate.latency or LatencyClaim()
     paths = (str(baseline.path), str(candidate.path))
     timed = Timed(Job(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed), context)

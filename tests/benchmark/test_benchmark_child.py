@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from vlatool.benchmark import _child
-from vlatool.benchmark._child import SAID, answer, ask, ended, raise_said
+from vlatool.benchmark._child import SAID, answer, ask, ended, message, raise_said
 from vlatool.benchmark._job import Limits
 from vlatool.bundle import Bundle
 from vlatool.errors import GateFailed, GraphError, MissingExtra, UsageError
@@ -58,3 +58,17 @@ def test_a_process_under_a_limit_did_not_fit_only_where_memory_ended_it() -> Non
     with pytest.raises(GateFailed, match="more than 50 MB"):
         raise_said({SAID: "GraphError", "message": "std::bad_alloc", "fix": ""}, limits)
     raise_said({"result": 1}, limits)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ('{"a": 1}\n', {"a": 1}),
+        ('{"result": {"blocks_ms": [[0.1, 0.', {}),
+        ("an engine says hello", {}),
+        ("[1]", {}),
+        ("", {}),
+    ],
+)
+def test_a_line_that_its_process_did_not_live_to_end_is_no_message(text, wanted) -> None:
+    assert message(text) == wanted

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.benchmark._memory import peak_rss_mb, resident_mb
@@ -310,6 +311,8 @@ def test_a_job_runs_elsewhere_where_the_context_says_so(float_bundle):
         ({"mode": "15W"}, "--mode is the power mode that --emulate takes"),
         ({"pin": "a-b"}, "--pin is 'a-b'"),
         ({"pin": "3-1"}, "names no processor"),
+        ({"rate": 1e-6}, "more than a day"),
+        ({"rate": 0.001, "iterations": 500}, "more than a day"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(float_bundle, options, told):
@@ -332,3 +335,14 @@ def test_what_the_engine_logs_is_kept(float_bundle):
     lines = benchmarked(float_bundle, Context(elsewhere=elsewhere)).rows[0].details["log"]
     assert [line["line"] for line in lines] == [f"warning {number}" for number in range(10, 50)]
     assert "log" not in benchmarked(float_bundle).rows[0].details
+
+
+def test_the_memory_of_eager_torch_is_not_said_to_be_limited(float_bundle, source_bundle):
+    with pytest.raises(UsageError, match="memory of eager torch is not limited"):
+        benchmarked(float_bundle, against=(source_bundle.path,), memory_mb=5000)
+
+
+@pytest.mark.parametrize("options", [{"threads": 2000}, {"memory_mb": 1e300}, {"cores": 10**20}, {"duration": 1e6}])
+def test_numbers_that_no_machine_has_are_refused(options):
+    with pytest.raises(ValidationError, match="less than or equal"):
+        Latency(**options)

@@ -10,7 +10,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "telemetry"))
 
 from telemetry_boards import AGX_ORIN, NUC, ORIN_NANO, write
 
-from vlatool.benchmark._agent import plain
 from vlatool.benchmark._rows import measurements, raw, sustained, tables
 from vlatool.telemetry import Recorder, open_all
 
@@ -22,7 +21,7 @@ def recorded(root, seconds):
     recorder.sample(every=True)
     now[0] += seconds
     recorder.sample(every=True)
-    return plain(recorder.recorded)
+    return recorder.recorded.to_dict()
 
 
 def found(telemetry=None, calls=100, **more):
@@ -92,7 +91,7 @@ def test_a_nuc_counts_energy_over_the_wrap_around(tmp_path):
     (package / "energy_uj").write_text("140000000")
     now[0] = 20.0
     recorder.sample(every=True)
-    told = numbers(found(plain(recorder.recorded)))
+    told = numbers(found(recorder.recorded.to_dict()))
     assert told["power_mean"].value == pytest.approx(240 / 20)
     assert told["energy_per_action"].value == pytest.approx(2.4)
 

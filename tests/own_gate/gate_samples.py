@@ -74,6 +74,7 @@ def checked_out(commit: str) -> Iterator[Path]:
     """Yield a directory with the tree of a commit, and remove it in the end."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "base"
+        git("worktree", "prune")  # what a run that was killed left
         subprocess.run(
             ["git", "-C", str(ROOT), "worktree", "add", "--quiet", "--detach", str(tree), commit], check=True
         )

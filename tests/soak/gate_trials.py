@@ -91,7 +91,8 @@ def one_gate(candidate: Bundle, base: Bundle, margin: float, number: int, output
 def counted(output: Path) -> None:
     """Print the verdicts of a series."""
     lines = [json.loads(line) for line in output.read_text().splitlines()]
-    print(f"{len(lines)} gates: {dict(Counter(line['verdict'] for line in lines))}")
+    print(f"{len(lines)} gates: {dict(Counter(line['verdict'] for line in lines))}, "
+          f"after so many processes: {dict(Counter(len(line['log_ratios']) for line in lines))}")  # fmt: skip
     print(f"median ratio {median(line['ratio'] for line in lines):.4f}, "
           f"processes {np.mean([len(line['log_ratios']) for line in lines]):.1f} and "
           f"{median(line['seconds'] for line in lines):.0f} s a gate; standard deviation of a process "

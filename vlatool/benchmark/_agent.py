@@ -13,21 +13,20 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
-from vlatool.benchmark._child import answer, ended, raise_said, too_large
+from vlatool.benchmark._child import answer, ended, message, raise_said, too_large
 from vlatool.benchmark._contest import Tell
 from vlatool.benchmark._job import Job, Limits
 from vlatool.benchmark._limited import chosen, command, grouped
 from vlatool.benchmark._probe import cold_start
-from vlatool.bundle import Bundle
 from vlatool.errors import VlatoolError
-from vlatool.host import busy_processors, fingerprint
+from vlatool.host import before_run
 from vlatool.processes import environment
-from vlatool.telemetry import Absent, Recorded, Recorder, open_all
+from vlatool.telemetry import Absent, Recorder, open_all
 from vlatool.telemetry.process import ProcessReader
 
 PERIOD_S = 0.2
@@ -52,36 +51,20 @@ def measure(job: Job, tell: Tell) -> dict[str, Any]:
         tell("whether it fits into the memory", None)
         with grouped(limits) as limited:
             for path in job.bundles:
-                _fits(_probed(path, job, limited), limited)
-    host = {**fingerprint(), "processors_busy": busy_processors()}  # before the run itself loads the machine
+                start = cold_start(Path(path), job.engine, job.threads, limited)
+                if start["peak_rss_mb"] > limited.memory_mb:  # pages of files that others have read count for no group
+                    raise too_large(limited, f": {start['peak_rss_mb']:,.0f} MB")
+    host = before_run()
     free = replace(limits, memory_mb=0.0)  # the worker also holds observations and every sample
     found = _run_worker(job, free, tell)
     for number, (path, policy) in enumerate(zip(job.bundles, found["policies"], strict=True)):
         if job.cold and policy["engines"]:
             tell("cold start of each in a fresh process", number / len(job.bundles))
             try:
-                policy["cold"] = [_probed(path, job, free) for _ in range(job.cold)]
+                policy["cold"] = [cold_start(Path(path), job.engine, job.threads, free) for _ in range(job.cold)]
             except VlatoolError as error:  # the latencies are measured, and stay
                 policy["cold_error"] = error.message
     return {"job": {**job.to_dict(), "bundles": len(job.bundles)}, "host": host, **found}
-
-
-def _probed(path: str, job: Job, limits: Limits) -> dict[str, Any]:
-    return cold_start(Path(path), job.engine, job.threads, limits) if _has_graphs(path) else {"peak_rss_mb": 0.0}
-
-
-def _has_graphs(path: str) -> bool:
-    return bool(Bundle.open(Path(path), verify=False).manifest.graphs)
-
-
-def _fits(start: Mapping[str, Any], limits: Limits) -> None:
-    """Refuse what a control group lets through: pages of files that others have read already.
-
-    Raises:
-        GateFailed: when more was resident than the limit.
-    """
-    if start["peak_rss_mb"] > limits.memory_mb:
-        raise too_large(limits, f": {start['peak_rss_mb']:,.0f} MB")
 
 
 def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
@@ -95,7 +78,7 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
         recorder: Recorder | None = None
         _answer(worker, json.dumps(job.to_dict()))
         for text in worker.stdout:
-            line: dict[str, Any] = json.loads(text) if text.startswith("{") else {}
+            line = message(text)
             if "progress" in line:
                 tell(*line["progress"])
             elif "ready" in line:
@@ -106,7 +89,7 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
                 _answer(worker)
             elif "result" in line:
                 found: dict[str, Any] = line["result"]
-                told = plain(recorder.recorded) if recorder else None
+                told = recorder.recorded.to_dict() if recorder else None
                 return {**found, "telemetry": told, "log": _end_of(log)}
             else:
                 raise_said(line, limits)
@@ -147,22 +130,6 @@ def _readers(worker: int) -> list[Any]:
 
 def _name(each: Any) -> str:
     return str(each.reader if isinstance(each, Absent) else each.name)
-
-
-def plain(found: Recorded) -> dict[str, Any]:
-    """Return what was recorded as JSON values, times in seconds of ``time.monotonic``."""
-    return {
-        "seconds": found.seconds,
-        "energy": [{**vars(each), "names": list(each.names)} for each in found.energy],
-        "throttled": found.throttled,
-        "throttling": list(found.throttling),
-        "gauges": {
-            name: {**vars(each), "times": list(each.times), "values": list(each.values)}
-            for name, each in found.gauges.items()
-        },
-        "counters": {name: vars(each) for name, each in found.counters.items()},
-        "unmeasured": [vars(each) for each in found.absent],
-    }
 
 
 def main() -> dict[str, Any]:

@@ -61,23 +61,31 @@ def ask(
         )
     except subprocess.TimeoutExpired as error:
         raise GraphError(f"{about}: no result after {timeout:g} s.") from error
-    told = done.stdout.splitlines()[-1:]
-    found: dict[str, Any] = json.loads(told[0]) if told and told[0].startswith("{") else {}
+    found = message(done.stdout.rstrip("\n").rpartition("\n")[2])
     raise_said(found, limits)
     if done.returncode or not found:
         raise ended(about, done.returncode, done.stderr, limits)
     return found
 
 
+def message(text: str) -> dict[str, Any]:
+    """Return a line of JSON; nothing for what an engine prints, and for a line that its process did not live to end."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def raise_said(found: Mapping[str, Any], limits: Limits = Limits()) -> None:  # noqa: B008
     """Raise what a process said that it raised; nothing when it did not."""
     if SAID not in found:
         return
-    message = str(found["message"])
-    if limits.memory_mb and any(sign in message for sign in NO_MEMORY):
+    told = str(found["message"])
+    if limits.memory_mb and any(sign in told for sign in NO_MEMORY):
         raise too_large(limits)
     raised = getattr(errors, str(found[SAID]), GraphError)
-    raise raised(message, str(found["fix"]))
+    raise raised(told, str(found["fix"]))
 
 
 def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fresh process") -> VlatoolError:

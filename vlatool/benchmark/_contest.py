@@ -42,6 +42,11 @@ class Contestant:
     starts: array[float] = field(default_factory=lambda: array("d"))
     answers: Answers | None = None
 
+    def warm_up(self, inferences: int) -> None:
+        """Infer so often, untimed."""
+        for index in range(inferences):
+            self.policy.infer(self.observations[index % len(self.observations)])
+
     @property
     def samples(self) -> list[float]:
         """All milliseconds in the order in which they were taken."""
@@ -67,8 +72,7 @@ def run_interleaved(
         between: Called before each round and after the last.
     """
     for contestant in contestants:
-        for index in range(warmup):
-            contestant.policy.infer(contestant.observations[index % len(contestant.observations)])
+        contestant.warm_up(warmup)
     each = -(-iterations // BLOCKS)
     order = np.random.default_rng(0)
     for block in range(BLOCKS):

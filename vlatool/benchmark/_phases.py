@@ -39,8 +39,7 @@ def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], secon
         seconds: After which no further action begins, once ``FEWEST`` are timed.
     """
     sessions = {name: _Timed(session) for name, session in policy.program.sessions.items()}
-    seed = 0
-    timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed), policy.engine)
+    timed = Policy(policy.bundle, Program(policy.program.steps, sessions, seed=0), policy.engine)
     encode, encoded = timed.encode, []
 
     def noted(observation: Mapping[str, Any]) -> dict[str, Any]:

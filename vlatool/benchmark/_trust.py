@@ -162,20 +162,20 @@ def _clock(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
 
 def _later(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
     """Tell of a policy alone that did not settle; several in turns slow down together, and their ratios stand."""
-    paced = bool((found.get("job") or {}).get("rate"))
-    for policy in found["policies"][:1] if len(found["policies"]) == 1 else ():
-        samples = [value for block in policy["blocks_ms"] for value in block]
-        quarter = len(samples) // 4
-        if quarter < FEWEST or sustained:
-            continue
-        first, last = median(samples[:quarter]), median(samples[-quarter:])
-        if abs(last / first - 1) > LATER:
-            word = "slower" if last > first else "faster"
-            yield Finding(
-                "suspect",
-                f"the last quarter of {policy['name']} was {abs(last / first - 1):.0%} {word} than the first",
-                f"warm up longer (--warmup), or see how it goes on: {'--duration' if paced else '--sustained'} 600",
-            )
+    policy, *others = found["policies"]
+    samples = [value for block in policy["blocks_ms"] for value in block]
+    quarter = len(samples) // 4
+    if quarter < FEWEST or sustained or others:
+        return
+    first, last = median(samples[:quarter]), median(samples[-quarter:])
+    if abs(last / first - 1) > LATER:
+        word = "slower" if last > first else "faster"
+        longer = "--duration" if (found.get("job") or {}).get("rate") else "--sustained"
+        yield Finding(
+            "suspect",
+            f"the last quarter of {policy['name']} was {abs(last / first - 1):.0%} {word} than the first",
+            f"warm up longer (--warmup), or see how it goes on: {longer} 600",
+        )
 
 
 def _memory(found: Mapping[str, Any]) -> Iterator[Finding]:

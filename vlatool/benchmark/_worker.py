@@ -99,8 +99,7 @@ def measure(
         if job.check:
             contestant.answers = expected_answers(contestant.policy, contestant.observations)
             contestant.observations = contestant.observations[: len(contestant.answers)]
-        for index in range(job.warmup):
-            contestant.policy.infer(contestant.observations[index % len(contestant.observations)])
+        contestant.warm_up(job.warmup)
     gc.collect()
     gc.freeze()
     canaries: list[float] = []
@@ -197,7 +196,6 @@ def _usage() -> dict[str, float]:
         "cpu_s": used.ru_utime + used.ru_stime,
         "switches": used.ru_nivcsw,
         "wall_s": time.monotonic(),
-        "faults": used.ru_majflt,
     }
 
 

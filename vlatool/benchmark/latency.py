@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 COLD_STARTS = 3
 LOG_LINES = 40
 CALLS, FEWEST_TICKS = 200, 20
+LONGEST_S = 86_400
 HERE = "this host"
 
 
@@ -47,20 +48,22 @@ class Latency(Measure):
     iterations: int | None = Field(
         None, ge=20, le=MOST, description="inferences of each policy, at least; 200, and with --rate 20, if unset"
     )
-    duration: float = Field(10.0, ge=0, le=86_400, description="seconds that each policy is timed for, at least")
+    duration: float = Field(10.0, ge=0, le=LONGEST_S, description="seconds that each policy is timed for, at least")
     warmup: int = Field(10, ge=1, description="inferences before the first that counts")
     rate: float = Field(0.0, ge=0, le=10_000, description="pace of a control loop in Hz; back to back when 0")
     sustained: float = Field(
-        0.0, ge=0, le=86_400, description="run each so many seconds, and compare their end with the start"
+        0.0, ge=0, le=LONGEST_S, description="run each so many seconds, and compare their end with the start"
     )
-    threads: int = Field(1, ge=1, description="intra-op threads")
+    threads: int = Field(1, ge=1, le=1024, description="intra-op threads")
     pin: str = Field("", description="processors to run on, such as 0-3 or 2,4; all when empty")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     cold: bool = Field(True, description="also load each bundle in fresh processes: cold start, and memory by part")
     phase: bool = Field(True, description="also time the parts of an inference: encoding, each graph, decoding")
     answers: bool = Field(True, description="also look for answers that change in the run, or come from memory")
-    cores: int = Field(0, ge=0, description="processors that the policy may use; all when 0")
-    memory_mb: float = Field(0.0, ge=0, description="memory that its process may use, in MB (10^6 bytes); all when 0")
+    cores: int = Field(0, ge=0, le=4096, description="processors that the policy may use; all when 0")
+    memory_mb: float = Field(
+        0.0, ge=0, le=1e9, description="memory that its process may use in MB (10^6 bytes); all when 0"
+    )
     emulate: bool = Field(
         False, description="take --cores and --memory-mb from --profile: what does not fit fails here"
     )
@@ -88,6 +91,8 @@ class Latency(Measure):
                 f"--rate {self.rate:g} for {self.duration:g} s are {self.rate * self.duration:,.0f} ticks; "
                 f"allowed: {MOST:,}, each of which is kept."
             )
+        if self.rate and (self.iterations or FEWEST_TICKS) > self.rate * LONGEST_S:
+            raise UsageError(f"--rate {self.rate:g} takes more than a day for {self.iterations or FEWEST_TICKS} ticks.")
         if self.sustained and self.rate:
             raise UsageError("--sustained calls back to back; with --rate pass --duration.")
         if self.emulate and profile is None:
@@ -122,6 +127,8 @@ class Latency(Measure):
         for bundle in bundles:
             if not bundle.manifest.graphs and "factory" not in bundle.manifest.source:
                 raise BundleError(f"{bundle.path} has nothing to run.")
+            if self.memory_mb and not bundle.manifest.graphs:
+                raise UsageError(f"The memory of eager torch is not limited: {bundle.path} has no graph.", "export it")
         job = self._job(bundles)
         elsewhere = context.elsewhere
         found = (

@@ -57,7 +57,7 @@ def side_by_side(paths: Sequence[Path], reports: Sequence[Report]) -> Report:
     """Return one report with the rows of all, the first row with a latency as the reference."""
     labels = short_names(paths)
     findings = [*differences(labels, reports), *_carried(labels, reports)]
-    same = len({_machine(report) for report in reports}) == 1 and reports[0].environment.get("cpu") is not None
+    same = len({_circumstances(report) for report in reports}) == 1 and reports[0].environment.get("cpu") is not None
     rows = _rows(labels, reports, same)
     limits = {
         name: wanted
@@ -176,8 +176,9 @@ def _threads(report: Report) -> dict[str, Any]:
     return {"threads": sorted(known, key=str)} if known else {}
 
 
-def _machine(report: Report) -> str:
-    return str(_facts(report, MACHINE)) + str(_run(report).get("rate_hz", "none"))
+def _circumstances(report: Report) -> tuple[str, str]:
+    """Return machine and pace: latencies of others give no speed-up."""
+    return str(_facts(report, MACHINE)), str(_run(report).get("rate_hz", "none"))
 
 
 def _measured(report: Report) -> set[str]:

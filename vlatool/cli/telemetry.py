@@ -6,9 +6,8 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -38,23 +37,10 @@ def telemetry(
         time.sleep(seconds)
     found = recorder.recorded
     if as_json:
-        typer.echo(json.dumps(plain(found)))
+        typer.echo(json.dumps(found.to_dict()))
         return
     for line in lines(found):
         typer.echo(line)
-
-
-def plain(found: Recorded) -> dict[str, Any]:
-    """Return what was recorded as JSON values."""
-    return {
-        "seconds": found.seconds,
-        "energy": [asdict(each) for each in found.energy],
-        "throttled": found.throttled,
-        "throttling": list(found.throttling),
-        "gauges": {name: asdict(each) for name, each in found.gauges.items()},
-        "counters": {name: asdict(each) for name, each in found.counters.items()},
-        "unmeasured": [asdict(each) for each in found.absent],
-    }
 
 
 def lines(found: Recorded) -> Iterator[str]:

@@ -6,6 +6,7 @@ from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 from vlatool.telemetry._reading import JOULE, THROTTLE, WATT, Absent, Reading
 from vlatool.telemetry._total import Total, totals
@@ -113,6 +114,21 @@ class Recorded:
     throttled: bool | None
     throttling: tuple[str, ...]
     absent: tuple[Absent, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values; the keys are those of the fields, but ``unmeasured`` for what is absent."""
+        return {
+            "seconds": self.seconds,
+            "energy": [{**vars(each), "names": list(each.names)} for each in self.energy],
+            "throttled": self.throttled,
+            "throttling": list(self.throttling),
+            "gauges": {
+                name: {**vars(each), "times": list(each.times), "values": list(each.values)}
+                for name, each in self.gauges.items()
+            },
+            "counters": {name: dict(vars(each)) for name, each in self.counters.items()},
+            "unmeasured": [dict(vars(each)) for each in self.absent],
+        }
 
 
 def collect(samples: Iterable[tuple[float, Reading]]) -> dict[str, Series]:
