@@ -74,6 +74,13 @@ class Bundle:
         """Sum of the sizes of all recorded files in bytes."""
         return sum(record.bytes for record in self.manifest.files.values())
 
+    @property
+    def graph_bytes(self) -> int:
+        """Bytes of all graphs, with the weights that lie beside them, whatever their files are called."""
+        graphs = tuple(graph.file for graph in self.manifest.graphs.values())
+        folders = tuple(f"{folder}/" for graph in graphs if (folder := graph.rpartition("/")[0]))
+        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith((*graphs, *folders)))
+
 
 def seal(directory: Path, manifest: Manifest) -> Bundle:
     """Hash every file below ``directory``, write ``manifest.json`` last, and return the bundle."""

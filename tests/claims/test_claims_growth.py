@@ -6,7 +6,7 @@ import pytest
 
 from vlatool.bundle import Bundle
 from vlatool.claims import growth
-from vlatool.claims.growth import examine_memory, examine_size, graph_bytes, judged
+from vlatool.claims.growth import examine_memory, examine_size, judged
 from vlatool.gate import GrowthClaim, LatencyClaim
 from vlatool.report import Measurement
 from vlatool.stage import Context
@@ -32,9 +32,17 @@ def test_the_size_is_that_of_the_graphs(float_bundle: Bundle, int8_bundle: Bundl
 def test_graphs_may_lie_anywhere_in_a_bundle(float_bundle: Bundle) -> None:
     files = {path.replace("graphs/", "g/"): record for path, record in float_bundle.manifest.files.items()}
     files["g/main.onnx.data"] = replace(files["g/main.onnx"], bytes=1000)
+    files["g/weights.data"] = replace(files["g/main.onnx"], bytes=70)
     graphs = {"main": replace(float_bundle.manifest.graphs["main"], file="g/main.onnx")}
     moved = replace(float_bundle, manifest=replace(float_bundle.manifest, files=files, graphs=graphs))
-    assert graph_bytes(moved) == graph_bytes(float_bundle) + 1000 > 1000
+    assert moved.graph_bytes == float_bundle.graph_bytes + 1070 > 1070
+
+
+def test_graphs_beside_the_manifest_are_counted_alone(float_bundle: Bundle) -> None:
+    files = {path.removeprefix("graphs/"): record for path, record in float_bundle.manifest.files.items()}
+    graphs = {"main": replace(float_bundle.manifest.graphs["main"], file="main.onnx")}
+    moved = replace(float_bundle, manifest=replace(float_bundle.manifest, files=files, graphs=graphs))
+    assert moved.graph_bytes == float_bundle.graph_bytes == files["main.onnx"].bytes
 
 
 def test_the_memory_is_that_of_fresh_processes(

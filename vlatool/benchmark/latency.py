@@ -164,7 +164,7 @@ class Latency(Measure):
             measured = measurements(found, policy, None if alone else policies[0], self.rate)
             measured += sustained(samples_of(policy)) if self.sustained else []
             if bundle.manifest.graphs:
-                measured.append(Measurement("size", _graph_bytes(bundle) / 1e6, "MB", note="graphs on disk"))
+                measured.append(Measurement("size", bundle.graph_bytes / 1e6, "MB", note="graphs on disk"))
             told = tables(found, policy, alone) | _work(bundle, policy["engine"])
             if policy is policies[0] and (lines := found.get("log", "").strip().splitlines()):
                 told["log"] = [{"line": line} for line in lines[-LOG_LINES:]]
@@ -246,10 +246,6 @@ def _ms(row: Row) -> str:
 
 def _place(host: Mapping[str, Any]) -> str:
     return str(host.get("board") or host.get("cpu") or "the target")
-
-
-def _graph_bytes(bundle: Bundle) -> int:
-    return sum(record.bytes for path, record in bundle.manifest.files.items() if path.startswith("graphs/"))
 
 
 def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:

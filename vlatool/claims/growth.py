@@ -33,14 +33,8 @@ def examine_memory(
 
 def examine_size(candidate: Bundle, baseline: Bundle, claim: GrowthClaim) -> Found:
     """Examine the bytes of the graphs."""
-    mine, theirs = (graph_bytes(bundle) / 1e6 for bundle in (candidate, baseline))
+    mine, theirs = (bundle.graph_bytes / 1e6 for bundle in (candidate, baseline))
     return judged("size", theirs, Measurement("size", mine, "MB", note="graphs on disk"), claim)
-
-
-def graph_bytes(bundle: Bundle) -> int:
-    """Return the bytes of all graphs, with the weights that lie beside them."""
-    graphs = tuple(graph.file for graph in bundle.manifest.graphs.values())
-    return sum(record.bytes for path, record in bundle.manifest.files.items() if path.startswith(graphs))
 
 
 def judged(name: str, baseline: float, measured: Measurement, claim: GrowthClaim) -> Found:
