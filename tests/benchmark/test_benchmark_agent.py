@@ -1,12 +1,14 @@
 """A whole measurement on this machine, in processes of its own."""
 
 import json
+import os
 import subprocess
 import sys
 
 import pytest
+from _processes import below
 
-from vlatool.benchmark._agent import measure
+from vlatool.benchmark._agent import WORKER, measure
 from vlatool.benchmark._job import Job, Limits
 from vlatool.errors import BundleError, GateFailed, GraphError, UsageError
 from vlatool.processes import environment
@@ -67,24 +69,23 @@ def test_a_cold_start_that_fails_costs_nothing_else(float_bundle, monkeypatch):
 
 
 def test_nobody_is_left_when_telling_fails(float_bundle):
-    import psutil
+    workers = []
 
     def broken(what, share):
+        workers.extend(below(os.getpid(), WORKER))
         raise BrokenPipeError
 
     with pytest.raises(BrokenPipeError):
         measure(Job((str(float_bundle.path),), iterations=20), broken)
-    left = [each for each in psutil.Process().children(recursive=True) if "_worker" in " ".join(each.cmdline())]
-    assert left == []
+    assert len(workers) == 1
+    assert not workers[0].is_running()  # also not as a zombie
 
 
 def test_a_worker_that_is_killed_is_named(float_bundle):
-    import psutil
-
     def kill(what, share):
         if what == "measuring latency":
-            for child in psutil.Process().children(recursive=True):
-                child.kill()
+            for worker in below(os.getpid(), WORKER):
+                worker.kill()
 
     with pytest.raises(GraphError, match=r"was killed \(SIGKILL\) while it was measured"):
         measure(Job((str(float_bundle.path),), iterations=20, limits=Limits(memory_mb=2000)), kill)

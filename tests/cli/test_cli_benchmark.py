@@ -9,7 +9,9 @@ import time
 
 import psutil
 import pytest
+from _processes import below
 
+from vlatool.benchmark._agent import WORKER
 from vlatool.report import Report
 
 QUICK = ["--iterations", 20, "--duration", 0, "--no-cold", "--no-phase"]
@@ -17,15 +19,6 @@ QUICK = ["--iterations", 20, "--duration", 0, "--no-cold", "--no-phase"]
 
 def command(*words):
     return [sys.executable, "-m", "vlatool", "benchmark", *map(str, words)]
-
-
-def workers(of):
-    """Return the processes below one that measure."""
-    try:
-        children = psutil.Process(of).children(recursive=True)
-        return [each for each in children if "vlatool.benchmark._worker" in " ".join(each.cmdline())]
-    except psutil.Error:
-        return []
 
 
 def gone(processes, seconds=10):
@@ -39,7 +32,7 @@ def test_nothing_is_left_when_a_run_is_ended(float_bundle, number, code):
         while b"measuring" not in (line := run.stderr.readline()):
             assert line
             assert time.monotonic() < end
-        left = workers(run.pid)
+        left = below(run.pid, WORKER)
         assert left
         run.send_signal(number)
         assert run.wait(20) == code
