@@ -11,7 +11,7 @@ from vlatool import run_gate as run_gate_module
 from vlatool.benchmark._pairs import Job, Pairs
 from vlatool.bundle import Bundle
 from vlatool.claims import _timed
-from vlatool.errors import BundleError, DataError
+from vlatool.errors import BundleError, DataError, GraphError
 from vlatool.gate import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
 from vlatool.report import Report
 from vlatool.run_gate import run_gate
@@ -28,7 +28,7 @@ def as_fast(monkeypatch: pytest.MonkeyPatch):
     def make(slowdown: float) -> list[Job]:
         jobs: list[Job] = []
 
-        def measured(job: Job) -> Pairs:
+        def measured(job: Job, timeout: float | None) -> Pairs:
             jobs.append(job)
             shift = math.exp(0.001 * (job.seed % 5 - 2))
             return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80)
@@ -91,6 +91,19 @@ def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
     assert measured["latency_ratio"].low <= measured["latency_ratio"].value <= measured["latency_ratio"].high
     assert report.verdict in ("pass", "inconclusive", "fail")
     json.loads(report.to_json())
+
+
+@pytest.mark.parametrize("claim", ["memory", "latency"])
+def test_a_process_that_hangs_ends_the_gate(float_bundle: Bundle, claim: str) -> None:
+    gate = Gate(
+        memory=GrowthClaim() if claim == "memory" else None,
+        accuracy=None,
+        size=None,
+        latency=LatencyClaim(timeout=0.05),
+    )
+    with pytest.raises(GraphError, match=r"no result after 0\.05 s, so the process was ended") as caught:
+        run_gate(float_bundle, float_bundle, gate, Context())
+    assert "latency: {timeout: SECONDS}" in caught.value.fix
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ class LatencyClaim(_Claim):
     seconds: float = Field(10.0, gt=0, description="after which a process begins no further pair (at least 30 of them)")
     threads: int = Field(1, ge=1, description="intra-op threads")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
+    timeout: float = Field(1800.0, gt=0, description="seconds after which a process that hangs ends, and the gate so")
 
     @model_validator(mode="after")
     def _looks_can_decide(self) -> LatencyClaim:

@@ -37,13 +37,13 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     Raises:
         BundleError: when a bundle has no graph, or the two have other inputs or outputs.
         DataError: when accuracy is claimed and there is nothing to measure it on.
-        GraphError: when a bundle cannot be run.
+        GraphError: when a bundle cannot be run, or hangs.
     """
     _check(candidate, baseline, gate)
     host = before_run()
     how = gate.latency or LatencyClaim()
     paths = (str(baseline.path), str(candidate.path))
-    timed = Timed(Job(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed), context)
+    timed = Timed(Job(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed), context, how.timeout)
     found: list[Found] = []
     if gate.size:
         found.append(growth.examine_size(candidate, baseline, gate.size))

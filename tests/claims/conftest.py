@@ -21,7 +21,7 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> MakeTimed:
     """A function that makes processes: slowdown of the candidate, its milliseconds, spread between processes."""
 
     def make(slowdown: float = 0.0, ms: float = 5.0, spread: float = 0.02, calls: int = 150) -> Timed:
-        def measured(job: Job) -> Pairs:
+        def measured(job: Job, timeout: float | None) -> Pairs:
             random = np.random.default_rng(job.seed)
             base = ms * np.exp(0.05 * random.normal(size=calls))
             ratio = (1 + slowdown) * math.exp(spread * random.normal())

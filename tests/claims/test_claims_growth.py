@@ -50,14 +50,16 @@ def test_the_memory_is_that_of_fresh_processes(
 ) -> None:
     asked = []
 
-    def probed(path, engine, threads):
-        asked.append((path, threads))
+    def probed(path, engine, threads, timeout):
+        asked.append((path, threads, timeout))
         return {"peak_rss_mb": 90.0 if path == float_bundle.path else 120.0 + len(asked)}
 
     monkeypatch.setattr(growth, "cold_start", probed)
-    found = examine_memory(int8_bundle, float_bundle, GrowthClaim(margin=0.1), LatencyClaim(threads=2), Context())
+    found = examine_memory(
+        int8_bundle, float_bundle, GrowthClaim(margin=0.1), LatencyClaim(threads=2, timeout=60), Context()
+    )
     assert (found.verdict, found.measurements[0].value) == ("fail", 123.0)
-    assert asked == [(path, 2) for _ in range(3) for path in (int8_bundle.path, float_bundle.path)]
+    assert asked == [(path, 2, 60) for _ in range(3) for path in (int8_bundle.path, float_bundle.path)]
 
 
 def test_a_bundle_takes_as_much_as_itself(float_bundle: Bundle) -> None:

@@ -18,7 +18,9 @@ def slowdown(monkeypatch: pytest.MonkeyPatch):
 
     def make(share: float) -> None:
         monkeypatch.setattr(
-            _timed, "measure_pairs", lambda job: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * job.seed,) * 50)
+            _timed,
+            "measure_pairs",
+            lambda job, timeout: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * job.seed,) * 50),
         )
 
     return make

@@ -60,7 +60,10 @@ def ask(
             env=environment(),
         )
     except subprocess.TimeoutExpired as error:
-        raise GraphError(f"{about}: no result after {timeout:g} s.") from error
+        raise GraphError(
+            f"{about}: no result after {timeout:g} s, so the process was ended.",
+            "see whether it hangs alone (vlatool benchmark); a gate allows more with latency: {timeout: SECONDS}",
+        ) from error
     found = message(done.stdout.rstrip("\n").rpartition("\n")[2])
     raise_said(found, limits)
     if done.returncode or not found:

@@ -27,8 +27,14 @@ PARTS = {
 }
 
 
-def cold_start(bundle: Path, engine: str, threads: int, limits: Limits = Limits()) -> dict[str, Any]:  # noqa: B008
-    """Probe a bundle in a fresh process.
+def cold_start(
+    bundle: Path,
+    engine: str,
+    threads: int,
+    limits: Limits = Limits(),  # noqa: B008
+    timeout: float | None = None,
+) -> dict[str, Any]:
+    """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
 
     Returns:
         ``start_ms`` (from the start of the process until its first line of Python), ``import_ms``, ``engine_ms`` (the
@@ -37,10 +43,11 @@ def cold_start(bundle: Path, engine: str, threads: int, limits: Limits = Limits(
         holds once that part is done.
 
     Raises:
-        VlatoolError: what the bundle raises; GraphError when the process ends in another way.
+        VlatoolError: what the bundle raises; GraphError when the process ends in another way, or takes longer.
     """
     begun = time.monotonic_ns()
-    found = ask("vlatool.benchmark._probe", (str(bundle), engine, str(threads)), "", str(bundle), limits=limits)
+    words = (str(bundle), engine, str(threads))
+    found = ask("vlatool.benchmark._probe", words, "", str(bundle), timeout, limits)
     found["start_ms"] = (found.pop("begun_ns") - begun) / 1e6
     found["total_ms"] = (found.pop("acted_ns") - begun) / 1e6
     return found

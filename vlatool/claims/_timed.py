@@ -15,21 +15,23 @@ class Timed:
     Args:
         job: What each measures; process n has the seed ``job.seed + n``.
         context: For progress.
+        timeout: Seconds that a process may take.
     """
 
     job: Job
     context: Context
+    timeout: float | None = None
     pairs: list[Pairs] = field(default_factory=list)
 
     def log_ratio(self, number: int) -> float:
         """Return the log ratio of a process, candidate over baseline; measures it when it is the next one.
 
         Raises:
-            GraphError: when a bundle cannot be run.
+            GraphError: when a bundle cannot be run, or the process takes longer than the timeout.
         """
         if number == len(self.pairs):
             self.context.tell(f"process {number + 1}: both bundles, call by call", None)
-            self.pairs.append(measure_pairs(replace(self.job, seed=self.job.seed + number)))
+            self.pairs.append(measure_pairs(replace(self.job, seed=self.job.seed + number), self.timeout))
         return self.pairs[number].log_ratio
 
     def processes(self) -> list[int]:

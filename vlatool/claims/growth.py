@@ -25,7 +25,7 @@ def examine_memory(
     for number in range(PROBES):
         context.tell("memory of each in fresh processes", number / PROBES)
         for bundle, found in zip((candidate, baseline), peaks, strict=True):
-            found.append(cold_start(bundle.path, how.engine, how.threads)["peak_rss_mb"])
+            found.append(cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout)["peak_rss_mb"])
     mine, theirs = median(peaks[0]), median(peaks[1])
     note = f"load and a few inferences, median of {PROBES} fresh processes"
     return judged("memory", theirs, Measurement("peak_rss", mine, "MB", samples=PROBES, note=note), claim)
