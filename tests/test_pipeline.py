@@ -173,7 +173,7 @@ def test_every_candidate_has_a_row_with_what_was_measured_and_predicted(from_tor
 def test_the_baseline_also_says_how_fast_eager_torch_is(from_torch):
     found = [row.get("torch_eager_latency_p50") for row in from_torch.report.rows]
     assert found[0].samples == 20
-    assert found[1:] == [None, None, None]
+    assert set(found[1:]) == {None}
 
 
 def test_episodes_are_paired_with_those_of_float32(from_torch):
