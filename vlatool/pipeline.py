@@ -303,7 +303,7 @@ def _latency_rows(
         if eager is not None:
             own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
             named[BASELINE] = replace(named[BASELINE], measurements=(*named[BASELINE].measurements, own))
-    told = [f"{each.reason}; {each.remedy}" for each in report.findings if each.effect != "note"]
+    told = ["; ".join(filter(None, (each.reason, each.remedy))) for each in report.findings if each.effect != "note"]
     return named, (*report.warnings, *told, *(kept if report.created < begun else ()))
 
 

@@ -49,7 +49,7 @@ def test_rounding_is_no_stray_and_no_number_is_one():
     assert answers.strays == 0
     answers.look(0, {"action": np.array([1, math.nan, 1, 1])})
     answers.look(0, {"action": np.ones(3)})
-    assert answers.to_dict() == {"looked": 3, "strays": 2, "worst": 1e9, "first": 1}
+    assert answers.to_dict() == {"looked": 3, "strays": 2, "worst": None, "first": 1}
 
 
 def test_a_slow_policy_is_asked_few_observations(policy, observations):

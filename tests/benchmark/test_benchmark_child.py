@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import pytest
 
 from vlatool.benchmark import _child
-from vlatool.benchmark._child import SAID, answer, ask, ended, message, raise_said
+from vlatool.benchmark._child import SAID, answer, ask, ended, message, raise_said, signal_name
 from vlatool.benchmark._job import Limits
 from vlatool.bundle import Bundle
-from vlatool.errors import GateFailed, GraphError, MissingExtra, UsageError
+from vlatool.errors import GateFailed, GraphError, MissingExtra, TargetError, UsageError
 
 
 def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -58,6 +58,17 @@ def test_a_process_under_a_limit_did_not_fit_only_where_memory_ended_it() -> Non
     with pytest.raises(GateFailed, match="more than 50 MB"):
         raise_said({SAID: "GraphError", "message": "std::bad_alloc", "fix": ""}, limits)
     raise_said({"result": 1}, limits)
+
+
+@pytest.mark.parametrize("name", ["annotations", "require", "NoSuchError", "ValueError"])
+def test_what_is_no_error_of_vlatool_is_raised_as_the_other_one(name):
+    with pytest.raises(TargetError, match="it broke"):
+        raise_said({SAID: name, "message": "it broke"}, otherwise=TargetError)
+
+
+def test_signals_have_names_where_there_are_some():
+    assert [signal_name(code) for code in (-9, -40)] == ["SIGKILL", "signal 40"]
+    assert "SIGSEGV" in ended("x", -11, "", Limits()).message
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,16 @@ def test_the_numbers_of_a_loop():
     assert found["age_max"].value == pytest.approx(40)
 
 
+def test_percentiles_of_few_ticks_are_refused_with_what_they_would_take():
+    found = {each.name: each for each in paced_measurements(Loop(1.0).run(300).to_dict(), 300, 100.0)}
+    for name in ("age_p99", "wakeup_p99"):
+        assert not found[name].known
+        assert "needs 662 independent calls" in found[name].note
+        assert "(about 8 s)" in found[name].note, "at the rate of the loop, not back to back"
+    assert found["age_p50"].high >= found["age_p50"].value
+    assert found["age_p50"].confidence == 0.99
+
+
 def test_nothing_is_bounded_where_many_ticks_share_an_inference():
     seen = Loop(25.0).run(1000).to_dict()
     assert seen["inferences"] < 600

@@ -36,7 +36,10 @@ def test_other_answers_are_invalid():
     assert one.effect == "invalid"
     assert "3 of 100" in one.reason
     assert "call 41" in one.reason
+    assert "difference up to 0.5" in one.reason
     assert validity([one]) == "invalid"
+    nan = only(found(policy={"answers": answers | {"worst": None}}))
+    assert "(not finite, or of another shape, first in call 41)" in nan.reason
 
 
 def test_answers_from_memory_are_invalid():

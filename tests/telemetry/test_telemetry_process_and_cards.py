@@ -52,6 +52,9 @@ def test_psutil_is_asked_where_there_is_no_proc(monkeypatch: pytest.MonkeyPatch)
     class Process:
         broken = False
 
+        def __init__(self, pid: int | None = None) -> None:
+            assert pid is None, "this process"
+
         def oneshot(self) -> Any:
             if self.broken:
                 raise RuntimeError("gone")

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from vlatool.benchmark._child import answer, ended, message, raise_said, too_large
 from vlatool.benchmark._contest import Tell
@@ -74,10 +74,9 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
         _started(command(limits, WORKER), log) as worker,
         contextlib.ExitStack() as recording,
     ):
-        assert worker.stdout is not None
         recorder: Recorder | None = None
         _answer(worker, json.dumps(job.to_dict()))
-        for text in worker.stdout:
+        for text in cast(IO[str], worker.stdout):
             line = message(text)
             if "progress" in line:
                 tell(*line["progress"])
@@ -105,10 +104,10 @@ def _end_of(log: IO[str]) -> str:
 
 def _answer(worker: subprocess.Popen[str], line: str = "") -> None:
     """Send a line to the worker; one that has ended says so with its output."""
-    assert worker.stdin is not None
+    stdin = cast(IO[str], worker.stdin)
     with contextlib.suppress(BrokenPipeError):
-        worker.stdin.write(line + "\n")
-        worker.stdin.flush()
+        stdin.write(line + "\n")
+        stdin.flush()
 
 
 @contextlib.contextmanager

@@ -62,9 +62,9 @@ class Answers:
             self.worst = max(self.worst, wrong if math.isfinite(wrong) else math.inf)
             self.first = self.looked if self.first < 0 else self.first
 
-    def to_dict(self) -> dict[str, float]:
-        """Return how many were looked at, how many differed, by how much and which was the first."""
-        worst = self.worst if math.isfinite(self.worst) else 1e9
+    def to_dict(self) -> dict[str, float | None]:
+        """Return how many were looked at, how many differed, by how much (None: no number says) and which was first."""
+        worst = self.worst if math.isfinite(self.worst) else None
         return {"looked": self.looked, "strays": self.strays, "worst": worst, "first": self.first}
 
 

@@ -80,15 +80,20 @@ def message(text: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def raise_said(found: Mapping[str, Any], limits: Limits = Limits()) -> None:  # noqa: B008
-    """Raise what a process said that it raised; nothing when it did not."""
+def raise_said(
+    found: Mapping[str, Any],
+    limits: Limits = Limits(),  # noqa: B008
+    otherwise: type[VlatoolError] = GraphError,
+) -> None:
+    """Raise what a process said that it raised, ``otherwise`` when that is no error here; nothing when it did not."""
     if SAID not in found:
         return
-    told = str(found["message"])
+    told = str(found.get("message", ""))
     if limits.memory_mb and any(sign in told for sign in NO_MEMORY):
         raise too_large(limits)
-    raised = getattr(errors, str(found[SAID]), GraphError)
-    raise raised(told, str(found["fix"]))
+    kind = getattr(errors, str(found[SAID]), None)
+    raised = kind if isinstance(kind, type) and issubclass(kind, VlatoolError) else otherwise
+    raise raised(told, str(found.get("fix", "")))
 
 
 def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fresh process") -> VlatoolError:
@@ -100,9 +105,17 @@ def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fre
             f"{about}: the process was killed (SIGKILL) {when}, as it is when memory runs out.", "use a smaller policy"
         )
     if code < 0:
-        return GraphError(f"{about}: the process ended with {signal.Signals(-code).name} {when}.")
+        return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.")
     last = (log.strip() or f"exit code {code}").splitlines()[-1]
     return GraphError(f"{about} cannot be run in a fresh process: {last}")
+
+
+def signal_name(code: int) -> str:
+    """Return the name of the signal that ended a process, from its negative exit code."""
+    try:
+        return signal.Signals(-code).name
+    except ValueError:  # a real-time signal has no name
+        return f"signal {-code}"
 
 
 def too_large(limits: Limits, seen: str = "") -> GateFailed:

@@ -101,17 +101,40 @@ def _time(contestant: Contestant, count: int, seconds: float) -> None:
     contestant.blocks.append(taken)
 
 
-def latency_measurements(samples: Sequence[float], refusals: bool = False, most: float = math.inf) -> list[Measurement]:
+def latency_measurements(
+    samples: Sequence[float], refusals: bool = False, most: float = math.inf, seconds: float | None = None
+) -> list[Measurement]:
     """Return the percentiles and the maximum in ms, each percentile with its upper bound at 99 %.
 
+    Args:
+        samples: In ms, in the order in which they were taken.
+        refusals, most, seconds: As ``percentile_measurements`` takes them; back to back when ``seconds`` is None.
+    """
+    taken = sum(samples) / 1e3 if seconds is None else seconds
+    found = percentile_measurements("latency", samples, PERCENTILES, refusals, most, taken)
+    return [*found, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
+
+
+def percentile_measurements(
+    what: str, samples: Sequence[float], percents: Sequence[float], refusals: bool, most: float, seconds: float
+) -> list[Measurement]:
+    """Return percentiles in ms, each with its upper bound at 99 %.
+
     The median is always given; without a bound where the samples are too few for one. Any other percentile that is not
-    bounded is left out, or, with ``refusals``, named with what it would take. ``most`` is how many independent calls
-    the samples are worth at most; 0 where nothing can be said.
+    bounded is left out, or, with ``refusals``, named with what it would take.
+
+    Args:
+        what: The name before ``_p50``.
+        samples: In ms, in the order in which they were taken.
+        percents: 0-100.
+        refusals: Whether a percentile that the samples cannot bound is named.
+        most: Independent calls that the samples are worth at most; 0 where nothing can be said.
+        seconds: That it took to take them.
     """
     found = []
-    for percent in PERCENTILES:
+    for percent in percents:
         seen = percentile(samples, percent, most=most)
-        name = f"latency_{seen.name}"
+        name = f"{what}_{seen.name}"
         if seen.known:
             found.append(
                 Measurement(name, seen.value, "ms", samples=len(samples), high=seen.bound, confidence=seen.confidence)
@@ -119,9 +142,9 @@ def latency_measurements(samples: Sequence[float], refusals: bool = False, most:
         elif percent == PERCENTILES[0]:
             found.append(Measurement(name, float(np.median(samples)), "ms", samples=len(samples)))
         elif refusals:
-            note = _wanting(seen, len(samples), sum(samples) / 1e3)
+            note = _wanting(seen, len(samples), seconds)
             found.append(Measurement(name, math.nan, "ms", samples=len(samples), note=note))
-    return [*found, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
+    return found
 
 
 def _wanting(seen: Percentile, calls: int, seconds: float) -> str:

@@ -11,10 +11,11 @@ from __future__ import annotations
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vlatool.benchmark._answers import Answers
+from vlatool.benchmark._contest import percentile_measurements
 from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
 from vlatool.statistics import wilson
@@ -140,23 +141,22 @@ def paced_measurements(found: Mapping[str, Any], ticks: int, rate: float) -> lis
     note = f"ticks at {rate:g} Hz whose action came after the next tick, {period:g} ms later; "
     note += f"{found['inferences']:,} inferences, {found['passed_over']:,} ticks passed over while the policy computed"
     measured = [Measurement("deadline_misses", misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
-    ages, late = sorted(found["age_ms"]), sorted(found["wakeup_ms"])
-    about = "age of the observation behind the newest action when a tick is due"
-    for name, share in (("age_p50", 0.5), ("age_p99", 0.99), ("age_max", 1.0)):
-        if ages:
-            measured.append(Measurement(name, _at(ages, share), "ms", samples=len(ages), note=about))
-    about = "how late the loop wakes up for a tick that it slept until"
-    for name, share in (("wakeup_p50", 0.5), ("wakeup_p99", 0.99)):
-        if not late:
-            break
-        measured.append(Measurement(name, _at(late, share), "ms", samples=len(late), note=about))
+    ages, late = found["age_ms"], found["wakeup_ms"]
+    if ages:
+        about = "age of the observation behind the newest action when a tick is due"
+        measured += _percentiles("age", ages, worth, ticks / rate, about)
+        measured.append(Measurement("age_max", max(ages), "ms", samples=len(ages), note=about))
+    if late:
+        about = "how late the loop wakes up for a tick that it slept until"
+        measured += _percentiles("wakeup", late, worth, ticks / rate, about)
     return measured
+
+
+def _percentiles(what: str, samples: Sequence[float], worth: float, seconds: float, about: str) -> list[Measurement]:
+    found = percentile_measurements(what, samples, (50.0, 99.0), True, worth, seconds)
+    return [replace(each, note=each.note or about) for each in found]
 
 
 def overloaded(found: Mapping[str, Any], ticks: int) -> bool:
     """Say whether so many ticks share an inference that nothing can be bounded."""
     return bool(found["passed_over"] > OVERLOADED * ticks)
-
-
-def _at(ordered: Sequence[float], share: float) -> float:
-    return float(ordered[min(len(ordered) - 1, int(share * len(ordered)))])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from statistics import median
 from typing import Any
 
@@ -42,12 +43,13 @@ def measurements(
     """
     samples, paced = samples_of(policy), policy.get("paced")
     most = math.inf if not paced else 0.0 if overloaded(paced, len(samples)) else float(paced["worth"])
-    measured = latency_measurements(samples, refusals=reference is None, most=most)
+    seconds = len(samples) / rate if paced else None
+    measured = latency_measurements(samples, refusals=reference is None, most=most, seconds=seconds)
     if reference is not None:
         return [*measured, speedup_of(policy["blocks_ms"], reference["blocks_ms"], reference["name"]), *cold(policy)]
     if paced:
         note = "from the moment at which the tick was due"
-        measured = [Measurement(**{**vars(each), "note": each.note or note}) for each in measured]
+        measured = [replace(each, note=each.note or note) for each in measured]
         measured += paced_measurements(paced, len(samples), rate)
     else:
         measured.append(_throughput(samples))

@@ -9,6 +9,7 @@ from typing import Any
 from vlatool.benchmark._answers import REMEMBERS
 from vlatool.benchmark._canary import MOVED, drift
 from vlatool.benchmark._contest import MOST
+from vlatool.benchmark._rows import samples_of
 from vlatool.report import Finding
 
 SWITCHES_A_SECOND = 50.0
@@ -58,11 +59,12 @@ def _answers(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
     for policy in policies:
         answers, memory = policy.get("answers"), policy.get("memory")
         if answers and answers["strays"]:
+            worst = answers["worst"]
+            how = "not finite, or of another shape" if worst is None else f"relative difference up to {worst:.3g}"
             yield Finding(
                 "invalid",
                 f"{policy['name']} answered {answers['strays']} of {answers['looked']} observations otherwise than in "
-                f"an unhurried pass before (relative difference up to {answers['worst']:.3g}, first in call "
-                f"{answers['first'] + 1})",
+                f"an unhurried pass before ({how}, first in call {answers['first'] + 1})",
                 "a fast wrong answer is no inference: check the engine and its version, then the memory of the machine",
             )
         if memory and memory["remembers"]:
@@ -163,7 +165,7 @@ def _clock(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
 def _later(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
     """Tell of a policy alone that did not settle; several in turns slow down together, and their ratios stand."""
     policy, *others = found["policies"]
-    samples = [value for block in policy["blocks_ms"] for value in block]
+    samples = samples_of(policy)
     quarter = len(samples) // 4
     if quarter < FEWEST or sustained or others:
         return

@@ -77,6 +77,9 @@ app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")
 app.add_typer(samples, name="samples")
 
+KEEPING = frozenset(("optimize", "export", "quantize"))
+"""Commands whose finished stages stay in the cache when they are interrupted."""
+
 
 def _end_on_signals() -> None:
     """Let SIGTERM and SIGHUP end the program as Ctrl-C does: what it started is ended, what it began is removed."""
@@ -113,7 +116,7 @@ def main(arguments: list[str] | None = None) -> None:
             typer.echo(f"  fix: {error.fix}", err=True)
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        kept = "; finished stages are kept" if set(sys.argv[1:2]) & {"optimize", "export", "quantize"} else ""
+        kept = "; finished stages are kept" if KEEPING.intersection((arguments or sys.argv[1:])[:1]) else ""
         typer.echo(f"interrupted{kept}", err=True)
         sys.exit(INTERRUPTED)
     except BrokenPipeError:

@@ -22,7 +22,7 @@ import sys
 import tarfile
 import time
 from pathlib import Path, PurePosixPath
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn, cast
 
 from vlatool.launch._place import BLOCK, Guard, Place, Refused, kill
 
@@ -152,9 +152,7 @@ def run(line: Line, place: Place, guard: Guard, message: dict[str, Any]) -> dict
 
 def _follow(line: Line, agent: subprocess.Popen[bytes]) -> bytes:
     """Tell what the agent says until it has ended, and return the end of what it logged."""
-    assert agent.stdout is not None
-    assert agent.stderr is not None
-    said, logged = agent.stdout.fileno(), agent.stderr.fileno()
+    said, logged = cast(IO[bytes], agent.stdout).fileno(), cast(IO[bytes], agent.stderr).fileno()
     streams, rest, log = [said, logged], b"", b""
     heard, ended = time.monotonic(), 0.0
     while streams or agent.poll() is None:

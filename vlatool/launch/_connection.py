@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 from vlatool.errors import MissingExtra, TargetError
 
@@ -108,9 +108,7 @@ class Connection:
                 "A benchmark on another machine needs the program ssh, which is not on this one.",
                 "install the OpenSSH client, for example: apt install openssh-client",
             ) from error
-        assert self._ssh.stdin is not None
-        assert self._ssh.stdout is not None
-        self._in, self._out = self._ssh.stdin, self._ssh.stdout
+        self._in, self._out = cast(IO[bytes], self._ssh.stdin), cast(IO[bytes], self._ssh.stdout)
         os.set_blocking(self._in.fileno(), False)
 
     def send(self, data: bytes) -> bool:

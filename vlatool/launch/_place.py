@@ -36,8 +36,13 @@ class Place:
 
     @property
     def path(self) -> Path:
-        """Where it is."""
-        assert self._path is not None
+        """Where it is.
+
+        Raises:
+            Refused: before it is made, and once it is removed.
+        """
+        if self._path is None:
+            raise Refused("no place", "the directory of the run is gone")
         return self._path
 
     def make(self) -> None:

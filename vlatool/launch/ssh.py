@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import vlatool
-from vlatool import errors
-from vlatool.benchmark._child import SAID
+from vlatool.benchmark._child import SAID, message, raise_said, signal_name
 from vlatool.bundle import Bundle
 from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.launch import _probe, _push
@@ -107,10 +106,10 @@ def _find_python(
     connection.doing = "while it looked for a Python"
     told: list[dict[str, Any]] = []
     while True:
-        told.append(message := connection.receive(PROBE_S))
-        if "none" in message:
+        told.append(heard := connection.receive(PROBE_S))
+        if "none" in heard:
             raise _probe.refusal(target, python, told, packages)
-        facts: dict[str, Any] = message.get("python", {})
+        facts: dict[str, Any] = heard.get("python", {})
         if facts and set(packages) == set(facts["packages"]):
             return facts
 
@@ -165,30 +164,26 @@ def _follow(connection: Connection, target: str, there: Mapping[str, str], tell:
     """Pass on what the agent tells until it has ended, and return its result."""
     answer: dict[str, Any] = {}
     while True:
-        message = connection.receive(alive=True)
-        if "agent" in message:
-            said = _said(str(message["agent"]), there)
+        heard = connection.receive(alive=True)
+        if "agent" in heard:
+            said = _said(str(heard["agent"]), there)
             if "progress" in said:
                 _pass_on(said["progress"], tell)
             elif "result" in said or SAID in said:
                 answer = said
-        elif "ended" in message or "refused" in message:
-            if message.get("left"):
-                tell(f"{target} could not remove {message['left']}", None)
-            if "refused" in message:
-                raise _refused(target, message)
-            return _result(target, answer, message["ended"])
+        elif "ended" in heard or "refused" in heard:
+            if heard.get("left"):
+                tell(f"{target} could not remove {heard['left']}", None)
+            if "refused" in heard:
+                raise _refused(target, heard)
+            return _result(target, answer, heard["ended"])
 
 
 def _said(line: str, there: Mapping[str, str]) -> dict[str, Any]:
     """Return a line of the agent, with the bundles under their local names; empty for anything else."""
     for remote, local in there.items():
         line = line.replace(json.dumps(remote)[1:-1], json.dumps(local)[1:-1])
-    try:
-        found = json.loads(line)
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
+    return message(line)
 
 
 def _pass_on(progress: Any, tell: Tell) -> None:
@@ -199,10 +194,7 @@ def _pass_on(progress: Any, tell: Tell) -> None:
 
 def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) -> dict[str, Any]:
     """Return the agent's result, or raise what it raised or why there is none."""
-    if SAID in answer:
-        kind = getattr(errors, str(answer[SAID]), None)
-        raised = kind if isinstance(kind, type) and issubclass(kind, VlatoolError) else TargetError
-        raise raised(str(answer.get("message", "")), str(answer.get("fix", "")))
+    raise_said(answer, otherwise=TargetError)
     code = int(ended["code"])
     last = next(
         (line.strip() for line in reversed(str(ended["log"]).splitlines()) if line.strip()), "it logged nothing"
@@ -214,17 +206,10 @@ def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) ->
             f"look for it with: ssh {target} dmesg; free memory there, or choose a smaller bundle",
         )
     if code < 0:
-        raise TargetError(f"The benchmark on {target} was ended by {_name(code)}; its last line: {last}")
+        raise TargetError(f"The benchmark on {target} was ended by {signal_name(code)}; its last line: {last}")
     if code or not isinstance(answer.get("result"), dict):
         raise TargetError(
             f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}"
         )
     result = dict(answer["result"])
     return {**result, "log": f"{ended['log']}{result.get('log', '')}"}
-
-
-def _name(code: int) -> str:
-    try:
-        return signal.Signals(-code).name
-    except ValueError:
-        return f"signal {-code}"

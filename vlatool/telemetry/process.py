@@ -52,7 +52,7 @@ class ProcessReader(Reader):
             return found
         if root == ROOT:
             with contextlib.suppress(ImportError):
-                found = cls(root, importlib.import_module("psutil").Process(*[number][: bool(number)]))
+                found = cls(root, importlib.import_module("psutil").Process(number or None))
             if found.read():
                 return found
         return Absent(cls.name, "there is no /proc; elsewhere than on Linux: pip install psutil")
