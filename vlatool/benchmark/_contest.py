@@ -116,7 +116,12 @@ def latency_measurements(
 
 
 def percentile_measurements(
-    what: str, samples: Sequence[float], percents: Sequence[float], refusals: bool, most: float, seconds: float
+    what: str,
+    samples: Sequence[float],
+    percents: Sequence[float],
+    refusals: bool = False,
+    most: float = math.inf,
+    seconds: float = 0.0,
 ) -> list[Measurement]:
     """Return percentiles in ms, each with its upper bound at 99 %.
 
@@ -129,7 +134,7 @@ def percentile_measurements(
         percents: 0-100.
         refusals: Whether a percentile that the samples cannot bound is named.
         most: Independent calls that the samples are worth at most; 0 where nothing can be said.
-        seconds: That it took to take them.
+        seconds: That it took to take them, for the refusals.
     """
     found = []
     for percent in percents:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.benchmark._contest import latency_measurements, speedup_of
+from vlatool.benchmark._contest import latency_measurements, percentile_measurements, speedup_of
 from vlatool.benchmark._paced import overloaded, paced_measurements
 from vlatool.benchmark._probe import PARTS
 from vlatool.report import Measurement
@@ -125,15 +125,15 @@ def cold(policy: Mapping[str, Any]) -> list[Measurement]:
 
 
 def sustained(samples: Sequence[float]) -> list[Measurement]:
-    """Return the median at the start of a long run and at its end, and their ratio."""
+    """Return the median at the start of a long run and at its end, each with its bound, and their ratio."""
     count = max(1, int(WINDOW * len(samples)))
-    start, end = (float(np.median(part)) for part in (samples[:count], samples[-count:]))
-    note = f"median of the {{}} {100 * WINDOW:g} % of the run"
-    return [
-        Measurement("latency_start_p50", start, "ms", samples=count, note=note.format("first")),
-        Measurement("latency_sustained_p50", end, "ms", samples=count, note=note.format("last")),
-        Measurement("sustained_slowdown", end / start, "x", samples=2 * count, note="end over start of the run"),
-    ]
+    found = []
+    for name, which, part in (("start", "first", samples[:count]), ("sustained", "last", samples[-count:])):
+        (middle,) = percentile_measurements(f"latency_{name}", part, (50.0,))
+        found.append(replace(middle, note=f"median of the {which} {100 * WINDOW:g} % of the run"))
+    slowdown = found[1].value / found[0].value
+    note = "end over start of the run"
+    return [*found, Measurement("sustained_slowdown", slowdown, "x", samples=2 * count, note=note)]
 
 
 def raw(found: Mapping[str, Any], policy: Mapping[str, Any], alone: bool) -> dict[str, list[float]]:
