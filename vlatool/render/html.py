@@ -71,7 +71,7 @@ class HtmlRenderer:
         if not variants:
             return ""
         aim = latency(report)
-        sub = "Each curve climbs to the share of inferences that were at least as fast; the dots are p50, p90 and p99. "
+        sub = "Each curve climbs to the share of inferences that were at least as fast; dots: p50, p90, p99 if known. "
         sub += f"Below, the same samples as histograms with the same marks. {beyond(variants, aim.limit)} "
         drawing = self._both(lambda width: distribution(variants, aim, width))
         where = f"{measured_where(report)}. {sub}{left_out(report)}"
