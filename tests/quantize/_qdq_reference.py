@@ -57,11 +57,11 @@ def quantized(
     return model, layers
 
 
-def rounded(values: Array, style: Style, low: float = -3.0, high: float = 3.0) -> Array:
-    """Reference: an activation after quantization."""
+def rounded(values: Array, style: Style, low: float = -3.0, high: float = 3.0, convolved: bool = False) -> Array:
+    """Reference: an activation after quantization; ``convolved`` when a convolution reads it."""
     kind = style.activations
     if kind == "symmetric":
-        kind = "uint8" if low >= 0 else "int8"
+        kind = "uint8" if low >= 0 or convolved else "int8"
     if kind == "int8":
         low, high = -max(-low, high), max(-low, high)
     first, last = (0, 255) if kind == "uint8" else (-127, 127)

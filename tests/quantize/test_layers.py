@@ -55,7 +55,7 @@ def test_pooling_is_passed_too() -> None:
         { p = MaxPool<kernel_shape=[2,2], strides=[2,2]>(x)  y = Conv(p, w) }"""
     model, _ = quantized(graph(text, w=w), STYLES["hoist"], {})
     assert model.graph.node[0].op_type == "QuantizeLinear"
-    pooled = rounded(IMAGE, STYLES["hoist"]).reshape(1, 3, 4, 2, 4, 2).max((3, 5))
+    pooled = rounded(IMAGE, STYLES["hoist"], convolved=True).reshape(1, 3, 4, 2, 4, 2).max((3, 5))
     close(run(model, x=IMAGE)["y"], conv(pooled, rounded_weight(w, STYLES["hoist"], 0)))
 
 

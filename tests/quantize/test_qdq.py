@@ -27,6 +27,7 @@ from vlatool.errors import GraphError
 from vlatool.quantize._layers import Layer, Style, check_weights, find_layers
 from vlatool.quantize._nodes import read_names
 from vlatool.quantize._qdq import quantize_weight
+from vlatool.runtime.engines.openvino import OpenvinoSession
 
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES)
@@ -59,7 +60,9 @@ class TestLayers:
             { c = Conv<strides=[4,4]>(x, w, b)  y = Relu(c)  z = Reshape(y, to) }"""
         model, layers = quantized(graph(text, w=w, b=b, to=np.array([1, 5, 4])), style, {"y": (0.0, 3.0)})
         assert layers[0].output == "y"
-        wanted = np.maximum(conv(rounded(IMAGE, style), rounded_weight(w, style, 0)) + b[:, None, None], 0)
+        wanted = np.maximum(
+            conv(rounded(IMAGE, style, convolved=True), rounded_weight(w, style, 0)) + b[:, None, None], 0
+        )
         if style.fused_convolutions:
             wanted = rounded(wanted, style, 0.0, 3.0)
             assert kinds(model)["QuantizeLinear"] == 2
@@ -120,7 +123,7 @@ def test_what_a_convolution_gives_as_an_output_stays_float(style: Style) -> None
     w = weight(5, 3, 4, 4, scale=0.1)
     text = "(float[1,3,8,8] x) => (float[1,5,2,2] y) { y = Conv<strides=[4,4]>(x, w) }"
     model, _ = quantized(graph(text, w=w), style, {"y": (-0.001, 0.001)})
-    close(run(model, x=IMAGE)["y"], conv(rounded(IMAGE, style), rounded_weight(w, style, 0)))
+    close(run(model, x=IMAGE)["y"], conv(rounded(IMAGE, style, convolved=True), rounded_weight(w, style, 0)))
 
 
 def test_the_bias_of_a_dead_channel_survives_int32() -> None:
@@ -226,3 +229,26 @@ def test_random_graphs_stay_near_float_in_every_style(seed: int) -> None:
         got = run(model, x=x)
         for name in outputs:
             assert np.linalg.norm(got[name] - seen[name]) <= 0.3 * np.linalg.norm(seen[name]) + 1e-3
+
+
+NEAR_CONCAT = {
+    "before": """(float[1,8,8,8] a, float[1,8,8,8] b) => (float[1,16,8,8] y)
+        { x = Concat<axis=1>(a, b)  y = Conv(x, w, k) }""",
+    "after, as patches and a class token": """(float[1,8,8,16] a, float[1,8,8,16] b) => (float[1,65,16] y)
+        { s = Add(a, b)  x = Transpose<perm=[0,3,1,2]>(s)  c = Conv(x, w, k)  r = Reshape(c, to)
+          t = Transpose<perm=[0,2,1]>(r)  y = Concat<axis=1>(token, t) }""",
+}
+
+
+@pytest.mark.parametrize("text", NEAR_CONCAT.values(), ids=NEAR_CONCAT)
+def test_openvino_computes_convolutions_near_a_concat_as_they_are_written(text, tmp_path):
+    known = {"w": weight(16, 16, 1, 1, scale=0.2), "k": weight(16), "to": np.array([1, 16, 64])}
+    known["token"] = weight(1, 1, 16, seed=3)
+    used = {name: value for name, value in known.items() if f"{name})" in text or f"{name}," in text}
+    model, _ = quantized(graph(text, **used), Style("symmetric", hoist=True), {})
+    onnx.save(model, tmp_path / "graph.onnx")
+    feeds = {value.name: weight(*(each.dim_value for each in value.type.tensor_type.shape.dim), seed=seed, scale=0.7)
+             for seed, value in enumerate(model.graph.input)}  # fmt: skip
+    wanted = run(model, **feeds)["y"]
+    got = OpenvinoSession(tmp_path / "graph.onnx", 1).run(feeds)["y"]
+    assert np.linalg.norm(got - wanted) < 0.02 * np.linalg.norm(wanted)

@@ -48,8 +48,8 @@ class Style:
     """How layers are written.
 
     Args:
-        activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, and uint8 with the zero
-            point 0 for what is never negative.
+        activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, uint8 with the zero point
+            0 for what is never negative, and uint8 with a zero point for what a convolution reads.
         per_channel: One weight scale for each output channel.
         reduce_range: 7-bit weights.
         fused_convolutions: Quantize a convolution's bias and output too: ONNX Runtime then computes it in int8.
@@ -178,6 +178,15 @@ def wanted_values(layers: Iterable[Layer], style: Style, moved: Mapping[str, str
         if style.fused_convolutions and layer.kind == "Conv":
             found[layer.output] = None
     return list(found)
+
+
+def convolved(layers: Iterable[Layer], moved: Mapping[str, str]) -> set[str]:
+    """Return the values that are quantized for a convolution.
+
+    On x86 processors without AMX, OpenVINO (2025.2 to 2026.4) turns signed inputs of convolutions into unsigned ones,
+    and loses their scale where a Concat is near; unsigned ones it computes as they are written, everywhere.
+    """
+    return {moved.get(name, name) for layer in layers if layer.kind == "Conv" for name in layer.activations}
 
 
 def split_gemm(model: Any) -> int:

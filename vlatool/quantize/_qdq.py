@@ -13,6 +13,7 @@ from vlatool.errors import GraphError, require
 from vlatool.quantize._layers import (
     Layer,
     Style,
+    convolved,
     hoisted,
 )
 from vlatool.quantize._nodes import read_names
@@ -55,6 +56,7 @@ class _Writer:
         self.graph = self.model.graph
         self.constants = {tensor.name: tensor for tensor in self.graph.initializer}
         self.outputs = {value.name for value in self.graph.output}
+        self.convolved = convolved(self.layers.values(), self.moved)
 
     def write(self) -> None:
         """Rebuild the list of nodes with the pairs before their first reader."""
@@ -122,7 +124,7 @@ class _Writer:
         low, high = self.ranges[name]
         kind = self.style.activations
         if kind == "symmetric":
-            kind = "uint8" if low >= 0 else "int8"
+            kind = "uint8" if low >= 0 or name in self.convolved else "int8"
         if kind == "int8":  # its zero point is 0, so that a range to one side would lose half of it
             low, high = -max(-low, high), max(-low, high)
         lowest, highest, dtype = ACTIVATION[kind]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -15,7 +15,16 @@ from vlatool.errors import RecipeError, nearest, require
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, read, save
 from vlatool.quantize._integer_matmul import use_integer_matmul
-from vlatool.quantize._layers import Layer, Style, check_weights, find_layers, hoisted, split_gemm, wanted_values
+from vlatool.quantize._layers import (
+    Layer,
+    Style,
+    check_weights,
+    convolved,
+    find_layers,
+    hoisted,
+    split_gemm,
+    wanted_values,
+)
 from vlatool.quantize._pixels import use_convolutions
 from vlatool.quantize._qdq import Range, insert_qdq
 from vlatool.quantize._ranges import Statistics, choose_range
@@ -48,7 +57,8 @@ class StaticInt8(Calibrated):
     )
     percentile: float = Field(99.99, gt=50, le=100, description="for the method percentile")
     activations: Literal["auto", "uint8", "int8"] = Field(
-        "auto", description="activation type; auto: uint8, and for openvino symmetric, which its kernels compute faster"
+        "auto",
+        description="activation type; auto: uint8, and for openvino int8 into products, where its kernels are faster",
     )
     per_channel: bool = Field(True, description="one weight scale for each output channel")
     reduce_range: bool = Field(False, description="7-bit weights, for x86 processors without VNNI")
@@ -74,7 +84,7 @@ class StaticInt8(Calibrated):
         kind: Literal["uint8", "int8", "symmetric"] = "uint8"
         if self.activations != "auto":
             kind = self.activations
-        elif own:
+        elif own and not self.convolutions:
             kind = "symmetric"
         return Style(kind, self.per_channel, self.reduce_range, fused_convolutions=not own, hoist=own)
 
@@ -107,7 +117,9 @@ class StaticInt8(Calibrated):
             model = load(original)
             if self.layout == "ort":
                 split_gemm(model)
-            insert_qdq(model, self._rewritten(model, layers[name]), self.ranges(found[name]), self.style)
+            chosen = self._rewritten(model, layers[name])
+            unsigned = convolved(chosen, hoisted(model, chosen, self.style))
+            insert_qdq(model, chosen, self.ranges(found[name], unsigned), self.style)
             if self.layout == "ort":
                 use_integer_matmul(model)
             if self.layout == "openvino":
@@ -132,11 +144,22 @@ class StaticInt8(Calibrated):
                 )
         return made
 
-    def ranges(self, statistics: Mapping[str, Statistics]) -> dict[str, Range]:
-        """Return value -> (low, high) that activations are quantized over."""
+    def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
+        """Return value -> (low, high) that activations are quantized over.
+
+        Args:
+            statistics: Of each value.
+            unsigned: Values that are written as uint8 where others are symmetric.
+        """
         kind = self.style.activations
         return {
-            name: choose_range(each, self.method, self.percentile, kind != "uint8", kind == "symmetric")
+            name: choose_range(
+                each,
+                self.method,
+                self.percentile,
+                kind == "int8" or (kind == "symmetric" and name not in unsigned),
+                kind == "symmetric",
+            )
             for name, each in statistics.items()
         }
 
