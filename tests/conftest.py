@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from vlatool.bundle import Bundle, seal
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 POLICY_YAML = """\
 schema: 1
@@ -337,6 +338,21 @@ def points_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def points_file(points_template: Path, tmp_path: Path) -> Path:
     """Sixty published latencies that the test may change."""
     return Path(shutil.copyfile(points_template, tmp_path / "points.csv"))
+
+
+@pytest.fixture
+def wrong_engine(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """A function that lets ONNX Runtime give so many times what the graph says, as a wrong kernel would."""
+    real = OrtCpuSession.run
+
+    def make(factor: float) -> None:
+        def run(self: OrtCpuSession, feeds: Any) -> dict[str, Any]:
+            by = np.float32(factor if self.optimized else 1)
+            return {name: value * by for name, value in real(self, feeds).items()}
+
+        monkeypatch.setattr(OrtCpuSession, "run", run)
+
+    return make
 
 
 @pytest.fixture

@@ -2,9 +2,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from vlatool.bundle import Bundle, hash_file
-from vlatool.finish import carry_over, reseal, save_npz
+from vlatool.bundle import Bundle, hash_file, restate
+from vlatool.data import observations_for
+from vlatool.errors import GraphError
+from vlatool.finish import ENGINE_DIFFERENCE, carry_over, finish, reseal, save_npz
 from vlatool.runtime import load
 from vlatool.runtime.policy import load_golden
 
@@ -32,7 +35,7 @@ def test_a_bundle_can_be_sealed_elsewhere_under_another_manifest(tmp_path: Path,
     opened = Bundle.open(tmp_path)
     assert opened.manifest.accuracy == {"success": {"value": 0.9}}
     assert not any(name.startswith("data/") for name in opened.manifest.files)
-    assert load(tmp_path, threads=1).golden_error == 0.0
+    assert load(tmp_path, threads=1).golden_error == pytest.approx(0, abs=1e-5)
 
 
 def test_a_derived_bundle_names_its_parent_and_keeps_the_policy(source_bundle, float_bundle):
@@ -43,6 +46,58 @@ def test_a_derived_bundle_names_its_parent_and_keeps_the_policy(source_bundle, f
         assert getattr(made, name) == getattr(source, name)
     assert made.source["factory"] == "policy.py:make"
     assert "arguments" not in made.source
+
+
+def again(bundle: Bundle, out: Path) -> Bundle:
+    """Make a bundle with the graphs of another."""
+    carry_over(bundle, out, ("assets", "data", "graphs"))
+    seen = observations_for(bundle, 2)
+    return finish(bundle, out, made_by={"stage": "quantize.x"}, graphs=bundle.manifest.graphs, observations=seen)
+
+
+def test_the_golden_action_is_what_the_graph_says_and_not_what_the_engine_gives(float_bundle, wrong_engine, tmp_path):
+    right = load_golden(again(float_bundle, tmp_path / "right"))
+    wrong_engine(1.5)
+    wrong = load_golden(again(float_bundle, tmp_path / "wrong"))
+    np.testing.assert_array_equal(right[2], wrong[2])
+
+
+@pytest.mark.parametrize(("factor", "tolerance"), [(1.0, 0.01), (1.008, 0.017), (1.03, 0.045), (1.1, 0.121)])
+def test_the_tolerance_of_the_golden_action_is_what_was_measured_and_some_more(
+    float_bundle, wrong_engine, tmp_path, factor, tolerance
+):
+    wrong_engine(factor)
+    made = again(float_bundle, tmp_path)
+    assert made.manifest.golden_tolerance == pytest.approx(tolerance, abs=0.0011)
+    assert load(tmp_path, threads=1, accept=[ENGINE_DIFFERENCE]).golden_error == pytest.approx(factor - 1, abs=1e-3)
+
+
+def test_an_engine_that_is_further_from_the_graph_than_rounding_is_a_finding(float_bundle, wrong_engine, tmp_path):
+    wrong_engine(1.03)
+    assert again(float_bundle, tmp_path / "rounded").manifest.findings == ()
+    wrong_engine(1.1)
+    (found,) = again(float_bundle, tmp_path / "wrong").manifest.findings
+    assert (found["name"], found["stage"], found["allowed"]) == ("engine-difference", "quantize.x", 0.045)
+    assert found["value"] == pytest.approx(0.1, abs=1e-3)
+    assert "the engine ort_cpu computes another action than the graphs say" in found["message"]
+
+
+def test_a_bundle_with_a_finding_is_refused_unless_it_is_overruled_by_name(float_bundle, wrong_engine, tmp_path):
+    wrong_engine(1.1)
+    again(float_bundle, tmp_path)
+    with pytest.raises(GraphError, match=r"found to be wrong when it was made \(engine-difference\)") as caught:
+        load(tmp_path, threads=1)
+    assert caught.value.fix.endswith("accept the finding by name: engine-difference")
+    with pytest.raises(GraphError, match="found to be wrong"):
+        load(tmp_path, threads=1, accept=["another"])
+    assert load(tmp_path, threads=1, accept=["engine-difference"]).spec == float_bundle.manifest.spec
+
+
+def test_what_was_wrong_with_the_source_stays_but_its_engine_is_looked_at_anew(float_bundle, copied, tmp_path):
+    source = copied(float_bundle)
+    told = ({"name": ENGINE_DIFFERENCE, "message": "m"}, {"name": "other", "message": "o"})
+    source = restate(source, replace(source.manifest, findings=told))
+    assert again(source, tmp_path / "made").manifest.findings == told[1:]
 
 
 def test_the_golden_file_holds_inputs_and_the_raw_action(float_bundle):

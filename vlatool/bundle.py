@@ -94,6 +94,12 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     return Bundle(directory, sealed)
 
 
+def restate(bundle: Bundle, manifest: Manifest) -> Bundle:
+    """Write another manifest for a bundle whose files stay as they are, and return it."""
+    (bundle.path / MANIFEST).write_bytes(manifest_bytes(manifest))
+    return Bundle(bundle.path, manifest)
+
+
 def manifest_bytes(manifest: Manifest) -> bytes:
     """Return the one way in which a manifest is written."""
     return (json.dumps(manifest.to_dict(), indent=1, ensure_ascii=False) + "\n").encode()

@@ -77,6 +77,7 @@ class Gate(BaseModel):
     memory: GrowthClaim | None = GrowthClaim(margin=0.1)
     size: GrowthClaim | None = GrowthClaim(margin=0.1)
     deadline: DeadlineClaim | None = None
+    accept: tuple[str, ...] = Field((), description="findings of the bundles that are overruled, by name")
 
     @model_validator(mode="after")
     def _something_is_claimed(self) -> Gate:

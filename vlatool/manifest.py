@@ -11,6 +11,8 @@ from vlatool.errors import BundleError, SpecError, nearest
 from vlatool.spec import PolicySpec
 
 SCHEMA = 1
+GOLDEN_TOLERANCE = 0.05
+"""Allowed relative L2 difference from the golden action where a manifest says none."""
 COMPUTES = ("", "float32", "bfloat16")
 DISTRIBUTIONS = ("normal", "uniform", "zeros")
 
@@ -115,7 +117,11 @@ class Manifest:
         source: Factory and hashes of the code and weights (a source bundle, and those exported from it).
         environment: Factory and tasks of the closed-loop evaluation.
         parts: Part of the policy -> globs of module names.
-        golden: File with golden inputs and outputs.
+        golden: File with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
+        golden_tolerance: Largest relative L2 difference from the golden action with which a machine loads the bundle,
+            from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
+        findings: What a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
+            and ``gate`` refuse the bundle unless each is overruled by its name.
         accuracy: Measured accuracy: name -> value, interval, samples.
         description: One sentence.
         license: SPDX identifier of the policy's licence.
@@ -136,6 +142,8 @@ class Manifest:
     environment: dict[str, Any] = field(default_factory=dict)
     parts: dict[str, list[str]] = field(default_factory=dict)
     golden: str = ""
+    golden_tolerance: float = 0.0
+    findings: tuple[dict[str, Any], ...] = ()
     accuracy: dict[str, Any] = field(default_factory=dict)
     description: str = ""
     license: str = ""
@@ -180,6 +188,7 @@ class Manifest:
             values["graphs"] = {name: Graph(**graph) for name, graph in data.get("graphs", {}).items()}
             values["program"] = program_from(data.get("program", []))
             values["build"] = _build_record(data.get("build", ()))
+            values["findings"] = _findings(data.get("findings", ()))
             values["files"] = {path: FileRecord(**record) for path, record in data.get("files", {}).items()}
         except (TypeError, AttributeError) as error:
             raise BundleError(f"The manifest is malformed: {error}.", "export the policy again") from error
@@ -267,6 +276,15 @@ def _inside(path: str) -> None:
     pure = PurePosixPath(path)
     if pure.is_absolute() or ".." in pure.parts or not path:
         raise BundleError(f"The manifest names the file '{path}', which is not inside the bundle.")
+
+
+def _findings(data: Any) -> tuple[dict[str, Any], ...]:
+    def named(each: Any) -> bool:
+        return isinstance(each, Mapping) and all(isinstance(each.get(key), str) for key in ("name", "message"))
+
+    if not isinstance(data, list | tuple) or not all(map(named, data)):
+        raise BundleError("The manifest has malformed 'findings'; they must be mappings with 'name' and 'message'.")
+    return tuple(dict(each) for each in data)
 
 
 def _build_record(data: Any) -> tuple[dict[str, Any], ...]:

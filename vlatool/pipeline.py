@@ -25,7 +25,7 @@ from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
 from vlatool.report import Measurement, Report, Row
-from vlatool.runtime.policy import DEFAULT_ENGINE
+from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
 from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
 from vlatool.sources.onnx import OnnxFile
@@ -244,6 +244,7 @@ def _chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: C
         context.tell(stage.name(), None)
         stage.check(bundle, plan.profile)
         bundle = cached_transform(stage, bundle, plan.cache, context)
+    refuse_findings(bundle, plan.recipe.limits.accept)
     return bundle
 
 

@@ -26,6 +26,8 @@ class Limits(BaseModel):
     max_latency_ms: float | None = Field(None, gt=0, description="largest latency of one inference")
     max_memory_mb: float | None = Field(None, gt=0, description="largest memory of the process, 10^6 bytes")
 
+    accept: tuple[str, ...] = Field((), description="findings of a bundle that are overruled, by name")
+
     @model_validator(mode="after")
     def _metric_has_a_bound(self) -> Limits:
         if bool(self.metric) != (self.max_metric is not None):

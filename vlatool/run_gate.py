@@ -16,6 +16,7 @@ from vlatool.errors import BundleError
 from vlatool.gate import Gate, LatencyClaim
 from vlatool.host import before_run
 from vlatool.report import Measurement, Report, Row
+from vlatool.runtime.policy import refuse_findings
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context
 from vlatool.telemetry import Recorder, open_all
@@ -67,6 +68,7 @@ def _check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
     for bundle in (candidate, baseline):
         if not bundle.manifest.graphs:
             raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+        refuse_findings(bundle, gate.accept)
     for kind in ("inputs", "outputs"):
         mine, theirs = (
             {each.name: each for each in getattr(bundle.manifest.spec, kind)} for bundle in (candidate, baseline)

@@ -32,6 +32,7 @@ from vlatool.launch import cached_measure, cached_transform
 from vlatool.profile import Profile
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.recipe import Limits, StageList, stage_entries
+from vlatool.runtime.policy import refuse_findings
 from vlatool.stage import Context, Transform, build_stage
 
 if TYPE_CHECKING:
@@ -152,6 +153,7 @@ class Search:
             for stage in built(stages):
                 stage.check(bundle, self.profile)
                 bundle = cached_transform(stage, bundle, self.cache, quiet)
+            refuse_findings(bundle, self.limits.accept)
             twin = self._seen.setdefault(graphs_of(bundle), name)
             if twin != name:  # no product has enough rows to become a convolution, say
                 raise GraphError(f"It has the graphs of {twin}.")

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
-RECORD = 1
-"""Version of the build record, part of the cache key: an output without a record is not taken for one with it."""
+RECORD = 2
+"""Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
 
 
 def _silent(_what: str, _share: float | None) -> None:

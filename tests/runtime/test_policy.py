@@ -162,7 +162,7 @@ def test_loading_without_warm_up_skips_the_golden_check(float_bundle):
 def test_a_machine_that_computes_another_golden_action_is_refused(float_bundle, copied):
     bundle = damage_golden(copied(float_bundle), lambda name, value: value * 2 if name.startswith("out.") else value)
     with pytest.raises(
-        GraphError, match=r"another golden action than recorded: relative error 0.5, allowed 0.25"
+        GraphError, match=r"another golden action than recorded: relative error 0.5, allowed 0.01"
     ) as caught:
         load(bundle.path, threads=1)
     assert "vlatool doctor" in caught.value.fix

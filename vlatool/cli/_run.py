@@ -13,7 +13,7 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, progress, refuse_existing, show
-from vlatool.errors import BundleError, MissingExtra, UsageError
+from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.launch import cache_directory, run_transform
 from vlatool.report import Report
 from vlatool.stage import Context, Measure, Transform
@@ -80,14 +80,28 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         made = run_transform(stage, bundle, out, context, force=force)
     summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
     precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
+    findings = made.manifest.findings
     if as_json:
-        typer.echo(json.dumps({**summary, "precision": precision}))
+        typer.echo(json.dumps({**summary, "precision": precision, "findings": findings}))
+        _refuse(made)
         return
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
     for line in stage.lines(made):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
+    _refuse(made)
+
+
+def _refuse(made: Bundle) -> None:
+    """Leave with an error when a stage found the bundle to be wrong; it is there all the same, to be looked at.
+
+    Raises:
+        GateFailed: naming the first finding.
+    """
+    for finding in made.manifest.findings:
+        fix = f"vlatool explain {made.path}; load, optimize and gate refuse the bundle (to overrule: {finding['name']})"
+        raise GateFailed(f"{made.path} was written, but it is wrong: {finding['message']}", fix)
 
 
 def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:

@@ -43,6 +43,7 @@ def describe(bundle: Bundle) -> list[str]:
         size = manifest.files[graph.file].bytes / 1e6
         lines.append(f"  graph      {name}: {size:.2f} MB, opset {graph.opset}, MACs: {shares}")
     lines += _lineage(manifest)
+    lines += [f"  WRONG      {each['name']}: {each['message']}" for each in manifest.findings]
     return lines
 
 

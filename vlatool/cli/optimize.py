@@ -25,6 +25,9 @@ def optimize(
     hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
     max_latency_ms: Annotated[float | None, typer.Option(min=0.001, help="largest latency of one inference")] = None,
     max_memory_mb: Annotated[float | None, typer.Option(min=1, help="largest memory of the process")] = None,
+    accept: Annotated[
+        list[str] | None, typer.Option(help="overrule a finding of a candidate by its name (see: vlatool inspect)")
+    ] = None,
     search: Annotated[
         bool | None, typer.Option("--search/--no-search", help="search for faster plans (default without --recipe)")
     ] = None,
@@ -57,6 +60,7 @@ def optimize(
         if value is not None and not math.isfinite(value):
             raise UsageError(f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.")
         asked |= {} if value is None else {name: value}
+    asked |= {"accept": tuple(accept)} if accept else {}
     if recipe is None:
         calibrated = pipeline.brings_calibration(source)
         chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine if board else "ort_cpu")

@@ -197,8 +197,8 @@ def _times(found: _Found, options: Options, context: Context) -> None:
 def _sentences(found: _Found, speed: float = math.nan) -> list[str]:
     """Return the findings, what matters most first."""
     again = command(found.made.stage, found.source) if found.made.stage is not None else "see vlatool quantize --help"
-    about_phases = told(found.phases, again)
-    ruined = sum(bool(each.nodes) for each in found.phases)
+    about_phases = [*(each["message"] for each in found.bundle.manifest.findings), *told(found.phases, again)]
+    ruined = len(found.bundle.manifest.findings) + sum(bool(each.nodes) for each in found.phases)
     sentences = about_phases[:ruined]
     if found.layers:
         sentences.append(tables.layers_told(found.layers))

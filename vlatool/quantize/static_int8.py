@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from vlatool.bundle import Bundle
-from vlatool.data import recorded_observations
 from vlatool.errors import RecipeError, nearest, require
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, read, save
@@ -30,14 +28,11 @@ from vlatool.quantize._qdq import Range, insert_qdq
 from vlatool.quantize._ranges import Statistics, choose_range
 from vlatool.quantize._reductions import keep_axes
 from vlatool.quantize._trial_compile import compile_apart
-from vlatool.runtime.policy import Policy, relative_error
 from vlatool.stage import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
-DIFFERENCE = 0.25
-"""Relative L2 difference of two engines on one int8 graph; rounding that falls the other way gives a few percent."""
 ENGINES = {"ort": "", "qdq": "", "openvino": "openvino"}
 
 
@@ -132,17 +127,7 @@ class StaticInt8(Calibrated):
             return "" if self.compute == "float32" else self.compute
 
         made_by = self.made_by(calibration=samples)
-        made = self.transform(bundle, out, context, quantize, ENGINES[self.layout], made_by)
-        if self.layout == "openvino" and self.compute == "float32":
-            context.tell("comparing OpenVINO with ONNX Runtime", None)
-            difference = engines_differ(made, recorded_observations(bundle, 2, self.calibration))
-            if not difference <= DIFFERENCE:
-                warnings.warn(
-                    f"OpenVINO computes other values than the int8 graph says (relative difference {difference:.2g} to "
-                    f"ONNX Runtime, allowed {DIFFERENCE:g}); do not trust this bundle; leave layers out with --exclude",
-                    stacklevel=2,
-                )
-        return made
+        return self.transform(bundle, out, context, quantize, ENGINES[self.layout], made_by)
 
     def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
         """Return value -> (low, high) that activations are quantized over.
@@ -187,17 +172,3 @@ class StaticInt8(Calibrated):
         names = {layer.name for layer in layers}
         again = find_layers(model, QUANTIZED_OPS, attention=self.attention)
         return [layer for layer in again if layer.name in names] + [layer for layer in layers if layer.kind == "Add"]
-
-
-def engines_differ(bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> float:
-    """Return the largest relative L2 difference between the actions of OpenVINO and ONNX Runtime on the same graphs.
-
-    Both run standard QDQ operators, and ONNX Runtime computes them as they are written; OpenVINO rewrites the graph.
-    """
-    action = bundle.manifest.spec.action.name
-    pair = [Policy.open(bundle, engine=engine, threads=1, seed=0) for engine in ("openvino", "ort_cpu")]
-    differences = [0.0]
-    for observation in observations:
-        got, wanted = (policy.infer(observation).outputs[action] for policy in pair)
-        differences.append(relative_error(got, wanted))
-    return max(differences)

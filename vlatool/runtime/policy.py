@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vlatool import registry
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError, GraphError
+from vlatool.manifest import GOLDEN_TOLERANCE
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
@@ -96,12 +97,18 @@ class Policy:
         self._sequence = 0
         self.program.reset()
 
-    def warm_up(self, inferences: int, tolerance: float) -> None:
+    def warm_up(self, inferences: int, tolerance: float | None = None) -> None:
         """Run the golden observation and compare the action with the recorded one.
 
+        Args:
+            inferences: How often.
+            tolerance: Largest relative L2 difference; the one in the manifest when None.
+
         Raises:
-            GraphError: when the relative L2 difference is above ``tolerance`` or not a number.
+            GraphError: when the difference is larger, or not a number.
         """
+        if tolerance is None:
+            tolerance = self.bundle.manifest.golden_tolerance or GOLDEN_TOLERANCE
         golden = load_golden(self.bundle)
         if golden is None:
             return
@@ -115,6 +122,25 @@ class Policy:
                 f"This machine computes another golden action than recorded: relative error {self.golden_error:.3g}, "
                 f"allowed {tolerance:g}.",
                 "the engine or processor may lack what this precision needs; run: vlatool doctor",
+            )
+
+
+def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
+    """Refuse a bundle that a stage found something wrong with.
+
+    Args:
+        bundle: An open bundle.
+        accept: Names of findings that are overruled.
+
+    Raises:
+        GraphError: naming the first finding that is not overruled.
+    """
+    allowed = set(accept)
+    for finding in bundle.manifest.findings:
+        if finding["name"] not in allowed:
+            raise GraphError(
+                f"{bundle.path} was found to be wrong when it was made ({finding['name']}): {finding['message']}",
+                f"make it in another way; to use it all the same, accept the finding by name: {finding['name']}",
             )
 
 

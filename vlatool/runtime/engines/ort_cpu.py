@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,9 @@ class OrtCpuSession:
         MissingExtra: when onnxruntime is not installed.
     """
 
+    optimized: ClassVar[bool] = True
+    """Whether ONNX Runtime may rewrite the graph."""
+
     def __init__(self, path: Path, threads: int | None = None, compute: str = "") -> None:
         ort = require("onnxruntime", "ort")
         if compute not in ("", "float32"):
@@ -51,6 +54,8 @@ class OrtCpuSession:
         options.log_severity_level = 3
         options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
         options.inter_op_num_threads = 1
+        if not self.optimized:
+            options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         try:
             self._session = _open(ort, path, options)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
