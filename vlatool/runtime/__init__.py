@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import os
 
+from vlatool.runtime.arguments import check_load
 from vlatool.runtime.chunks import ChunkQueue
-from vlatool.runtime.policy import Action, Policy
+from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 
@@ -21,6 +22,9 @@ def load(
     seed: int | None = None,
     warmup: int = 2,
     golden_tolerance: float = 0.25,
+    first_run_s: float = FIRST_RUN_S,
+    memory_mb: float | None = None,
+    probe: bool = False,
 ) -> Policy:
     """Load a bundle, verify it, open its graphs and warm them up.
 
@@ -31,11 +35,19 @@ def load(
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).
         golden_tolerance: Largest relative L2 difference between the recorded golden action and this machine's.
+        first_run_s: Seconds that an inference of the warm-up may take before it is stopped. (Opening a graph cannot be
+            stopped, nor can OpenVINO inside of a loop: it goes on until the process ends; ``probe`` can.)
+        memory_mb: Most that inputs and outputs of a graph may declare, and that the probe may take, in 10^6 bytes;
+            2,000 and eight times the size of the graphs when None.
+        probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
+            bundles of others. Takes as long as loading twice and starting Python.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
         SpecError: normalisation statistics or a tokenizer are missing or do not fit.
-        GraphError: the engine refuses a graph, or computes something else than when the bundle was made.
+        GraphError: the engine refuses a graph, the graph does not take and give what the spec declares, it computes
+            something else than when the bundle was made, or a limit is reached.
+        UsageError: an argument makes no sense.
         MissingExtra: the engine is not installed.
 
     Example:
@@ -45,6 +57,12 @@ def load(
     """
     from vlatool.bundle import Bundle
 
-    policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=seed)
-    policy.warm_up(warmup, golden_tolerance)
+    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
+    bundle = Bundle.open(path)
+    if probe:
+        from vlatool.runtime.probe import probe as tried
+
+        tried(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
+    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
+    policy.warm_up(warmup, golden_tolerance, first_run_s)
     return policy
