@@ -205,8 +205,10 @@ class _Decoder:
         tensor = self.tensor
         physical = raw
         if self.normaliser is not None:
-            with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is looked at below
+            try:
                 physical = self.normaliser.inverse(raw)
+            except (RuntimeWarning, FloatingPointError):  # an overflow, where the caller lets numpy raise
+                raise not_finite(tensor.name) from None
         if self._floating and not all_finite(physical):
             raise not_finite(tensor.name)
         if tensor.kind == "discrete":
