@@ -222,6 +222,16 @@ def test_inspect_prints_the_manifest_as_it_is_written(vlatool, int8_bundle):
     assert vlatool("inspect", int8_bundle.path, "--json")[1] == (int8_bundle.path / "manifest.json").read_text()
 
 
+def test_inspect_runs_a_bundle_once_in_a_process_with_limits(vlatool, int8_bundle):
+    code, out, _ = vlatool("inspect", int8_bundle.path, "--probe")
+    assert code == 0
+    assert "probe      ran once: golden error" in out
+    code, _, err = vlatool("inspect", int8_bundle.path, "--probe", "--memory", "20")
+    assert code == 3
+    assert "more than 20 MB of memory" in err
+    assert "--memory MB" in err
+
+
 # ---- reports
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from vlatool.bundle import Bundle, hash_file
 from vlatool.data import recorded_observations
-from vlatool.errors import GraphError, RecipeError, SourceError
+from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
 from vlatool.export._torch_policy import load_modules, torch_policy
 from vlatool.export.onnx import ExportOnnx
 from vlatool.runtime import load
@@ -289,3 +289,30 @@ def test_the_golden_action_is_that_of_the_exported_graph(float_bundle, source_bu
         observation = recorded_observations(source_bundle, 24)[0]
         got = torch_policy(source_bundle).infer(observation).outputs["action"]
         assert relative_error(got, golden["out.action"][0]) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("output", "body", "told"),
+    [
+        ("{name: y, shape: [1, 8, 7]}", "x.repeat(1, 38)[:, :112].reshape(1, 8, 14)", r"float32 \[1, 8, 14\]"),
+        ("{name: y, shape: [1, 8, 7]}", "x.repeat(1, 38)[:, :112]", r"float32 \[1, 112\]"),
+        ("{name: y, shape: [1, 2]}", "self.linear(x).double()", r"float64 \[1, 2\]"),
+        ("{name: y, shape: [1, 3], kind: discrete, labels: [a, b, c]}", "self.linear(x)", r"float32 \[1, 2\]"),
+    ],
+    ids=["wider", "flat", "float64", "two logits"],
+)
+def test_a_module_that_gives_something_else_than_its_spec_declares_is_not_exported(
+    source, tmp_path: Path, output, body, told
+):
+    chunk = "  chunk: 8\n" if "8, 7" in output else ""
+    description = PLAIN_YAML.replace("{name: y, shape: [1, 2]}", output) + chunk
+    bundle = source(PLAIN_PY.replace("BODY", f"return {body}"), description)
+    with pytest.raises(GraphError, match=f"The torch module gives 'y' as {told}; the spec declares") as caught:
+        export(bundle, tmp_path / "out")
+    assert ("cast it" in caught.value.fix) == ("float64" in told)
+
+
+def test_a_chunk_that_the_shape_does_not_hold_is_not_exported(source, tmp_path: Path):
+    bundle = source(PLAIN_PY.replace("BODY", "return self.linear(x)"), PLAIN_YAML + "  chunk: 8\n")
+    with pytest.raises(SpecError, match="chunk 8; the shape"):
+        export(bundle, tmp_path / "out")

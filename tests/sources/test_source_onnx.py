@@ -121,3 +121,17 @@ def test_an_operator_that_the_engine_does_not_know(tmp_path: Path):
 def test_a_rate_must_be_above_zero(tmp_path: Path):
     with pytest.raises(RecipeError, match="control_hz"):
         build_stage("sources.onnx", {"model": tmp_path / "a.onnx", "control_hz": 0})
+
+
+def test_a_file_whose_action_has_a_time_axis_is_a_chunk_of_which_one_action_is_executed(tmp_path: Path):
+    path = tmp_path / "chunked.onnx"
+    graph = helper.make_graph(
+        [helper.make_node("Neg", ["x"], ["y"])],
+        "main",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, (1, 8, 7))],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 8, 7))],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10), path)
+    bundle = build(tmp_path / "out", path)
+    assert (bundle.manifest.spec.chunk, bundle.manifest.spec.execute) == (8, 1)
+    assert load(bundle.path, threads=1).infer({"x": np.ones((8, 7))}).chunk.shape == (8, 7)

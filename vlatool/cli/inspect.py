@@ -9,20 +9,37 @@ import typer
 
 from vlatool.bundle import Bundle, manifest_bytes
 from vlatool.manifest import Manifest
+from vlatool.runtime.policy import FIRST_RUN_S
+from vlatool.runtime.probe import probe as try_once
 from vlatool.spec import TensorSpec
 
 
 def inspect(
     bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="print the manifest as JSON")] = False,
+    probe: Annotated[
+        bool, typer.Option("--probe", help="run it once, too, in a child process that is limited in time and memory")
+    ] = False,
+    first_run: Annotated[
+        float, typer.Option("--first-run", min=0.1, help="seconds that the run of --probe may take")
+    ] = FIRST_RUN_S,
+    memory: Annotated[
+        float | None,
+        typer.Option("--memory", min=1, help="MB that --probe may take; 2,000 and 8 times the graphs when not given"),
+    ] = None,
 ) -> None:
     """Verify a bundle and say what is in it."""
     opened = Bundle.open(bundle)
+    tried = try_once(bundle, first_run_s=first_run, memory_mb=memory) if probe else None
     if as_json:
         typer.echo(manifest_bytes(opened.manifest).decode(), nl=False)
         return
     for line in describe(opened):
         typer.echo(line)
+    if tried is not None:
+        error = "no golden action" if tried["golden_error"] is None else f"golden error {tried['golden_error']:.2g}"
+        used = f"{tried['peak_rss_mb']:,.0f} MB resident, {tried['memory_mb']:,.0f} MB allowed"
+        typer.echo(f"  probe      ran once: {error}, {used}")
 
 
 def describe(bundle: Bundle) -> list[str]:

@@ -21,6 +21,7 @@ from vlatool.errors import GraphError, require
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
+from vlatool.runtime.contract import Outputs, check_chunk
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
@@ -49,14 +50,20 @@ class ExportOnnx(Transform):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Export, run, compare, and write the bundle."""
         bundle = source_of(source, self.name())
-        action = bundle.manifest.spec.action.name
+        spec = bundle.manifest.spec
+        check_chunk(spec)
         modules = load_modules(bundle)
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
         observations = observations_for(bundle, self.samples)
-        encode = ObservationEncoder(bundle.manifest.spec, bundle.path / "assets")
+        encode = ObservationEncoder(spec, bundle.path / "assets")
         context.tell("running the torch policy", None)
         torch_program = Program(bundle.manifest.program, sessions, seed=0)
-        expected = [torch_program.run(encode(observation))[action] for observation in observations]
+        outputs = Outputs(spec.outputs)
+
+        def action(values: dict[str, Any]) -> Any:
+            return outputs(values, "The torch module")[spec.action.name]
+
+        expected = [torch_program.run(encode(observation), finish=action) for observation in observations]
         graphs = {}
         for number, (name, session) in enumerate(sessions.items()):
             context.tell(f"exporting {name}", number / len(sessions))

@@ -8,8 +8,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
+from vlatool.runtime.arguments import check_load
 from vlatool.runtime.chunks import ChunkQueue
-from vlatool.runtime.policy import Action, Policy, refuse_findings
+from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
 
 __all__ = ["Action", "ChunkQueue", "Policy", "load"]
 
@@ -23,6 +24,9 @@ def load(
     warmup: int = 2,
     golden_tolerance: float | None = None,
     accept: Iterable[str] = (),
+    first_run_s: float = FIRST_RUN_S,
+    memory_mb: float | None = None,
+    probe: bool = False,
 ) -> Policy:
     """Load a bundle, verify it, open its graphs and warm them up.
 
@@ -35,12 +39,19 @@ def load(
         golden_tolerance: Largest relative L2 difference between the recorded golden action and this machine's; the one
             that was measured when the bundle was made when None.
         accept: Names of findings in the manifest that are overruled, see ``vlatool inspect``.
+        first_run_s: Seconds that an inference of the warm-up may take before it is stopped. (Opening a graph cannot be
+            stopped, nor can OpenVINO inside of a loop: it goes on until the process ends; ``probe`` can.)
+        memory_mb: Most that inputs and outputs of a graph may declare, and that the probe may take, in 10^6 bytes;
+            2,000 and eight times the size of the graphs when None.
+        probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
+            bundles of others. Takes as long as loading twice and starting Python.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.
         SpecError: normalisation statistics or a tokenizer are missing or do not fit.
-        GraphError: the engine refuses a graph, or computes something else than the graph says, or a stage found the
-            bundle to be wrong.
+        GraphError: the engine refuses a graph, the graph does not take and give what the spec declares, it computes
+            something else than the graph says, a stage found the bundle to be wrong, or a limit is reached.
+        UsageError: an argument makes no sense.
         MissingExtra: the engine is not installed.
 
     Example:
@@ -50,8 +61,13 @@ def load(
     """
     from vlatool.bundle import Bundle
 
+    check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.open(path)
     refuse_findings(bundle, accept)
-    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed)
-    policy.warm_up(warmup, golden_tolerance)
+    if probe:
+        from vlatool.runtime.probe import probe as tried
+
+        tried(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
+    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
+    policy.warm_up(warmup, golden_tolerance, first_run_s)
     return policy

@@ -48,13 +48,20 @@ class ObservationEncoder:
         for name, encode in self._encoders:
             try:
                 value = observation[name]
-            except KeyError:
-                raise DataError(
-                    f"The observation has no '{name}' (it has: {', '.join(map(str, observation)) or 'nothing'}); "
-                    f"the policy takes {', '.join(self.names)}."
-                ) from None
+            except Exception:  # the seam: a mapping says KeyError, anything else what it likes
+                raise self._lacking(observation, name) from None
             values[name] = encode(value)
         return values
+
+    def _lacking(self, observation: Any, name: str) -> DataError:
+        takes = f"the policy takes {', '.join(self.names)}."
+        if not isinstance(observation, Mapping):
+            return DataError(
+                f"The observation is a {type(observation).__name__}; it must be a mapping of names to values: {takes}",
+                f'pass {{"{name}": ...}}',
+            )
+        has = ", ".join(map(str, observation)) or "nothing"
+        return DataError(f"The observation has no '{name}' (it has: {has}); {takes}")
 
 
 def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
@@ -71,6 +78,11 @@ def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
             array = value if isinstance(value, np.ndarray) else np.asarray(value)
         except ValueError as error:
             raise DataError(f"The input '{tensor.name}' is no array: its rows have different lengths.") from error
+        except Exception as error:  # the seam: numpy asks the object for an array, a tensor on a GPU has none
+            raise DataError(
+                f"The input '{tensor.name}' is a {type(value).__name__}, which gives no numpy array.",
+                "pass numpy arrays; tensors as tensor.detach().cpu().numpy()",
+            ) from error
         if array.dtype != dtype:
             array = _cast(array, dtype, tensor)
         shape = array.shape

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,14 +16,17 @@ from numpy.typing import NDArray
 
 from vlatool import registry
 from vlatool.bundle import Bundle
-from vlatool.errors import BundleError, DataError, GraphError
+from vlatool.errors import BundleError, DataError, GraphError, UsageError
 from vlatool.manifest import GOLDEN_TOLERANCE
+from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, not_finite
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
 from vlatool.spec import PolicySpec, TensorSpec
 
 DEFAULT_ENGINE = "ort_cpu"
+FIRST_RUN_S = 60.0
+"""How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
 Array = NDArray[Any]
 
 
@@ -46,7 +51,11 @@ class Action(NamedTuple):
 class Policy:
     """An open bundle. ``infer`` maps an observation to an ``Action``; ``reset`` starts a new episode.
 
-    Not safe for calls from several threads at once: open one policy for each thread.
+    It may be opened in one thread and used in another. Calls from several threads at once take turns, so that each gets
+    the answer to its own observation: an error instead would hit a control loop at random, whenever calls happen to
+    overlap, and a lock costs it less than a microsecond. Calls that overlap on a policy that keeps values from step to
+    step are refused all the same: they would mix two episodes, which no order makes right. One policy for each thread
+    also spares them the waiting.
     """
 
     def __init__(self, bundle: Bundle, program: Program, engine: str) -> None:
@@ -56,56 +65,126 @@ class Policy:
         self.program = program
         self.encode = ObservationEncoder(self.spec, bundle.path / "assets")
         self._decode = _Decoder(self.spec, bundle.path / "assets")
-        self._outputs = [tensor.name for tensor in self.spec.outputs]
+        self._outputs = Outputs(self.spec.outputs, action=False)
         self._sequence = 0
+        self._turn = threading.Lock()
+        self._owner = 0
         self.golden_error: float | None = None
 
     @classmethod
-    def open(cls, bundle: Bundle, *, engine: str = "", threads: int | None = None, seed: int | None = None) -> Policy:
-        """Open every graph of a verified bundle; see ``vlatool.runtime.load``."""
+    def open(
+        cls,
+        bundle: Bundle,
+        *,
+        engine: str = "",
+        threads: int | None = None,
+        seed: int | None = None,
+        memory_mb: float | None = None,
+    ) -> Policy:
+        """Open every graph of a verified bundle and hold it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
             raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+        check_chunk(manifest.spec)
+        limit_mb = allowed_mb(manifest, memory_mb)
+        check_sizes(manifest, limit_mb)
         engine = engine or manifest.engine or DEFAULT_ENGINE
         session = registry.load("engines", engine)
         sessions: dict[str, Session] = {
             name: session(bundle.file(graph.file), threads, graph.compute) for name, graph in manifest.graphs.items()
         }
+        check_graphs(manifest, sessions, limit_mb)
         return cls(bundle, Program(manifest.program, sessions, seed), engine)
 
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
         """Return the next action chunk.
+
+        An inference that raises counts as if it had never been: kept values, noise and the sequence number stay.
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
             noise: Value name -> float32 array, in the place of what the program would draw.
 
         Raises:
-            DataError: when the observation does not fit the spec.
-            GraphError: when the engine fails or the action is not finite.
+            DataError: when the observation or the noise does not fit.
+            GraphError: when the engine fails, or an output or a kept value is not finite or not as declared.
+            UsageError: when another inference of a policy that keeps values is under way, or one of this thread.
         """
         start = time.perf_counter_ns()
-        values = self.program.run(self.encode(observation), noise)
-        outputs = {name: values[name] for name in self._outputs}
-        chunk, labels = self._decode(outputs[self._outputs[0]])
-        sequence = self._sequence
-        self._sequence += 1
+        if self._owner:
+            self._check_overlap()
+        with self._turn:
+            self._owner = threading.get_ident()
+            try:
+                outputs, chunk, labels = self.program.run(self.encode(observation), noise, self._answer)
+                sequence = self._sequence
+                self._sequence += 1
+            finally:
+                self._owner = 0
         return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
 
-    def reset(self) -> None:
-        """Start a new episode: forget kept values, restart the noise from its seed."""
-        self._sequence = 0
-        self.program.reset()
+    def _answer(self, values: dict[str, Any]) -> tuple[dict[str, Array], Array, tuple[str, ...]]:
+        outputs = self._outputs(values)
+        return outputs, *self._decode(outputs[self.spec.action.name])
 
-    def warm_up(self, inferences: int, tolerance: float | None = None) -> None:
-        """Run the golden observation and compare the action with the recorded one.
+    def _check_overlap(self) -> None:
+        """Refuse a call during an inference where taking turns would not make it right."""
+        fix = "open one policy for each thread"
+        if self._owner == threading.get_ident():
+            raise UsageError("The policy is called while it infers, in the same thread (a signal handler?).", fix)
+        if self.program.keeps:
+            raise UsageError(
+                "Two threads call a policy at once that keeps values from step to step; it would mix their episodes.",
+                fix,
+            )
+
+    def reset(self) -> None:
+        """Start a new episode: forget kept values, restart the noise from its seed.
 
         Args:
             inferences: How often.
             tolerance: Largest relative L2 difference; the one in the manifest when None.
 
         Raises:
-            GraphError: when the difference is larger, or not a number.
+            UsageError: when this thread's own inference is under way.
+        """
+        if self._owner == threading.get_ident():
+            self._check_overlap()
+        with self._turn:
+            self._sequence = 0
+            self.program.reset()
+
+    @contextlib.contextmanager
+    def stopped_after(self, seconds: float) -> Iterator[None]:
+        """Stop the engine when the inference of this block takes longer.
+
+        Raises:
+            GraphError: when it did.
+        """
+        limited = [session for session in self.program.sessions.values() if hasattr(session, "deadline")]
+        for session in limited:
+            session.deadline = time.monotonic() + seconds
+        try:
+            yield
+        except TimeoutError as error:
+            raise GraphError(
+                f"{self.bundle.path}: an inference takes longer than {seconds:g} s, so it was stopped{error}.",
+                "allow a slow policy more with load(..., first_run_s=...); else its graph loops without end",
+            ) from None
+        finally:
+            for session in limited:
+                session.deadline = None
+
+    def warm_up(self, inferences: int, tolerance: float | None = None, first_run_s: float = FIRST_RUN_S) -> None:
+        """Run the golden observation, each time ``first_run_s`` at most, and compare the action with the recorded one.
+
+        Args:
+            inferences: How often.
+            tolerance: Largest relative L2 difference; the one in the manifest when None.
+            first_run_s: Seconds.
+
+        Raises:
+            GraphError: when the difference is larger or not a number, or a run takes longer.
         """
         if tolerance is None:
             tolerance = self.bundle.manifest.golden_tolerance or GOLDEN_TOLERANCE
@@ -114,7 +193,8 @@ class Policy:
             return
         observation, noise, expected = golden
         for _ in range(inferences):
-            got = self.infer(observation, noise=noise).outputs[self.spec.action.name]
+            with self.stopped_after(first_run_s):
+                got = self.infer(observation, noise=noise).outputs[self.spec.action.name]
             self.golden_error = relative_error(got, expected)
             self.reset()
         if inferences and not (self.golden_error or 0.0) <= tolerance:
@@ -154,14 +234,17 @@ class _Decoder:
 
     def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
         tensor = self.tensor
-        if self._floating and not all_finite(raw):
-            raise GraphError(
-                f"The output '{tensor.name}' is not finite.", "do not execute it; check the last observation"
-            )
+        physical = raw
+        if self.normaliser is not None:
+            try:
+                physical = self.normaliser.inverse(raw)
+            except (RuntimeWarning, FloatingPointError):  # an overflow, where the caller lets numpy raise
+                raise not_finite(tensor.name) from None
+        if self._floating and not all_finite(physical):
+            raise not_finite(tensor.name)
         if tensor.kind == "discrete":
             chunk = raw.argmax(-1).reshape(-1)
             return chunk, tuple([tensor.labels[index] for index in chunk.tolist()])
-        physical = raw if self.normaliser is None else self.normaliser.inverse(raw)
         return physical.reshape(-1, physical.shape[-1]), tensor.labels
 
 

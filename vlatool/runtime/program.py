@@ -8,8 +8,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError, GraphError, VlatoolError, nearest
 from vlatool.manifest import ProgramStep
+from vlatool.runtime.contract import not_finite
+from vlatool.runtime.observation import all_finite
 
 Array = NDArray[Any]
 
@@ -21,7 +23,10 @@ class Session(Protocol):
     """One open graph on one engine."""
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run the graph: input name -> array, output name -> array."""
+        """Run the graph: input name -> array, output name -> array.
+
+        A session with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
+        """
 
 
 class Program:
@@ -39,6 +44,7 @@ class Program:
         self._seed = seed
         self._schedules = [_schedules(step) for step in self.steps]
         self._plain = self._plain_step()
+        self._noisy = any(step.noise for step in self.steps)
         self.reset()
 
     def _plain_step(self) -> tuple[Run, list[tuple[str, str]], list[tuple[str, str]]] | None:
@@ -59,31 +65,57 @@ class Program:
             for name, kept in step.keep.items()
         }
 
-    def run(self, values: dict[str, Any], noise: Mapping[str, Array] | None = None) -> dict[str, Any]:
+    @property
+    def keeps(self) -> bool:
+        """Whether an inference depends on those before it."""
+        return bool(self._kept)
+
+    def run(
+        self,
+        values: dict[str, Any],
+        noise: Mapping[str, Array] | None = None,
+        finish: Callable[[dict[str, Any]], Any] | None = None,
+    ) -> Any:
         """Run all steps and return every value; ``values`` (the encoded inputs) is filled in place.
+
+        When anything raises, ``finish`` included, the kept values and the noise generator are as they were before.
 
         Args:
             values: Value name -> array.
-            noise: Value name -> array, in the place of what the program would draw.
+            noise: Value name -> floating array, in the place of what the program would draw.
+            finish: Makes the result from all values.
+
+        Raises:
+            DataError: when the noise does not fit.
+            GraphError: when a graph fails, or a kept value is not finite or of another shape or dtype than declared.
         """
-        for name in noise or ():
-            if all(name not in step.noise for step in self.steps):
-                known = [known for step in self.steps for known in step.noise]
-                raise DataError(f"The program draws no noise '{name}'; {nearest(name, known)}.")
+        given = self._given(noise) if noise is not None else {}
         if self._plain is not None:
             run, feeds, gives = self._plain
-            given = run({name: values[value] for name, value in feeds})
+            results = run({name: values[value] for name, value in feeds})
             for name, value in gives:
-                values[value] = given[name]
-            return values
+                values[value] = results[name]
+            return values if finish is None else finish(values)
+        before = self._random.bit_generator.state if self._noisy else None
+        try:
+            self._run_steps(values, given)
+            kept = {name: _checked(name, values[name], zero) for name, zero in self._kept.items()}
+            found = values if finish is None else finish(values)
+        except BaseException as error:
+            if before is not None:
+                self._random.bit_generator.state = before
+            if isinstance(error, VlatoolError) and (before or self._kept):
+                _tell_rolled_back(error)
+            raise
+        self._kept = kept
+        return found
+
+    def _run_steps(self, values: dict[str, Any], given: Mapping[str, Array]) -> None:
         values.update(self._kept)
         for step, schedules in zip(self.steps, self._schedules, strict=True):
             for name, wanted in step.noise.items():
-                values[name] = self._draw(name, wanted, noise)
+                values[name] = given[name] if name in given else draw(wanted, self._random)
             self._run_step(step, schedules, values)
-        for name in self._kept:
-            self._kept[name] = values[name]
-        return values
 
     def _run_step(self, step: ProgramStep, schedules: dict[str, list[Array]], values: dict[str, Any]) -> None:
         session = self.sessions[step.graph]
@@ -96,13 +128,22 @@ class Program:
             for source, target in step.carry.items():
                 values[target] = values[source]
 
-    def _draw(self, name: str, wanted: Mapping[str, Any], noise: Mapping[str, Array] | None) -> Array:
-        shape = tuple(wanted["shape"])
-        if noise is not None and name in noise:
-            if noise[name].shape != shape:
-                raise DataError(f"The noise '{name}' has the shape {list(noise[name].shape)}; wanted {list(shape)}.")
-            return np.asarray(noise[name], np.float32)
-        return draw(wanted, self._random)
+    def _given(self, noise: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the noise of the caller as float32."""
+        known = {name: wanted for step in self.steps for name, wanted in step.noise.items()}
+        if not isinstance(noise, Mapping):
+            raise DataError(f"The noise is a {type(noise).__name__}; it must be a mapping of names to arrays.")
+        found = {}
+        for name, value in noise.items():
+            if name not in known:
+                raise DataError(f"The program draws no noise '{name}'; {nearest(str(name), known)}.")
+            array, shape = np.asarray(value), tuple(known[name]["shape"])
+            if array.dtype.kind != "f":
+                raise DataError(f"The noise '{name}' is {array.dtype}; wanted float32.", "cast it to float32")
+            if array.shape != shape:
+                raise DataError(f"The noise '{name}' has the shape {list(array.shape)}; wanted {list(shape)}.")
+            found[name] = array.astype(np.float32, copy=False)
+        return found
 
 
 def draw(wanted: Mapping[str, Any], random: np.random.Generator) -> Array:
@@ -122,3 +163,22 @@ def _schedules(step: ProgramStep) -> dict[str, list[Array]]:
         whole = all(isinstance(number, int) for number in numbers)
         found[name] = [np.array([number], np.int64 if whole else np.float32) for number in numbers]
     return found
+
+
+def _checked(name: str, value: Array, zero: Array) -> Array:
+    """Return a kept value that is as the program declares it."""
+    if value.shape != zero.shape or value.dtype != zero.dtype:
+        raise GraphError(
+            f"The kept value '{name}' is {value.dtype} {list(value.shape)}; "
+            f"the program declares {zero.dtype} {list(zero.shape)}.",
+            "declare under 'keep' what the graph gives, and export the policy again",
+        )
+    if value.dtype.kind == "f" and not all_finite(value):
+        raise not_finite(name, "kept value")
+    return value
+
+
+def _tell_rolled_back(error: VlatoolError) -> None:
+    """Say in an error that the inference counts as if it had never been."""
+    error.message += " The state that the policy keeps is as it was before this inference."
+    error.fix = "; ".join(filter(None, [error.fix, "go on with a good observation, or start anew with reset()"]))

@@ -19,7 +19,8 @@ SPEC: dict[str, object] = {
         {"name": "hidden", "shape": [1, 113, 960], "dtype": "float32", "unit": "1"},
     ],
     "control_hz": 10,
-    "chunk": 1,
+    "chunk": 113,
+    "execute": 1,
 }
 
 

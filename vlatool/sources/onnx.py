@@ -83,7 +83,9 @@ class OnnxFile(Transform):
     def _described(self, model: Any) -> Description:
         initializers = {tensor.name for tensor in model.graph.initializer}
         inputs = tuple(_tensor(value) for value in model.graph.input if value.name not in initializers)
-        spec = PolicySpec(inputs, tuple(_tensor(value) for value in model.graph.output), self.control_hz)
+        outputs = tuple(_tensor(value) for value in model.graph.output)
+        rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int)) if outputs else 1
+        spec = PolicySpec(inputs, outputs, self.control_hz, chunk=rows, execute=1 if rows > 1 else 0)
         return Description(self.model.parent, self.model.stem, "0.0.0", spec)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, nearest, require
+from vlatool.runtime.contract import Port
 
 DEVICE = "CPU"
+GRACE_MS = 1000
+"""How long a run that is cancelled may take to end."""
 HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
 """What OpenVINO is told to compute in: left alone it silently takes bfloat16 where the processor has it."""
 
@@ -50,6 +55,9 @@ class OpenvinoSession:
         self._outputs = [(output.get_any_name(), number) for number, output in enumerate(self._compiled.outputs)]
         self.outputs = [name for name, _ in self._outputs]
         self.inputs = {port.get_any_name(): _described(port) for port in self._compiled.inputs}
+        self.takes = {port.get_any_name(): _port(port) for port in self._compiled.inputs}
+        self.gives = {port.get_any_name(): _port(port) for port in self._compiled.outputs}
+        self.deadline: float | None = None
         self._buffers = self._bound(openvino)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -57,18 +65,45 @@ class OpenvinoSession:
 
         Raises:
             GraphError: when an input is missing or of another dtype, or OpenVINO fails on these inputs.
+            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes.
         """
         try:
-            if self._buffers and self._fill(feeds):
+            if self.deadline is not None:
+                self._run_until(self.deadline, feeds)
+            elif self._buffers and self._fill(feeds):
                 self._request.infer()
             else:
                 self._check(feeds)
                 self._request.infer(feeds)
             return {name: np.array(self._request.get_output_tensor(number).data) for name, number in self._outputs}
-        except GraphError:
+        except (GraphError, TimeoutError):
             raise
         except Exception as error:
             raise GraphError(f"OpenVINO failed in {self.path.name}: {_last_line(error)}") from error
+
+    def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> None:
+        """Run, but do not wait beyond the deadline.
+
+        OpenVINO (2026.2) stops between two nodes of a graph only, so that a loop inside of one goes on: it cannot be
+        ended but with the process, and would be waited for when its request is freed, so that is kept.
+        """
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        if self._buffers and self._fill(feeds):
+            self._request.start_async()
+        else:
+            self._check(feeds)
+            self._request.start_async(feeds)
+        if self._request.wait_for(max(1, int(left * 1e3))):
+            self._request.wait()
+            return
+        self._request.cancel()
+        if not self._request.wait_for(GRACE_MS):
+            for kept in (self._request, self._compiled):
+                ctypes.pythonapi.Py_IncRef(ctypes.py_object(kept))
+            raise TimeoutError(", but OpenVINO goes on with it until this process ends")
+        raise TimeoutError
 
     def _bound(self, openvino: Any) -> dict[str, NDArray[Any]]:
         """Give the request arrays of ours as its inputs, once; none when a shape is dynamic or a type not numpy's.
@@ -148,6 +183,18 @@ def version_of(openvino: Any) -> str:
 def _described(port: Any) -> tuple[list[Any], str]:
     shape = [dimension.get_length() if dimension.is_static else str(dimension) for dimension in port.partial_shape]
     return shape, str(port.element_type.get_type_name())
+
+
+def _port(port: Any) -> Port:
+    shape = port.partial_shape
+    if shape.rank.is_dynamic:
+        return Port(None, _dtype(port))
+    return Port(tuple(axis.get_length() if axis.is_static else None for axis in shape), _dtype(port))
+
+
+def _dtype(port: Any) -> str:
+    name = str(port.element_type.get_type_name())
+    return name if name == "bf16" else str(np.dtype(port.element_type.to_dtype()).name)
 
 
 def _last_line(error: Exception) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
+from vlatool.runtime.contract import Port, port
 
 PROVIDER = "CPUExecutionProvider"
 SMALL = 256 * 1024
@@ -65,9 +68,12 @@ class OrtCpuSession:
         if self.providers != [PROVIDER]:
             raise GraphError(f"{path} was opened on {', '.join(self.providers)}; wanted {PROVIDER}.")
         self.path = path
+        self.deadline: float | None = None
         self._run = self._session.run
         self.outputs = [node.name for node in self._session.get_outputs()]
         self.inputs = {node.name: (list(node.shape), str(node.type)) for node in self._session.get_inputs()}
+        self.takes = {node.name: _port(node) for node in self._session.get_inputs()}
+        self.gives = {node.name: _port(node) for node in self._session.get_outputs()}
         self._bound = _Bound.of(self._session, ort)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -75,13 +81,39 @@ class OrtCpuSession:
 
         Raises:
             GraphError: when ONNX Runtime fails on these inputs.
+            TimeoutError: when ``deadline`` (seconds of ``time.monotonic``; none when None) passes.
         """
         try:
+            if self.deadline is not None:
+                return self._run_until(self.deadline, feeds)
             if self._bound is not None and self._bound.takes(feeds):
                 return self._bound.run()
             return dict(zip(self.outputs, self._run(self.outputs, feeds), strict=True))
+        except TimeoutError:
+            raise
         except Exception as error:
             raise GraphError(f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}") from error
+
+    def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run, and let another thread tell ONNX Runtime to stop before its next node at the deadline."""
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        options = require("onnxruntime", "ort").RunOptions()
+        options.log_severity_level = 4
+        timer = threading.Timer(left, setattr, (options, "terminate", True))
+        timer.daemon = True
+        timer.start()
+        try:
+            if self._bound is not None and self._bound.takes(feeds):
+                return self._bound.run(options)
+            return dict(zip(self.outputs, self._run(self.outputs, feeds, options), strict=True))
+        except Exception:
+            if options.terminate:
+                raise TimeoutError from None
+            raise
+        finally:
+            timer.cancel()
 
     @staticmethod
     def version() -> str:
@@ -133,10 +165,16 @@ class _Bound:
             buffer[...] = value
         return len(feeds) == len(self._inputs)
 
-    def run(self) -> dict[str, Array]:
+    def run(self, *options: Any) -> dict[str, Array]:
         """Run on what the buffers hold and return copies of the outputs."""
-        self._start(self._binding)
+        self._start(self._binding, *options)
         return {name: buffer.copy() for name, buffer in self._outputs}
+
+
+def _port(node: Any) -> Port:
+    dtype = NUMPY_OF.get(str(node.type))
+    told = str(node.type) if dtype is None else dtype.name
+    return port(node.shape, told) if node.shape else Port(None, told)  # a scalar looks like an unknown number of axes
 
 
 def _buffer(node: Any) -> Array | None:

@@ -1,0 +1,68 @@
+"""What a caller passes to ``load``: each value is what it is documented to be, or a sentence says so."""
+
+from __future__ import annotations
+
+import math
+import numbers
+import os
+from typing import Any
+
+from vlatool.errors import UsageError
+
+MOST_THREADS = 1024
+
+
+def check_path(path: Any) -> None:
+    """Refuse what is no path.
+
+    Raises:
+        UsageError: naming what it is.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise UsageError(f"The path of the bundle is a {type(path).__name__}; allowed: text or a Path.")
+
+
+def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, optional: bool = False) -> None:
+    """Refuse what is no whole number from ``least`` to ``most``; None too, unless it is optional.
+
+    Raises:
+        UsageError: naming the argument, what it is and what is allowed.
+    """
+    if optional and value is None:
+        return
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not whole or not least <= value <= most:
+        upto = "" if most == math.inf else f" to {most:.0f}"
+        other = ", or None" if optional else ""
+        raise UsageError(f"{name} is {value!r}; allowed: a whole number from {least}{upto}{other}.")
+
+
+def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False) -> None:
+    """Refuse what is no number above 0 (from 0 where ``zero``); None too, unless it is optional.
+
+    Raises:
+        UsageError: naming the argument, what it is and what is allowed.
+    """
+    if optional and value is None:
+        return
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not number or not (value > 0 or (zero and value == 0)):
+        other = ", or None" if optional else ""
+        raise UsageError(f"{name} is {value!r}; allowed: {unit} {'from' if zero else 'above'} 0{other}.")
+
+
+def check_load(
+    path: Any, threads: Any, seed: Any, warmup: Any, tolerance: Any, first_run_s: Any, memory_mb: Any
+) -> None:
+    """Check all arguments of ``load``.
+
+    Raises:
+        UsageError: for the first that makes no sense.
+    """
+    check_path(path)
+    check_whole("threads", threads, 1, MOST_THREADS, optional=True)
+    check_whole("seed", seed, 0, optional=True)
+    check_whole("warmup", warmup, 0)
+    check_positive("golden_tolerance", tolerance, "a number", optional=True, zero=True)
+    check_positive("first_run_s", first_run_s, "a number of seconds")
+    check_positive("memory_mb", memory_mb, "a number of 10^6 bytes", optional=True)

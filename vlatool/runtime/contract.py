@@ -1,0 +1,252 @@
+"""What the graphs give and take, held against the spec: when a policy is opened, and at every inference."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import GraphError, SpecError, nearest
+from vlatool.manifest import Manifest, ProgramStep
+from vlatool.runtime.observation import all_finite
+from vlatool.spec import PolicySpec, TensorSpec
+
+Array = NDArray[Any]
+AGAIN = "declare in the spec what the policy gives, or mend the policy, and export it again"
+BASE_MB = 2000.0
+TIMES_GRAPHS = 8.0
+"""A policy may take ``BASE_MB`` and this many times the size of its graphs: an engine unpacks them."""
+
+
+class Port(NamedTuple):
+    """Shape and dtype of an input or output of a graph, or of a value of a program.
+
+    Args:
+        axes: Sizes, None for one that is known when the graph runs; None when even their number is.
+        dtype: As numpy calls it; an engine's own name for a type that numpy lacks.
+    """
+
+    axes: tuple[int | None, ...] | None
+    dtype: str
+
+    def __str__(self) -> str:
+        return self.dtype if self.axes is None else f"{self.dtype} [{', '.join(_axis(axis) for axis in self.axes)}]"
+
+    def fits(self, other: Port) -> bool:
+        """Say whether both can be the same array."""
+        if self.dtype != other.dtype:
+            return False
+        if self.axes is None or other.axes is None:
+            return True
+        return len(self.axes) == len(other.axes) and all(
+            one is None or two is None or one == two for one, two in zip(self.axes, other.axes, strict=True)
+        )
+
+    @property
+    def bytes(self) -> int:
+        """Size in bytes with every unknown axis counted as 1; 0 for a type that numpy lacks."""
+        try:
+            width = np.dtype(self.dtype).itemsize
+        except TypeError:
+            return 0
+        return width * math.prod(axis or 1 for axis in self.axes or ())
+
+
+def port(axes: Sequence[Any], dtype: str) -> Port:
+    """Return a port; whatever is no whole number stands for a free axis."""
+    return Port(tuple(axis if isinstance(axis, int) else None for axis in axes), dtype)
+
+
+def check_chunk(spec: PolicySpec) -> None:
+    """Check that ``chunk`` is the number of actions that the shape of the action holds.
+
+    That is the product of all axes but the last: 8 for [1, 8, 7], 1 for [1, 7]. A free axis is believed.
+
+    Raises:
+        SpecError: when it is not.
+    """
+    leading = spec.action.shape[:-1]
+    sizes = [axis for axis in leading if isinstance(axis, int)]
+    if len(sizes) < len(leading) or math.prod(sizes) == spec.chunk:
+        return
+    actions, name = math.prod(sizes), spec.action.name
+    raise SpecError(
+        f"The spec has chunk {spec.chunk}; the shape {list(spec.action.shape)} of the output '{name}' holds "
+        f"{actions} {'action' if actions == 1 else 'actions'}.",
+        f"write chunk: {actions} (and execute: for how many of them are executed), or another shape",
+    )
+
+
+def allowed_mb(manifest: Manifest, memory_mb: float | None) -> float:
+    """Return the memory in 10^6 bytes that a policy may take: what the caller says, else by the size of its graphs."""
+    if memory_mb is not None:
+        return memory_mb
+    graphs = sum(manifest.files[graph.file].bytes for graph in manifest.graphs.values() if graph.file in manifest.files)
+    return BASE_MB + TIMES_GRAPHS * graphs / 1e6
+
+
+def check_sizes(manifest: Manifest, limit_mb: float) -> None:
+    """Check what the manifest alone says before anything of that size is made.
+
+    Raises:
+        GraphError: when inputs, outputs, noise and kept values would be larger than ``limit_mb`` (10^6 bytes).
+    """
+    spec = manifest.spec
+    named = {tensor.name: _declared(tensor) for tensor in (*spec.inputs, *spec.outputs)}
+    for step in manifest.program:
+        named |= _sources(step)
+    _check_total(named, "The program", limit_mb)
+
+
+def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: float) -> None:
+    """Hold what the open graphs declare against the spec, and against each other along the program.
+
+    Args:
+        manifest: With spec and program.
+        sessions: Graph name -> session; one that does not tell ``takes`` and ``gives`` is believed.
+        limit_mb: Of what one graph takes and gives together, in 10^6 bytes.
+
+    Raises:
+        GraphError: naming graph and tensor, what it is and what is declared.
+    """
+    for name, session in sessions.items():
+        told = {**getattr(session, "takes", {}), **getattr(session, "gives", {})}
+        _check_total(told, f"The graph '{name}'", limit_mb)
+    values: dict[str, tuple[str, Port]] = {
+        tensor.name: ("the spec declares", _declared(tensor)) for tensor in manifest.spec.inputs
+    }
+    for step in manifest.program:
+        _follow(step, sessions[step.graph], values)
+    for tensor in manifest.spec.outputs:
+        origin, found = values.get(tensor.name, ("", _declared(tensor)))
+        if not found.fits(_declared(tensor)):
+            raise GraphError(
+                f"The output '{tensor.name}' is declared as {_declared(tensor)} in the spec, but {origin} {found}.",
+                _remedy(found.dtype, tensor.dtype),
+            )
+
+
+def _follow(step: ProgramStep, session: Any, values: dict[str, tuple[str, Port]]) -> None:
+    """Check what a step feeds to its graph, and note what it gives."""
+    takes, gives = getattr(session, "takes", None), getattr(session, "gives", None)
+    if takes is None or gives is None:
+        for name in step.gives.values():
+            values.pop(name, None)
+        return
+    _check_names(step, takes, gives)
+    values.update({name: ("the program makes", found) for name, found in _sources(step).items()})
+    for turn in range(min(step.repeat, 2)):
+        for name, value in step.feeds.items():
+            _check_feed(step.graph, name, takes[name], value, values, turn)
+        for name, value in step.gives.items():
+            values[value] = (f"the graph '{step.graph}' gives", gives[name])
+        for source, target in step.carry.items():
+            values[target] = values[source]
+
+
+def _check_feed(
+    graph: str, name: str, wanted: Port, value: str, values: Mapping[str, tuple[str, Port]], turn: int
+) -> None:
+    origin, found = values.get(value, ("", wanted))
+    if not found.fits(wanted):
+        when = " in the next repeat" if turn else ""
+        raise GraphError(
+            f"The graph '{graph}' takes '{name}' as {wanted}, but {origin} '{value}' as {found}{when}.", AGAIN
+        )
+
+
+def _check_names(step: ProgramStep, takes: Mapping[str, Port], gives: Mapping[str, Port]) -> None:
+    for words, named, known in (("takes", step.feeds, takes), ("gives", step.gives, gives)):
+        for name in named:
+            if name not in known:
+                raise GraphError(f"The graph '{step.graph}' {words} no '{name}'; {nearest(name, known)}.", AGAIN)
+    for name in takes:
+        if name not in step.feeds:
+            raise GraphError(f"The graph '{step.graph}' takes '{name}', which the program does not feed.", AGAIN)
+
+
+def _sources(step: ProgramStep) -> dict[str, Port]:
+    """Return what a step brings into being: noise, kept values and schedules."""
+    found = {name: port(noise["shape"], "float32") for name, noise in step.noise.items()}
+    found |= {name: port(kept["shape"], str(kept.get("dtype", "float32"))) for name, kept in step.keep.items()}
+    for name, numbers in step.schedule.items():
+        found[name] = Port((1,), "int64" if all(isinstance(number, int) for number in numbers) else "float32")
+    return found
+
+
+def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
+    total = sum(each.bytes for each in named.values())
+    if total > limit_mb * 1e6:
+        largest = max(named, key=lambda name: named[name].bytes)
+        raise GraphError(
+            f"{who} has inputs and outputs of {total / 1e6:,.0f} MB, most of it '{largest}' ({named[largest]}); "
+            f"allowed: {limit_mb:,.0f} MB.",
+            "allow more with load(..., memory_mb=...) if the policy is meant to be that large",
+        )
+
+
+class Outputs:
+    """Holds the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
+
+    Args:
+        outputs: What is declared.
+        action: Whether the first is looked at for finite numbers, too; a policy does that in physical units.
+    """
+
+    def __init__(self, outputs: Iterable[TensorSpec], *, action: bool = True) -> None:
+        self._wanted = []
+        for number, tensor in enumerate(outputs):
+            dtype = np.dtype(tensor.dtype)
+            fixed = tensor.shape if all(isinstance(axis, int) for axis in tensor.shape) else None
+            floating = dtype.kind == "f" and (action or number > 0)
+            self._wanted.append((tensor.name, fixed, dtype, floating, tensor))
+
+    def __call__(self, values: Mapping[str, Any], who: str = "The policy") -> dict[str, Array]:
+        """Return the outputs by name.
+
+        Raises:
+            GraphError: naming the output, what it is and what is declared.
+        """
+        found = {}
+        for name, shape, dtype, floating, tensor in self._wanted:
+            array = values[name]
+            if array.dtype != dtype or (array.shape != shape and (shape or not _fits(array, tensor))):
+                raise _misfit(array, tensor, who)
+            if floating and not all_finite(array):
+                raise not_finite(name)
+            found[name] = array
+        return found
+
+
+def not_finite(name: str, what: str = "output") -> GraphError:
+    """Return the error of an output or a kept value that holds NaN or infinity."""
+    return GraphError(f"The {what} '{name}' is not finite.", "do not execute it; check the last observation")
+
+
+def _fits(array: Array, tensor: TensorSpec) -> bool:
+    return Port(array.shape, tensor.dtype).fits(_declared(tensor))
+
+
+def _misfit(array: Array, tensor: TensorSpec, who: str) -> GraphError:
+    got = Port(tuple(array.shape), str(array.dtype))
+    return GraphError(
+        f"{who} gives '{tensor.name}' as {got}; the spec declares {_declared(tensor)}.",
+        _remedy(got.dtype, tensor.dtype),
+    )
+
+
+def _remedy(got: str, declared: str) -> str:
+    if got == declared:
+        return AGAIN
+    return f"cast it to {declared} in forward(), or declare another dtype in the spec, and export the policy again"
+
+
+def _declared(tensor: TensorSpec) -> Port:
+    return port(tensor.shape, tensor.dtype)
+
+
+def _axis(axis: int | None) -> str:
+    return "?" if axis is None else str(axis)

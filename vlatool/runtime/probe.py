@@ -1,0 +1,132 @@
+"""The first run of a bundle in a child process with limits: what hangs, crashes or eats memory does so there.
+
+``vlatool.load(path, probe=True)`` and ``vlatool inspect --probe``; needs the standard library and what a robot has.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from vlatool import errors
+from vlatool.bundle import Bundle
+from vlatool.errors import GraphError, VlatoolError
+from vlatool.runtime.contract import allowed_mb
+from vlatool.runtime.policy import FIRST_RUN_S, Policy
+
+START_S = 60.0
+"""What the child may take beside its first run: Python, the engine's library, opening the graphs on a slow board."""
+NO_MEMORY = ("MemoryError", "bad_alloc", "bad allocation", "ailed to allocate", "ut of memory", "annot allocate")
+"""What Python, C++ and the engines say when a limit is reached."""
+CHILD = "import sys; sys.path[:0] = {path!r}; from vlatool.runtime import probe; probe.main()"
+
+
+def probe(
+    path: Path,
+    *,
+    engine: str = "",
+    threads: int | None = None,
+    first_run_s: float = FIRST_RUN_S,
+    memory_mb: float | None = None,
+) -> dict[str, Any]:
+    """Open a bundle and run its golden observation once, in a fresh process under limits.
+
+    Args:
+        path: The bundle; its files are not verified here.
+        engine, threads: As for ``load``.
+        first_run_s: Seconds that the inference may take; opening the graphs may take ``START_S`` more.
+        memory_mb: Private writable memory of the process in 10^6 bytes (``RLIMIT_DATA``); 2,000 and eight times the
+            size of the graphs when None.
+
+    Returns:
+        ``memory_mb`` that was allowed, ``peak_rss_mb`` of the process, ``golden_error`` (None without a golden file).
+
+    Raises:
+        GraphError: when the process is ended by a limit or a signal; says how to raise the limit.
+        VlatoolError: what the bundle raises, of the same class.
+    """
+    allowed = allowed_mb(Bundle.open(path, verify=False).manifest, memory_mb)
+    asked = {
+        "path": str(path), "engine": engine, "threads": threads, "first_run_s": first_run_s, "memory_mb": allowed,
+    }  # fmt: skip
+    try:
+        done = subprocess.run(
+            [sys.executable, "-I", "-c", CHILD.format(path=_search_path())],
+            input=json.dumps(asked), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise _too_long(path, START_S + first_run_s) from None
+    return {"memory_mb": allowed, **_answer(path, done, allowed)}
+
+
+def main() -> None:
+    """Answer one question: the child's side."""
+    asked = json.loads(sys.stdin.readline())
+    size = int(asked["memory_mb"] * 1e6)
+    resource.setrlimit(resource.RLIMIT_DATA, (size, size))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    seconds = math.ceil((START_S + asked["first_run_s"]) * len(os.sched_getaffinity(0)))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # should the parent not live to end this process
+    try:
+        answer = _run(**asked)
+    except VlatoolError as error:
+        answer = {"error": type(error).__name__, "message": error.message, "fix": error.fix}
+    except MemoryError:
+        answer = {"error": "GraphError", "message": "MemoryError", "fix": ""}
+    sys.stdout.write("\n" + json.dumps(answer) + "\n")
+
+
+def _run(path: str, engine: str, threads: int | None, first_run_s: float, memory_mb: float) -> dict[str, Any]:
+    policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=0, memory_mb=memory_mb)
+    policy.warm_up(1, float("inf"), first_run_s)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"golden_error": policy.golden_error, "peak_rss_mb": peak * 1024 / 1e6}
+
+
+def _search_path() -> list[str]:
+    """Return where this process finds modules, without the current directory and the script's."""
+    here = str(Path(__file__).parents[2])
+    return [here, *(entry for entry in sys.path[1:] if entry and entry != here and Path(entry).is_absolute())]
+
+
+def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) -> dict[str, Any]:
+    """Return what the child found, or raise what it raised."""
+    told: dict[str, Any] = {}
+    with contextlib.suppress(ValueError):
+        told = json.loads(done.stdout.rstrip("\n").rpartition("\n")[2])
+    said = str(told.get("message", "")) or done.stderr[-2000:]
+    if ("error" in told or done.returncode) and any(sign in said for sign in NO_MEMORY):
+        raise GraphError(
+            f"{path}: the first run needs more than {allowed:,.0f} MB of memory.",
+            "allow more with load(..., memory_mb=...) or vlatool inspect --probe --memory MB",
+        )
+    if "error" in told:
+        kind = getattr(errors, str(told["error"]), GraphError)
+        raise kind(said, str(told.get("fix", "")))
+    if done.returncode < 0:
+        raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
+    if done.returncode or not told:
+        last = (said.strip() or f"exit code {done.returncode}").splitlines()[-1]
+        raise GraphError(f"{path} cannot be run in a process of its own: {last}")
+    return told
+
+
+def _too_long(path: Path, seconds: float) -> GraphError:
+    return GraphError(
+        f"{path}: no first action after {seconds:g} s, so the process was ended.",
+        "allow a slow policy more with load(..., first_run_s=...) or vlatool inspect --probe --first-run SECONDS",
+    )
+
+
+def _signal(number: int) -> str:
+    with contextlib.suppress(ValueError):
+        return signal.Signals(number).name
+    return f"signal {number}"
