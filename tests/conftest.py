@@ -245,6 +245,7 @@ def _cache_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VLATOOL_CACHE", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("VLATOOL_CALIBRATIONS", str(tmp_path_factory.mktemp("calibrations")))
+        patch.setenv("VLATOOL_TRUST", str(tmp_path_factory.mktemp("trust") / "trusted.json"))
         yield
 
 

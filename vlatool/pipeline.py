@@ -102,18 +102,23 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
         beside = path.parent / FILE if (path.parent / FILE).is_file() else None
         return OnnxFile(model=path, policy=beside), beside
     if path.is_dir() or path.suffix in (".yaml", ".yml"):
-        read_description(path)
-        return TorchModule(policy=path), path
+        return _torch_source(path), path
     where, _, function = source.rpartition(":")
     if where.endswith(".py") and function:
         folder = Path(where).parent
         if not Path(where).is_file():
             raise SourceError(f"There is no file {where} (from '{source}').")
-        return TorchModule(policy=folder, factory=f"{Path(where).name}:{function}"), folder
+        return _torch_source(folder, f"{Path(where).name}:{function}"), folder
     raise SourceError(
         f"'{source}' is no bundle and no policy source.",
         "give a bundle, a directory with a policy.yaml, path/to/policy.py:make, or a .onnx file",
     )
+
+
+def _torch_source(policy: Path, factory: str = "") -> TorchModule:
+    stage = TorchModule(policy=policy, factory=factory)
+    stage.name_it()
+    return stage
 
 
 def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
@@ -232,6 +237,8 @@ def _transforms(stages: Any) -> tuple[Transform, ...]:
     built = []
     for name, options in stage_entries(stages):
         stage = build_stage(name, options or {})
+        if stage.kind() == "sources":
+            raise RecipeError(f"The stage {name} reads a policy; the policy is named on the command line.")
         if not isinstance(stage, Transform):
             raise RecipeError(f"The stage {name} measures; a recipe lists stages that make a bundle.")
         built.append(stage)

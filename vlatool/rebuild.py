@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,15 +11,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from vlatool import __version__
+from vlatool import __version__, trust
 from vlatool.bundle import LOCATION, MANIFEST, Bundle, hash_file, writing
 from vlatool.differences import Compared, compare_bundles
-from vlatool.errors import BundleError, DataError, SourceError, VlatoolError
+from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.finish import DECIDED, HANDED_OUT, history, reseal
 from vlatool.launch import run_transform
 from vlatool.pipeline import ROBOT_FOLDERS, source_stage
-from vlatool.report import read_report
-from vlatool.sources._description import read_location
+from vlatool.sources._description import read_description, read_location
+from vlatool.sources._factory import factory_file
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Transform, build_stage, installed_version, source_of, stage_class
 
@@ -268,6 +267,7 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
     if isinstance(stage, TorchModule):
         if stage.factory and stage.factory != factory:
             raise SourceError(f"{source} names the factory {stage.factory}; {bundle.path} was made by {factory}.")
+        _check_factory(factory, stage, bundle)
         stage = stage.model_copy(update={"factory": factory})
     stage.check(None, None)
     got, recorded = stage.input_hashes(), entry.get("files", {})
@@ -285,32 +285,46 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
     return stage
 
 
+def _check_factory(factory: str, stage: TorchModule, bundle: Bundle) -> None:
+    """Let a record name functions in the policy's own files, or what its description names.
+
+    Raises:
+        SourceError: for any other.
+    """
+    described = read_description(stage.policy)
+    file = factory_file(factory, described.folder)
+    if factory != described.factory and (file is None or not file.is_relative_to(described.folder.resolve())):
+        raise SourceError(f"The build record of {bundle.path} names the factory {factory}; {stage.policy} does not.")
+
+
 def _told(digest: str | None) -> str:
     return f"sha256:{digest[:16]}" if digest else "no such file"
 
 
 def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
-    """Yield where the source may be: as the bundle, the cached source bundle, or the report's command notes."""
+    """Yield where the source may be: as the bundle or the cached source bundle notes.
+
+    Raises:
+        SourceError: when the user neither named nor trusted that folder.
+    """
     description = next(iter(entries[0].get("files", {})), "policy.yaml")
     wanted = entries[1].get("input") if len(entries) > 1 else bundle.hash
     cached = [path.parent for path in sorted((cache / "stages").glob(f"{entries[0]['stage']}-*/{MANIFEST}"))]
+    refused: SourceError | None = None
     for noted in [bundle.path, *(path for path in cached if f"sha256:{hash_file(path / MANIFEST)}" == wanted)]:
         if (noted / LOCATION).is_file():
             try:
-                yield str(read_location(noted) / description)
+                folder = read_location(noted)
             except SourceError:
                 continue
-    try:
-        words = shlex.split(read_report(bundle.path / "reports").command)[1:]
-    except (DataError, OSError, ValueError):
-        return
-    for word in words:
-        if Path(word.rpartition(":")[0] or word).exists() and not (Path(word) / MANIFEST).is_file():
             try:
-                source_stage(word)
-            except VlatoolError:
+                trust.require(folder, "the policy's code")
+            except SourceError as error:
+                refused = refused or error
                 continue
-            yield word
+            yield str(folder / description)
+    if refused:
+        raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
 
 
 def _hand_out(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:

@@ -20,7 +20,7 @@ from vlatool.hwselect._measured import measured_questions
 from vlatool.hwselect._select import Choice, Wants, choose, in_the_cloud
 from vlatool.hwselect._simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.hwselect._stored import digest, read_workload, write_workload
-from vlatool.hwselect._torch_workload import torch_workload
+from vlatool.hwselect._torch_workload import counted_apart
 from vlatool.hwselect._workload import Workload, workload
 from vlatool.launch import cached_transform
 from vlatool.pipeline import sourced
@@ -28,6 +28,7 @@ from vlatool.platforms import load_platform
 from vlatool.profile import Profile, load_profile, names
 from vlatool.report import Report
 from vlatool.sources._description import read_location
+from vlatool.sources._origin import origin_of
 from vlatool.stage import Context
 
 CARRIED = "workload.json"
@@ -116,7 +117,7 @@ def counted(bundle: Bundle, context: Context) -> Workload:
         return carried
     elif "factory" in bundle.manifest.source:
         context.tell("counting the policy's work, without its weights", None)
-        found = torch_workload(bundle)
+        found = counted_apart(bundle, context.tell)
     else:
         found = workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
@@ -143,7 +144,7 @@ def carry_count(source: str, context: Context) -> Path:
             "would notice.",
             "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
         )
-    file = _beside(bundle)
+    file = origin_of(bundle).folder / CARRIED
     found = counted(bundle, context)
     try:
         write_workload(file, found, digest(bundle))

@@ -135,6 +135,13 @@ class Transform(Stage):
     streams: ClassVar[bool] = False
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
+    def runs(self, source: Bundle | None) -> str:
+        """Return whose code this stage runs on that source (``policy.py``); empty when only vlatool's own.
+
+        Such a stage is run in a child process; see ``vlatool.apart``.
+        """
+        return ""
+
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what else a person wants to know about the new bundle, a sentence for each line."""
         return ()

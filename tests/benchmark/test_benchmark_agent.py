@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 
 import pytest
 from _processes import below
@@ -11,7 +10,7 @@ from _processes import below
 from vlatool.benchmark._agent import WORKER, measure
 from vlatool.benchmark._job import Job, Limits
 from vlatool.errors import BundleError, GateFailed, GraphError, UsageError
-from vlatool.processes import environment
+from vlatool.processes import python_command
 
 
 def quiet(what, share):
@@ -45,10 +44,10 @@ def test_errors_of_the_worker_come_back(tmp_path, float_bundle):
 
 
 def test_the_agent_speaks_json_lines(float_bundle, tmp_path):
-    command = [sys.executable, "-m", "vlatool.benchmark._agent"]
+    command = python_command("vlatool.benchmark._agent")
     for bundle, last in ((float_bundle.path, "result"), (tmp_path / "none", "vlatool error")):
         line = json.dumps(Job((str(bundle),), iterations=20).to_dict()) + "\n"
-        done = subprocess.run(command, input=line, text=True, capture_output=True, check=True, env=environment())
+        done = subprocess.run(command, input=line, text=True, capture_output=True, check=True)
         told = [json.loads(each) for each in done.stdout.splitlines()]
         assert last in told[-1]
         assert all("progress" in each for each in told[:-1])

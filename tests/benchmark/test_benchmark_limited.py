@@ -12,28 +12,27 @@ from vlatool.benchmark import _limited
 from vlatool.benchmark._job import Job, Limits
 from vlatool.benchmark._limited import chosen, command, grouped, ran_out
 from vlatool.errors import UsageError
-from vlatool.processes import environment
+from vlatool.processes import python_code, python_command
 
 USES = "import os, sys; print(sorted(os.sched_getaffinity(0)))"
 
 
 def test_without_limits_the_command_is_plain():
-    assert command(Limits(), "json.tool", ["-h"]) == [sys.executable, "-m", "json.tool", "-h"]
+    assert command(Limits(), "json.tool", ["-h"]) == python_command("json.tool", ["-h"])
     assert not Limits()
     assert Limits(cores=1)
     assert Limits(memory_mb=1)
 
 
-def test_a_module_runs_under_limits(tmp_path):
+def test_a_module_runs_under_limits(tmp_path, monkeypatch):
     (tmp_path / "told.py").write_text(
         "import os, resource, sys\n"
         "print(sys.argv[1:], sorted(os.sched_getaffinity(0)), resource.getrlimit(resource.RLIMIT_DATA)[0])\n"
     )
     cpu = sorted(os.sched_getaffinity(0))[-1]
+    monkeypatch.syspath_prepend(tmp_path)
     words = command(Limits((cpu,), memory_mb=500), "told", ["x", "y"])
-    env = environment()
-    env["PYTHONPATH"] = f"{tmp_path}{os.pathsep}{env['PYTHONPATH']}"
-    done = subprocess.run(words, capture_output=True, text=True, check=True, env=env)
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == f"['x', 'y'] [{cpu}] 500000000"
 
 
@@ -57,14 +56,13 @@ def test_a_control_group_is_made_where_there_is_one_and_removed(tmp_path, monkey
         assert limits == Limits(cores=1)
 
 
-def test_what_needs_more_memory_is_stopped(tmp_path):
+def test_what_needs_more_memory_is_stopped(tmp_path, monkeypatch):
     (tmp_path / "hungry.py").write_text(
         "block = bytearray(400_000_000)\nblock[::4096] = bytes(len(block[::4096]))\nprint('lived')\n"
     )
-    env = environment()
-    env["PYTHONPATH"] = f"{tmp_path}{os.pathsep}{env['PYTHONPATH']}"
+    monkeypatch.syspath_prepend(tmp_path)
     with grouped(Limits(memory_mb=200)) as limits:
-        done = subprocess.run(command(limits, "hungry"), capture_output=True, text=True, check=False, env=env)
+        done = subprocess.run(command(limits, "hungry"), capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "lived" not in done.stdout
     assert done.returncode == -9 if limits.cgroup else "MemoryError" in done.stderr
@@ -100,14 +98,14 @@ def test_groups_of_runs_that_were_killed_are_removed(tmp_path, monkeypatch):
 
 
 def test_a_process_ends_with_the_one_that_started_it(tmp_path):
-    child = "import sys, time; from vlatool.benchmark._limited import die_with_parent; die_with_parent(); " + (
+    child = "import sys, time; from vlatool.processes import die_with_parent; die_with_parent(); " + (
         "print('up', flush=True); time.sleep(60)"
     )
     parent = (
-        f"import subprocess, sys; child = subprocess.Popen([sys.executable, '-c', {child!r}]); "
+        f"import subprocess, sys; child = subprocess.Popen({python_code(child)!r}); "
         "print(child.pid, flush=True); child.wait()"
     )
-    started = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True, env=environment())
+    started = subprocess.Popen(python_code(parent), stdout=subprocess.PIPE, text=True)
     lines = {started.stdout.readline().strip() for _ in range(2)}
     (number,) = lines - {"up"}
     started.kill()

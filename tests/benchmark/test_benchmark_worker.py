@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from vlatool.benchmark._worker import measure, opened, run_job
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError
-from vlatool.processes import environment
+from vlatool.processes import python_command
 from vlatool.runtime.policy import Policy
 
 
@@ -125,8 +124,8 @@ def test_nothing_to_run_is_refused(float_bundle, copied):
 
 def test_the_process_waits_for_the_word_and_says_what_it_found(float_bundle: Bundle):
     lines = json.dumps(job(float_bundle, iterations=20).to_dict()) + "\n\n\n"
-    done = subprocess.run([sys.executable, "-m", "vlatool.benchmark._worker"], input=lines, text=True,
-                          capture_output=True, check=True, env=environment())  # fmt: skip
+    done = subprocess.run(python_command("vlatool.benchmark._worker"), input=lines, text=True,
+                          capture_output=True, check=True)  # fmt: skip
     told = [json.loads(line) for line in done.stdout.splitlines()]
     assert {"progress", "ready", "timed", "result"} == {key for line in told for key in line}
     assert np.concatenate(told[-1]["result"]["policies"][0]["blocks_ms"]).shape == (20,)

@@ -1,11 +1,11 @@
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
 from vlatool.errors import MissingExtra, SourceError
 from vlatool.sources._factory import call_factory, factory_file, import_factory, split_factory
+from vlatool.statistics import wilson
 
 
 def write(folder: Path, text: str, name: str = "policy.py") -> Path:
@@ -40,8 +40,8 @@ def test_a_file_gives_its_function_and_takes_arguments(tmp_path: Path):
 
 
 def test_a_module_gives_its_function(tmp_path: Path):
-    assert import_factory("fractions:Fraction", tmp_path) is Fraction
-    assert call_factory("fractions:Fraction", tmp_path, {"numerator": 3}) == 3
+    assert import_factory("vlatool.statistics:wilson", tmp_path) is wilson
+    assert call_factory("vlatool.statistics:wilson", tmp_path, {"successes": 3, "trials": 4}) == wilson(3, 4)
 
 
 def test_a_file_may_import_its_neighbours_when_imported_and_when_called(tmp_path: Path):
@@ -153,4 +153,30 @@ def test_our_own_errors_pass_through(tmp_path: Path, where):
     from vlatool.errors import DataError
 
     with pytest.raises(DataError, match="no episodes"):
+        call_factory("policy.py:make", tmp_path, {})
+
+
+@pytest.mark.parametrize(
+    "factory", ["subprocess:check_output", "os:system", "builtins:eval", "importlib.util:find_spec"]
+)
+def test_a_function_of_the_standard_library_is_no_factory(tmp_path: Path, factory: str):
+    with pytest.raises(SourceError, match="names a function of Python's standard library"):
+        call_factory(factory, tmp_path, {})
+
+
+def test_a_function_that_a_package_only_imports_is_not_its_factory(tmp_path: Path):
+    with pytest.raises(SourceError, match=r"is defined in 'concurrent\.futures\.thread', not in the package 'vlatool'"):
+        import_factory("vlatool.apart:ThreadPoolExecutor", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        ("import sys; sys.exit(0)", r"called sys.exit\(0\)"),
+        ("class Stop(BaseException): ...\n    raise Stop('it')", "raised Stop: it"),
+    ],
+)
+def test_what_is_no_exception_becomes_an_error(tmp_path: Path, act: str, says: str):
+    write(tmp_path, f"def make():\n    {act}\n")
+    with pytest.raises(SourceError, match=r"The factory 'policy.py:make' " + says):
         call_factory("policy.py:make", tmp_path, {})

@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, cast
 
+from vlatool import trust
 from vlatool.benchmark._child import answer, ended, message, raise_said, too_large
 from vlatool.benchmark._contest import Tell
 from vlatool.benchmark._job import Job, Limits
@@ -25,7 +26,6 @@ from vlatool.benchmark._limited import chosen, command, grouped
 from vlatool.benchmark._probe import cold_start
 from vlatool.errors import VlatoolError
 from vlatool.host import before_run
-from vlatool.processes import environment
 from vlatool.telemetry import Absent, Recorder, open_all
 from vlatool.telemetry.process import ProcessReader
 
@@ -75,7 +75,7 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
         contextlib.ExitStack() as recording,
     ):
         recorder: Recorder | None = None
-        _answer(worker, json.dumps(job.to_dict()))
+        _answer(worker, json.dumps({**job.to_dict(), "named": trust.named_so_far()}))
         for text in cast(IO[str], worker.stdout):
             line = message(text)
             if "progress" in line:
@@ -114,7 +114,7 @@ def _answer(worker: subprocess.Popen[str], line: str = "") -> None:
 def _started(words: list[str], log: IO[str]) -> Iterator[subprocess.Popen[str]]:
     """Start a process, and see to it that it ends with the block."""
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=log, text=True, env=environment()) as process:
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=log, text=True) as process:
         try:
             yield process
         finally:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import IO, Any
 
 from vlatool import errors
 from vlatool.benchmark._job import Limits
 from vlatool.benchmark._limited import command, ran_out
 from vlatool.errors import GateFailed, GraphError, VlatoolError
-from vlatool.processes import environment
 
 SAID = "vlatool error"
 NO_MEMORY = (
@@ -57,7 +57,6 @@ def ask(
             text=True,
             check=False,
             timeout=timeout,
-            env=environment(),
         )
     except subprocess.TimeoutExpired as error:
         raise GraphError(
@@ -106,6 +105,8 @@ def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fre
         )
     if code < 0:
         return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.")
+    if code == 0:
+        return GraphError(f"{about}: the process ended with exit code 0 {when}, before it was done.")
     last = (log.strip() or f"exit code {code}").splitlines()[-1]
     return GraphError(f"{about} cannot be run in a fresh process: {last}")
 
@@ -126,10 +127,19 @@ def too_large(limits: Limits, seen: str = "") -> GateFailed:
     )
 
 
-def answer(give: Callable[[], dict[str, Any]]) -> None:
+def answers_alone() -> IO[str]:
+    """Return standard output for answers alone: what anybody else prints goes to standard error from now on."""
+    stream = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    return stream
+
+
+def answer(give: Callable[[], dict[str, Any]], stream: IO[str] | None = None) -> None:
     """Print what a function returns as one line of JSON, or what it raised."""
     try:
         found = give()
     except VlatoolError as error:
         found = {SAID: type(error).__name__, "message": error.message, "fix": error.fix}
-    sys.stdout.write(json.dumps(found) + "\n")
+    out = stream or sys.stdout
+    out.write(json.dumps(found) + "\n")
+    out.flush()

@@ -6,12 +6,10 @@ The limits are set before anything is imported that could take memory or start t
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import os
 import resource
 import runpy
-import signal
 import sys
 import tempfile
 import time
@@ -21,9 +19,8 @@ from pathlib import Path
 
 from vlatool.benchmark._job import Limits
 from vlatool.errors import UsageError
+from vlatool.processes import die_with_parent, python_command
 
-PR_SET_PDEATHSIG = 1
-"""Of ``prctl(2)``."""
 GROUPS = (
     (Path("/sys/fs/cgroup"), "memory.max", ("memory.swap.max", "0")),
     (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", ("memory.memsw.limit_in_bytes", "")),
@@ -35,8 +32,8 @@ itself when empty)."""
 def command(limits: Limits, module: str, arguments: Sequence[str] = ()) -> list[str]:
     """Return the command of a module, under the limits where there are any."""
     if not limits:
-        return [sys.executable, "-m", module, *arguments]
-    return [sys.executable, "-m", "vlatool.benchmark._limited", json.dumps(asdict(limits)), module, *arguments]
+        return python_command(module, arguments)
+    return python_command("vlatool.benchmark._limited", (json.dumps(asdict(limits)), module, *arguments))
 
 
 @contextlib.contextmanager
@@ -142,12 +139,6 @@ def limit_this_process(limits: Limits) -> None:
     elif limits.memory_mb:
         size = int(limits.memory_mb * 1e6)
         resource.setrlimit(resource.RLIMIT_DATA, (size, size))
-
-
-def die_with_parent() -> None:
-    """Let the kernel kill this process when the one that started it ends, however that ends (Linux)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def main() -> None:

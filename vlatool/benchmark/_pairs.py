@@ -21,7 +21,7 @@ from statistics import median
 from typing import Any
 
 from vlatool.benchmark._child import answer, ask
-from vlatool.benchmark._limited import die_with_parent
+from vlatool.processes import die_with_parent
 
 WARMUP_MS = 200.0
 """How long each bundle runs before its first call that counts, at least ``Job.warmup`` calls."""

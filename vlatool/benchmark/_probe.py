@@ -12,8 +12,8 @@ from typing import Any
 
 from vlatool.benchmark._child import answer, ask
 from vlatool.benchmark._job import Limits
-from vlatool.benchmark._limited import die_with_parent
 from vlatool.benchmark._memory import peak_rss_mb, resident_mb
+from vlatool.processes import die_with_parent
 
 MORE = 5
 """Inferences after the first: an engine's arena may grow with the second."""

@@ -16,19 +16,20 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+from vlatool import trust
 from vlatool.benchmark._answers import expected_answers, remembered
 from vlatool.benchmark._canary import canary_ms
-from vlatool.benchmark._child import answer
+from vlatool.benchmark._child import answer, answers_alone
 from vlatool.benchmark._contest import BLOCKS, Contestant, Tell, run_interleaved, unique_names
 from vlatool.benchmark._job import Job
-from vlatool.benchmark._limited import die_with_parent
 from vlatool.benchmark._paced import run_paced
 from vlatool.benchmark._phases import time_phases
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError
+from vlatool.processes import die_with_parent
 from vlatool.runtime.policy import Policy
 
 OBSERVATIONS = 32
@@ -41,7 +42,9 @@ EXTRA_S = 3.0
 def main() -> dict[str, Any]:
     """Run the job that standard input names."""
     die_with_parent()
-    job = Job.from_dict(json.loads(sys.stdin.readline()))
+    asked = json.loads(sys.stdin.readline())
+    trust.restore(asked.pop("named", ()))
+    job = Job.from_dict(asked)
 
     def wait() -> None:
         _say({"ready": os.getpid()})
@@ -59,9 +62,14 @@ def _await() -> None:
         raise SystemExit("whoever started the measurement has gone")
 
 
+_answers: IO[str] | None = None
+"""Where answers go; standard output when None."""
+
+
 def _say(line: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(line) + "\n")
-    sys.stdout.flush()
+    stream = _answers or sys.stdout
+    stream.write(json.dumps(line) + "\n")
+    stream.flush()
 
 
 def run_job(
@@ -212,4 +220,5 @@ def _set_torch_threads(threads: int) -> None:
 
 
 if __name__ == "__main__":
-    answer(main)
+    _answers = answers_alone()
+    answer(main, _answers)

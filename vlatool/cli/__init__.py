@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import threading
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from vlatool import __version__
+from vlatool import __version__, trust
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._stages import StageGroup
 from vlatool.cli.compare import compare
@@ -42,6 +44,12 @@ app = typer.Typer(
 )
 
 
+def _trust(folders: list[Path]) -> list[Path]:
+    for folder in folders:
+        trust.trust(folder)
+    return folders
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"vlatool {__version__}")
@@ -53,6 +61,14 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
+    trusted: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--trust",
+            callback=lambda folders: _trust(folders or []),
+            help="let a bundle run the code in this policy directory, now and later, until something in it changes",
+        ),
+    ] = None,
 ) -> None:
     """Make a trained robot policy run, fast and safely, on the board that the robot carries."""
 
@@ -81,6 +97,50 @@ KEEPING = frozenset(("optimize", "export", "quantize"))
 """Commands whose finished stages stay in the cache when they are interrupted."""
 
 
+def _standard_files() -> None:
+    """Open what the shell has closed (``2>&-``): files that are opened later would take the numbers, and the prints."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
+
+
+def _flushed() -> None:
+    """Give what nobody takes to nobody: a full disk or a closed pipe does not change the exit code at the very end."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _say(text: str, fix: str = "") -> None:
+    """Say something on stderr, where somebody reads it."""
+    with contextlib.suppress(OSError, ValueError):
+        typer.echo(f"{text}\n  fix: {fix}" if fix else text, err=True)
+
+
+def _with_trust_first(arguments: list[str]) -> list[str]:
+    """Let ``--trust DIR`` stand anywhere: it is an option of every command."""
+    first: list[str] = []
+    rest: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        if word == "--":
+            rest += [word, *words]
+        elif word == "--trust":
+            first += [word, *[each for each in [next(words, None)] if each is not None]]
+        elif word.startswith("--trust="):
+            first.append(word)
+        else:
+            rest.append(word)
+    return first + rest
+
+
 def _end_on_signals() -> None:
     """Let SIGTERM and SIGHUP end the program as Ctrl-C does: what it started is ended, what it began is removed."""
 
@@ -98,39 +158,48 @@ def main(arguments: list[str] | None = None) -> None:
 
     0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
     """
+    _standard_files()
     _end_on_signals()
+    words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
     try:
-        with plain_warnings():
-            code = app(arguments, standalone_mode=False) or 0
+        with plain_warnings(), trust.nothing_named():
+            code = app(words, standalone_mode=False) or 0
         if code == INTERRUPTED:  # typer catches Ctrl-C itself
             raise KeyboardInterrupt
-        sys.exit(code)
     except SystemExit as left:  # a closed pipe: typer puts a wrapper around stdout and leaves with 1
-        sys.exit(0 if type(sys.stdout).__name__ == "PacifyFlushWrapper" else left.code)
-    except CLICK_EXCEPTION as error:
-        error.show()
-        sys.exit(error.exit_code)
-    except VlatoolError as error:
-        typer.echo(f"error: {error.message}", err=True)
-        if error.fix:
-            typer.echo(f"  fix: {error.fix}", err=True)
-        sys.exit(error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
-        kept = "; finished stages are kept" if KEEPING.intersection((arguments or sys.argv[1:])[:1]) else ""
-        typer.echo(f"interrupted{kept}", err=True)
-        sys.exit(INTERRUPTED)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
-    except OSError as error:
-        typer.echo(f"error: {error.filename or 'a file'}: {error.strerror or error}.", err=True)
-        sys.exit(3)
-    except MemoryError:
-        typer.echo("error: out of memory.\n  fix: use a machine with more memory, or a smaller policy", err=True)
-        sys.exit(3)
-    except Exception as error:
-        if os.environ.get("VLATOOL_DEBUG"):
+        code = 0 if type(sys.stdout).__name__ == "PacifyFlushWrapper" else left.code
+    except BaseException as error:  # the seam: whatever happened becomes an exit code
+        if not isinstance(error, Exception | KeyboardInterrupt):
             raise
-        typer.echo(f"internal error: {type(error).__name__}: {error}", err=True)
-        typer.echo("  fix: this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback", err=True)
-        sys.exit(OUR_BUG)
+        code = _exit_code(error, words)
+    _flushed()
+    sys.exit(code)
+
+
+def _exit_code(error: BaseException, words: list[str]) -> int:
+    """Say what went wrong; return the exit code that it has."""
+    if isinstance(error, CLICK_EXCEPTION):
+        with contextlib.suppress(OSError, ValueError):
+            error.show()
+        return int(error.exit_code)
+    if isinstance(error, VlatoolError):
+        _say(f"error: {error.message}", error.fix)
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
+        _say(f"interrupted{'; finished stages are kept' if KEEPING.intersection(words) else ''}")
+        return INTERRUPTED
+    if isinstance(error, BrokenPipeError):
+        return 0
+    if isinstance(error, OSError):
+        _say(f"error: {error.filename or 'a file'}: {error.strerror or error}.")
+        return 3
+    if isinstance(error, MemoryError):
+        _say("error: out of memory.", "use a machine with more memory, or a smaller policy")
+        return 3
+    if os.environ.get("VLATOOL_DEBUG"):
+        raise error
+    _say(
+        f"internal error: {type(error).__name__}: {error}",
+        "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback",
+    )
+    return OUR_BUG

@@ -81,7 +81,8 @@ def plain_warnings() -> Iterator[None]:
             elsewhere(message, category, *where, **more)
         elif str(message) not in shown:
             shown.add(str(message))
-            typer.echo(f"warning: {message}", err=True)
+            with contextlib.suppress(OSError, ValueError):
+                typer.echo(f"warning: {message}", err=True)
 
     warnings.showwarning = show
     try:
@@ -137,12 +138,18 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
 
 
 def emit(text: str) -> None:
-    """Print on stdout; a reader that has gone (``| head``) does not change the exit code, which is the verdict's."""
+    """Print on stdout; a reader that has gone (``| head``) or a full disk does not change the exit code.
+
+    That is the verdict's.
+    """
     try:
         typer.echo(text, nl=False)
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            with contextlib.suppress(OSError, ValueError):
+                typer.echo(f"warning: the result cannot be printed: {error.strerror}", err=True)
 
 
 def terminal_text(report: Report, *, brief: bool = False) -> str:

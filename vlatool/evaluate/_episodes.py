@@ -1,22 +1,27 @@
-"""Play episodes, spread over worker processes; each worker opens the bundle once."""
+"""Play episodes, spread over child processes; each opens the bundle once.
+
+The environment is a user's code: it runs in children alone, however many, and one that ends its process, prints or
+changes the directory does that there (see ``vlatool.apart``).
+"""
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
-import multiprocessing
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from vlatool.apart import spread
 from vlatool.bundle import Bundle
 from vlatool.errors import DataError, VlatoolError
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import Policy
-from vlatool.sources._factory import call_factory
+from vlatool.sources._factory import call_factory, exits_told
 from vlatool.stage import Context
 
 STEP_LIMIT = 100_000
+PRELOAD = ("numpy", "onnxruntime", __name__)
 
 
 @dataclass(frozen=True)
@@ -45,24 +50,24 @@ def run_jobs(bundle: Bundle, jobs: list[Job], engine: str, context: Context) -> 
 
     Raises:
         DataError: when the environment fails or does not fit the policy's spec.
+        SourceError: when it ends the process that it runs in.
     """
-    arguments = (str(bundle.path), engine)
-    if context.workers == 1:
-        worker = _Worker(*arguments)
-        try:
-            return _collect((worker.play(job) for job in jobs), len(jobs), context)
-        finally:
-            worker.close()
-    spawn = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(context.workers, spawn, _open, arguments)
+    opening = {"bundle": str(bundle.path.absolute()), "engine": engine, "limit": STEP_LIMIT}
+    requests = [{**opening, "job": asdict(job)} for job in jobs]
+    about = jobs[0].environment.rpartition(":")[0] if jobs else ""
+    here = f"{__name__}:"
+    found = spread(f"{here}play", requests, context.workers, context.tell, about, PRELOAD, last=f"{here}close")
+    with contextlib.closing(found):
+        played = (_played(part, job) for part, job in zip(found, jobs, strict=True))
+        return _collect(played, len(jobs), context)
+
+
+def _played(found: Any, job: Job) -> list[Outcome]:
+    """Return what a child says of the episodes of a job."""
     try:
-        return _collect(pool.map(_play, jobs), len(jobs), context)
-    except concurrent.futures.process.BrokenProcessPool as error:
-        raise DataError(
-            "A worker process died while it played episodes.", "look at the memory, or run with --workers 1 to see why"
-        ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        return [Outcome(job.task, int(seed), bool(success), int(steps)) for seed, success, steps in found]
+    except (TypeError, ValueError) as error:
+        raise DataError(f"The process that played '{job.task}' answers what are no episodes.") from error
 
 
 def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
@@ -74,8 +79,8 @@ def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
     return outcomes
 
 
-class _Worker:
-    """What a worker process keeps between jobs: the policy and the environment of the current task."""
+class Worker:
+    """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
         self.queue = ChunkQueue(Policy.open(Bundle.open(Path(path)), engine=engine, threads=1, seed=0))
@@ -92,10 +97,10 @@ class _Worker:
             self._key = key
         return self._environment
 
-    def play(self, job: Job) -> list[Outcome]:
+    def play(self, job: Job, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
         environment = self.environment(job)
-        return [_episode(environment, self.queue, job.task, seed) for seed in job.seeds]
+        return [_episode(environment, self.queue, job.task, seed, limit) for seed in job.seeds]
 
     def close(self) -> None:
         """Close the open environment; one that fails to close has done its work all the same."""
@@ -105,35 +110,42 @@ class _Worker:
                 environment.close()
 
 
-_worker: _Worker | None = None
+_worker: Worker | None = None
 
 
-def _open(path: str, engine: str) -> None:
+def play(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> list[list[Any]]:
+    """Play the episodes of a job in this process: seed, success and steps of each."""
     global _worker
-    _worker = _Worker(path, engine)
-
-
-def _play(job: Job) -> list[Outcome]:
     if _worker is None:
-        raise RuntimeError("the worker was not opened")
-    return _worker.play(job)
+        _worker = Worker(request["bundle"], request["engine"])
+    job = Job(**{**request["job"], "seeds": tuple(request["job"]["seeds"])})
+    return [[each.seed, each.success, each.steps] for each in _worker.play(job, request["limit"])]
 
 
-def _episode(environment: Any, queue: ChunkQueue, task: str, seed: int) -> Outcome:
+def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> None:
+    """Close what is open in this process."""
+    global _worker
+    if _worker is not None:
+        _worker.close()
+    _worker = None
+
+
+def _episode(environment: Any, queue: ChunkQueue, task: str, seed: int, limit: int) -> Outcome:
     try:
-        observation, _ = environment.reset(seed=seed)
-        queue.reset()
-        for step in range(1, STEP_LIMIT):
-            action = queue.act(observation)
-            observation, _, terminated, truncated, info = environment.step(
-                action.item() if action.ndim == 0 else action
-            )
-            if terminated or truncated:
-                return Outcome(task, seed, bool(info.get("success", False)), step)
+        with exits_told(f"the environment of task '{task}', at seed {seed},"):
+            observation, _ = environment.reset(seed=seed)
+            queue.reset()
+            for step in range(1, limit):
+                action = queue.act(observation)
+                observation, _, terminated, truncated, info = environment.step(
+                    action.item() if action.ndim == 0 else action
+                )
+                if terminated or truncated:
+                    return Outcome(task, seed, bool(info.get("success", False)), step)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: a user's environment may raise anything
         raise DataError(
             f"The environment of task '{task}' failed at seed {seed}: {type(error).__name__}: {error}."
         ) from error
-    raise DataError(f"The environment of task '{task}' did not end within {STEP_LIMIT} steps at seed {seed}.")
+    raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.")

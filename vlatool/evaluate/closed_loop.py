@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
+from vlatool import trust
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.errors import DataError, UsageError, nearest
+from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._episodes import Job, run_jobs
 from vlatool.evaluate._paired import compare_success, success_row
 from vlatool.host import fingerprint
 from vlatool.report import Report, Row
 from vlatool.sources._description import read_description
-from vlatool.sources._factory import factory_file
+from vlatool.sources._factory import factory_file, split_factory
 from vlatool.stage import Context, Measure
 
 if TYPE_CHECKING:
@@ -50,12 +51,13 @@ class ClosedLoop(Measure):
         return (*([self.baseline / MANIFEST] if self.baseline else []), *code)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Environment and tasks are named."""
-        self._jobs(source)
+        """Environment and tasks are named, and the environment may run."""
+        self._may_run(self._jobs(source)[0])
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Run all episodes of the bundle, and of the baseline when there is one."""
         jobs = self._jobs(source)
+        self._may_run(jobs[0])
         rows: list[Row] = []
         if self.baseline:
             rows.append(
@@ -69,6 +71,24 @@ class ClosedLoop(Measure):
         title = f"{source.manifest.name}{told} in {count} closed-loop episodes"
         text = f"{row.value('success'):.1%} of {count} episodes succeed{told and ',' + told}."
         return Report("evaluate", title, summary=(text,), rows=tuple(rows), environment=fingerprint())
+
+    def _may_run(self, job: Job) -> None:
+        """Let the environment's code run where it was named in the options; what a bundle names must be trusted.
+
+        Raises:
+            SourceError: when it is not.
+        """
+        where, function = split_factory(job.environment)
+        file = factory_file(job.environment, Path(job.folder))
+        if self.policy or self.environment:
+            trust.name(file.parent if file else Path(job.folder))
+            return
+        if file is None:
+            raise SourceError(
+                f"This would run {function}() of the package {where}, which the bundle names and you did not.",
+                "pass --policy DIR, or --environment and --tasks",
+            )
+        trust.require(file.parent, f"{function}() of {file.name}")
 
     def _jobs(self, source: Bundle | None) -> list[Job]:
         described = read_description(self.policy) if self.policy else None

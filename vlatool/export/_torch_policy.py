@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vlatool.bundle import Bundle, hash_file
+from vlatool.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
 from vlatool.manifest import ProgramStep
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
-from vlatool.sources._description import read_location
-from vlatool.sources._factory import call_factory, factory_file
+from vlatool.sources._factory import exits_told
+from vlatool.sources._origin import origin_of
 from vlatool.sources._shards import read_header, shard_files
 
 if TYPE_CHECKING:
@@ -28,12 +28,9 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
     torch = require("torch", "build")
-    origin = source.manifest.source
-    if "factory" not in origin:
-        raise SourceError(f"{source.path} was not made from a torch policy; it has nothing to export.")
-    folder = read_location(source.path)
-    _check_code(origin, folder)
-    made = call_factory(origin["factory"], folder, dict(origin.get("arguments", {})))
+    origin = origin_of(source)
+    origin.check()
+    made = origin.made()
     modules = made if isinstance(made, Mapping) else {"main": made}
     wanted = {step.graph for step in source.manifest.program}
     for name in wanted:
@@ -41,9 +38,9 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
             raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, modules)}.")
         if not isinstance(modules[name], torch.nn.Module):
             raise SourceError(f"The factory gave a {type(modules[name]).__name__} for '{name}'; wanted a torch module.")
-    if origin.get("weights"):
+    if origin.weights:
         for name in wanted:
-            _load_weights(name, modules[name], folder, str(origin["weights"]))
+            _load_weights(name, modules[name], origin.folder, origin.weights)
     return {name: modules[name].eval() for name in sorted(wanted)}
 
 
@@ -69,14 +66,6 @@ def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> 
             raise SourceError(f"'{name}' has the shape {got} in the shards; the module's is {want}.")
         found[name] = tensor.to(value.dtype)
     module.load_state_dict(found)
-
-
-def _check_code(origin: Mapping[str, Any], folder: Path) -> None:
-    path = factory_file(origin["factory"], folder)
-    for name, digest in origin.get("code", {}).items():
-        file = (path.parent if path else folder) / name
-        if not file.is_file() or hash_file(file) != digest:
-            raise SourceError(f"{file} has changed since the source bundle was made.", "start again from the source")
 
 
 def torch_policy(source: Bundle) -> Policy:
@@ -110,8 +99,10 @@ class TorchSession:
             self.first_feeds = dict(feeds)
         arguments = [torch.from_numpy(np.ascontiguousarray(feeds[name])) for name in self.step.feeds]
         try:
-            with torch.inference_mode():
+            with torch.inference_mode(), exits_told("the policy's forward()"):
                 given = self.module(*arguments)
+        except SourceError:
+            raise
         except Exception as error:  # the seam: the user's module may raise anything
             shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
             raise SourceError(

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, require
+from vlatool.errors import GraphError, SourceError, require
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
@@ -25,6 +25,8 @@ from vlatool.runtime.contract import Outputs, check_chunk
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
+from vlatool.sources._factory import exits_told
+from vlatool.sources._origin import factory_of
 from vlatool.stage import Context, Transform, source_of
 
 if TYPE_CHECKING:
@@ -46,6 +48,10 @@ class ExportOnnx(Transform):
     opset: int = Field(20, ge=18, le=23, description="opset of the default ONNX domain")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
     tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
+
+    def runs(self, source: Bundle | None) -> str:
+        """The factory builds the modules, and their forward() runs."""
+        return factory_of(source)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Export, run, compare, and write the bundle."""
@@ -112,18 +118,31 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     """
     torch = require("torch", "build")
     try:
-        with quiet_exporter(), torch.no_grad():
+        with quiet_exporter(), torch.no_grad(), exits_told("the policy's forward()"):
             return torch.onnx.export(
                 module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
                 output_names=list(step.gives), verbose=False, **options,
             )  # fmt: skip
+    except SourceError:
+        raise
     except Exception as error:  # the seam: the exporter raises many foreign types
+        raise_interrupt(error)
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
         raise GraphError(
             f"torch cannot export the graph '{step.graph}': {reason}.",
             "keep data-dependent control flow, and what depends on the values of weights, out of forward(); see "
             "docs/guides/your-own-policy.md",
         ) from error
+
+
+def raise_interrupt(error: BaseException | None) -> None:
+    """Raise Ctrl-C again where a library has wrapped it into an error of its own."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        seen.add(id(error))
+        error = error.__cause__ or error.__context__
 
 
 def name_by_module(model: Any) -> None:

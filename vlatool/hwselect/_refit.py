@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vlatool.apart import spread
 from vlatool.errors import DataError, UsageError
 from vlatool.hwselect._fit import fit
 from vlatool.hwselect._latency import LatencyModel, Predicted
@@ -53,21 +54,20 @@ def refit_points(
     if len(folds) < 2:
         raise DataError(f"{path} has no two {held_out}: nothing is left to fit on.")
     answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
-    with single_threads(), ProcessPoolExecutor(len(os.sched_getaffinity(0)), get_context("spawn")) as workers:
-        jobs = [workers.submit(one_fold, points, held, held_out, seed, seconds) for held in folds]
-        try:
-            for done, job in enumerate(as_completed(jobs), 1):
-                for kind, found in job.result().items():
-                    answered[kind] += found
-                tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
-        except BaseException:  # Ctrl-C too: what has begun ends, nothing further begins
-            workers.shutdown(wait=False, cancel_futures=True)
-            raise
+    how = {"points": str(path.absolute()), "held_out": held_out, "seed": seed, "seconds": seconds}
+    jobs = [{**how, "held": sorted(held)} for held in folds]
+    processes = len(os.sched_getaffinity(0))
+    parts = spread(f"{__name__}:fold", jobs, processes, tell, "the fit", (__name__,))
+    with single_threads(), contextlib.closing(parts):
+        for done, part in enumerate(parts, 1):
+            for kind, found in part.items():
+                answered[kind] += [(points[number], Predicted(**told)) for number, told in found]
+            tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
     unasked = [point for point in points if not point.question]
-    how = f"all fitted anew without it, {seconds:g} s each"
+    told = f"all fitted anew without it, {seconds:g} s each"
     return {
         kind: summary(
-            [point for point, _ in found] + unasked, [each for _, each in found], f"{told_as(kind, seed)}; {how}"
+            [point for point, _ in found] + unasked, [each for _, each in found], f"{told_as(kind, seed)}; {told}"
         )
         for kind, found in answered.items()
     }
@@ -84,6 +84,14 @@ def dealt(points: Sequence[Point], held_out: str, seed: int) -> list[frozenset[s
     order = np.random.default_rng(seed).permutation(len(names))
     parts = [frozenset(names[place] for place in order[number::FOLDS]) for number in range(FOLDS)]
     return [part for part in parts if part]
+
+
+def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Compute one part in this process: kind -> number of the point and what was predicted for it."""
+    points = read_points(Path(job["points"]))
+    numbers = {id(point): number for number, point in enumerate(points)}
+    found = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
+    return {kind: [[numbers[id(point)], asdict(told)] for point, told in part] for kind, part in found.items()}
 
 
 def one_fold(

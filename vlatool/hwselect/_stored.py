@@ -40,7 +40,14 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
         data = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    if not isinstance(data, dict) or data.get("layout") != LAYOUT or data.get("digest", "") != of:
+    if not isinstance(data, dict) or data.get("digest", "") != of:
+        return None
+    return from_values(data)
+
+
+def from_values(data: Any) -> Workload | None:
+    """Return the workload of what ``to_values`` gave; None when it is something else."""
+    if not isinstance(data, dict) or data.get("layout") != LAYOUT:
         return None
     graphs = {}
     try:
@@ -64,11 +71,16 @@ def write_workload(file: Path, found: Workload, of: str = "") -> None:
     Raises:
         OSError: when the file cannot be written.
     """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(file) as draft:
+        data = {**to_values(found), "digest": of}
+        draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def to_values(found: Workload) -> dict[str, Any]:
+    """Return a workload as JSON values."""
     graphs: dict[str, Any] = {}
     for name, graph in found.graphs.items():
         fields = dataclasses.asdict(graph)
         graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(file) as draft:
-        data = {"layout": LAYOUT, "digest": of, "graphs": graphs, "runs": dict(found.runs)}
-        draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)}

@@ -8,12 +8,15 @@ import math
 import warnings
 import weakref
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from vlatool import apart
 from vlatool.bundle import Bundle
 from vlatool.errors import SourceError, require
+from vlatool.hwselect._stored import from_values, to_values
 from vlatool.hwselect._workload import GraphWorkload, Tally, Workload, part_named
 from vlatool.manifest import ProgramStep
 from vlatool.sources._faked import faked_modules, run_faked
@@ -21,6 +24,26 @@ from vlatool.sources._faked import faked_modules, run_faked
 PRODUCTS = {"mm": 0, "bmm": 0, "addmm": 1, "baddbmm": 1}
 """Operator of torch -> the position of its first factor."""
 ATTENTION = "_scaled_dot_product"
+
+
+def counted_apart(bundle: Bundle, tell: Callable[[str, float | None], None]) -> Workload:
+    """Count as ``torch_workload`` does, in a child process: the policy's code runs there.
+
+    Raises:
+        SourceError: when the factory or a module fails, or ends its process.
+    """
+    about = str(bundle.manifest.source.get("factory", "")).rpartition(":")[0]
+    job = {"bundle": str(bundle.path.absolute())}
+    found = apart.call("vlatool.hwselect._torch_workload:count", job, tell, about, ("torch", __name__))
+    counted = from_values(found)
+    if counted is None:
+        raise SourceError(f"{about} was counted in a way that makes no sense.")
+    return counted
+
+
+def count(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Count in this process; see ``counted_apart``."""
+    return to_values(torch_workload(Bundle.open(Path(job["bundle"]), verify=False)))
 
 
 def torch_workload(bundle: Bundle) -> Workload:

@@ -10,6 +10,7 @@ from pathlib import Path
 from vlatool.bundle import Bundle, writing
 from vlatool.errors import BundleError, DataError, OutputError
 from vlatool.host import cache_directory as cache_directory
+from vlatool.launch._inside import run_apart
 from vlatool.report import REPORT, Report, read_report
 from vlatool.stage import Context, Measure, Stage, Transform
 
@@ -19,6 +20,8 @@ def run_transform(
 ) -> Bundle:
     """Run a stage that makes a bundle; ``out`` appears whole or not at all.
 
+    A stage that runs a user's code does so in a child process.
+
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
     """
@@ -26,7 +29,10 @@ def run_transform(
         raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
     stage.check(source, None)
     with writing(out, force=force) as draft:
-        stage.run(source, draft, context)
+        if stage.runs(source):
+            run_apart(stage, source, draft, context)
+        else:
+            stage.run(source, draft, context)
     return Bundle.open(out, verify=False)
 
 

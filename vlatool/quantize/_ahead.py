@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import queue
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from vlatool import errors
-from vlatool.processes import SINGLE, environment
+from vlatool.processes import SINGLE, python_command
 from vlatool.quantize._records import Record, Tools, compute
 
 
@@ -80,8 +80,8 @@ class Worker:
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "vlatool.quantize._worker"],
-            env={**environment(), **SINGLE},
+            python_command("vlatool.quantize._worker"),
+            env={**os.environ, **SINGLE},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -13,8 +13,8 @@ from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, nearest, require
 from vlatool.export.onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
 from vlatool.manifest import ProgramStep
-from vlatool.sources._description import read_description, read_location
 from vlatool.sources._faked import faked_modules, run_faked
+from vlatool.sources._origin import origin_of
 from vlatool.sources._shards import StoredTensor, read_shards, stored_array
 
 FOLDED = 1 << 16
@@ -38,8 +38,8 @@ class Skeleton:
 
 def policy_weights(bundle: Bundle) -> tuple[Path, str]:
     """Return the folder of a policy's code and the glob of its weights; empty when the factory loads them itself."""
-    folder = read_location(bundle.path)
-    return folder, read_description(folder).weights
+    origin = origin_of(bundle)
+    return origin.folder, origin.weights
 
 
 def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 from vlatool.errors import GraphError
+from vlatool.processes import python_code
 
 CODE = """
 import sys
@@ -22,7 +22,7 @@ def compile_apart(path: Path) -> None:
     Raises:
         GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
     """
-    done = subprocess.run([sys.executable, "-c", CODE, str(path)], capture_output=True, check=False)
+    done = subprocess.run(python_code(CODE, [str(path)]), capture_output=True, check=False)
     if done.returncode < 0:
         raise GraphError(
             f"OpenVINO crashes (signal {-done.returncode}) when it compiles {path.name} with these layers in int8.",

@@ -24,6 +24,7 @@ from vlatool.quantize._records import Record
 from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shards, weights_fingerprint
 from vlatool.quantize._stream import Written, forget, work_directory, work_root, write_records
 from vlatool.quantize._weights_plan import WeightsPlan, make_plan
+from vlatool.sources._origin import factory_of
 from vlatool.stage import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
@@ -86,6 +87,10 @@ class WeightOnly(Quantization):
                 f"{source.path} has no graph to quantize, and its policy.yaml names no weights to stream.",
                 "export it first: vlatool export SOURCE -o BUNDLE; or add 'weights: \"*.safetensors\"' to policy.yaml",
             )
+
+    def runs(self, source: Bundle | None) -> str:
+        """A policy without graphs is exported here."""
+        return factory_of(source)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Plan, stream the weights into one file, write the graphs, and verify."""

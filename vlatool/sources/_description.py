@@ -120,10 +120,12 @@ def read_location(bundle: Path) -> Path:
     """
     try:
         folder = Path(json.loads((bundle / LOCATION).read_text(encoding="utf-8"))["folder"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise SourceError(
             f"{bundle} does not say where the policy's code is.", "start again from the source"
         ) from error
+    if not folder.is_absolute() or ".." in folder.parts or "\0" in str(folder):
+        raise SourceError(f"{bundle} notes {str(folder)!r} as the place of the code.", "start again from the source")
     if not folder.is_dir():
         raise SourceError(f"The policy's code was in {folder}, which is gone.", "start again from the source")
     return folder

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from vlatool.apart import left
 from vlatool.errors import MissingExtra, SourceError, VlatoolError, nearest
 
 
@@ -47,8 +48,11 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
     path = factory_file(factory, folder)
     if path is not None and not path.is_file():
         raise SourceError(f"There is no file {path} (from '{factory}').")
+    if path is None:
+        _check_package(factory)
     try:
-        module = _import_path(path) if path is not None else importlib.import_module(where)
+        with exits_told(f"importing '{where}'"):
+            module = _import_path(path) if path is not None else importlib.import_module(where)
     except VlatoolError:
         raise
     except ModuleNotFoundError as error:
@@ -62,6 +66,8 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
     if not callable(found):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
         raise SourceError(f"'{where}' has no function '{function}'; {nearest(function, known)}.")
+    if path is None:
+        _check_own(found, factory)
     return found  # type: ignore[no-any-return]
 
 
@@ -73,7 +79,7 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
     """
     make = import_factory(factory, folder)
     try:
-        with _importable(factory_file(factory, folder)):
+        with _importable(factory_file(factory, folder)), exits_told(f"the factory '{factory}'"):
             return make(**arguments)
     except (VlatoolError, MemoryError):
         raise
@@ -83,6 +89,46 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
         ) from error
     except Exception as error:  # the seam: user code may raise anything
         raise SourceError(f"The factory '{factory}' failed: {type(error).__name__}: {error}.") from error
+
+
+@contextlib.contextmanager
+def exits_told(what: str) -> Iterator[None]:
+    """Turn what a user's code raises beside ``Exception`` (``sys.exit``, classes of its own) into an error.
+
+    Raises:
+        SourceError: saying what was raised; Ctrl-C stays Ctrl-C.
+    """
+    try:
+        yield
+    except (Exception, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # the seam: user code may raise anything
+        raise left(what[:1].upper() + what[1:], type(error).__name__, str(error)) from error
+
+
+def _check_package(factory: str) -> None:
+    """Refuse modules of Python itself: what they hold builds no policy, but may run commands."""
+    package = split_factory(factory)[0].partition(".")[0]
+    if package in sys.stdlib_module_names:
+        raise SourceError(
+            f"'{factory}' names a function of Python's standard library, which makes neither policy nor environment.",
+            "name a function in a file beside policy.yaml, or in a package that is made for it",
+        )
+
+
+def _check_own(found: Any, factory: str) -> None:
+    """Refuse a function that the named package only imports from elsewhere.
+
+    Raises:
+        SourceError: naming the module that defines it.
+    """
+    package = split_factory(factory)[0].partition(".")[0]
+    module = str(getattr(found, "__module__", None) or type(found).__module__)
+    if module.partition(".")[0] != package:
+        raise SourceError(
+            f"'{factory}' is defined in '{module}', not in the package '{package}'.",
+            "name a function that the package itself defines, or write one in a file beside policy.yaml",
+        )
 
 
 def _import_path(path: Path) -> ModuleType:

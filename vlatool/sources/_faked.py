@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vlatool.bundle import Bundle, hash_file
+from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import SourceError, nearest, require
 from vlatool.manifest import ProgramStep
 from vlatool.runtime.observation import ObservationEncoder
-from vlatool.sources._description import read_location
-from vlatool.sources._factory import call_factory, factory_file
+from vlatool.sources._factory import exits_told
+from vlatool.sources._origin import origin_of
 
 DRAWING = (
     "uniform_", "normal_", "trunc_normal_", "xavier_uniform_", "xavier_normal_", "kaiming_uniform_", "kaiming_normal_",
@@ -32,7 +31,7 @@ def faked_modules(bundle: Bundle) -> dict[str, Any]:
     Raises:
         SourceError: when code has changed, the factory fails, or a graph has no module.
     """
-    return _modules(require("torch", "build"), bundle, read_location(bundle.path))
+    return _modules(require("torch", "build"), bundle)
 
 
 def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
@@ -68,15 +67,11 @@ def _declare(step: ProgramStep, values: dict[str, Any]) -> None:
         values[name] = (tuple(kept["shape"]), np.dtype(kept.get("dtype", "float32")))
 
 
-def _modules(torch: Any, bundle: Bundle, folder: Path) -> dict[str, Any]:
-    origin = bundle.manifest.source
-    path = factory_file(origin["factory"], folder)
-    for name, digest in origin.get("code", {}).items():
-        file = (path.parent if path else folder) / name
-        if file.suffix == ".py" and (not file.is_file() or hash_file(file) != digest):
-            raise SourceError(f"{file} has changed since the source bundle was made.", "start again from the source")
+def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
+    origin = origin_of(bundle)
+    origin.check((".py",))
     with _parameters_on_meta(torch):
-        made = call_factory(origin["factory"], folder, dict(origin.get("arguments", {})))
+        made = origin.made()
     modules = made if isinstance(made, Mapping) else {"main": made}
     for step in bundle.manifest.program:
         given = modules.get(step.graph)
@@ -164,7 +159,7 @@ def _fake_tensor(torch: Any, mode: Any, shape: tuple[int, ...], dtype: Any) -> A
 
 
 def _outputs(torch: Any, step: ProgramStep, module: Any, feeds: list[Any]) -> list[Any]:
-    with torch.inference_mode(False), torch.no_grad():
+    with torch.inference_mode(False), torch.no_grad(), exits_told("the policy's forward()"):
         given = module(*feeds)
     outputs = list(given) if isinstance(given, tuple | list) else [given]
     if len(outputs) != len(step.gives):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from vlatool import trust
 from vlatool.bundle import Bundle, hash_file, seal
 from vlatool.errors import SourceError
 from vlatool.manifest import Manifest
@@ -52,6 +53,7 @@ class TorchModule(Transform):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the spec, the assets and the recorded data."""
         described = read_description(self.policy)
+        self.name_it()
         copy_assets(described, out)
         factory = self._factory(described)
         code = {path.name: hash_file(path) for path in self._code(described)}
@@ -69,6 +71,10 @@ class TorchModule(Transform):
             license=described.license,
         )
         return seal(out, manifest)
+
+    def name_it(self) -> None:
+        """Let the policy's code run in this process: the user named its folder."""
+        trust.name(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
 
     def _factory(self, described: Description) -> str:
         factory = self.factory or described.factory

@@ -1,0 +1,247 @@
+"""A bundle is data: its files make no code run that the user neither named nor trusted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlatool import trust
+from vlatool.bundle import LOCATION, MANIFEST, Bundle, manifest_bytes, seal
+from vlatool.cli import main
+from vlatool.errors import SourceError, UsageError
+from vlatool.export._torch_policy import load_modules
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage import Context
+
+MARKED = """\
+import pathlib
+pathlib.Path(__file__).with_name("ran").touch()
+"""
+
+
+@pytest.fixture(autouse=True)
+def nothing_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Each test begins with a user who trusts nothing."""
+    monkeypatch.setenv("VLATOOL_TRUST", str(tmp_path / "settings" / "trusted.json"))
+    with trust.nothing_named():
+        yield
+
+
+@pytest.fixture
+def mine(policy_dir: Path) -> Path:
+    """A policy whose code leaves a mark when it runs."""
+    for name in ("policy.py", "environment.py"):
+        (policy_dir / name).write_text(MARKED + (policy_dir / name).read_text())
+    return policy_dir
+
+
+@pytest.fixture
+def bundle(mine: Path, tmp_path: Path) -> Bundle:
+    """The source bundle of that policy, as somebody else may have sent it."""
+    (tmp_path / "bundle").mkdir()
+    with trust.nothing_named():
+        return TorchModule(policy=mine).run(None, tmp_path / "bundle", Context())
+
+
+@pytest.fixture
+def vlatool(capsys):
+    def run(*line: Any) -> tuple[int, str, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main([str(part) for part in line])
+        told = capsys.readouterr()
+        return left.value.code or 0, told.out, told.err
+
+    return run
+
+
+def ran(mine: Path) -> bool:
+    return (mine / "ran").exists()
+
+
+COMMANDS = {
+    "export": ["export", "BUNDLE", "-o", "OUT"],
+    "quantize": ["quantize", "weight-only", "BUNDLE", "-o", "OUT"],
+    "hwselect": ["hwselect", "BUNDLE", "--boards", "raspberry-pi-5"],
+    "carry": ["hwselect", "BUNDLE", "--boards", "raspberry-pi-5", "--carry-count"],
+    "simulate": ["simulate", "BUNDLE", "--profile", "raspberry-pi-5"],
+    "benchmark": ["benchmark", "BUNDLE", "--iterations", "20", "--duration", "0"],
+    "rebuild": ["rebuild", "BUNDLE", "--check"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_bundle_alone_runs_no_code(vlatool, mine, bundle, tmp_path: Path, command: str) -> None:
+    with (mine / "policy.yaml").open("a") as stream:
+        stream.write('weights: "*.safetensors"\n' if command == "quantize" else "")
+    names = {"BUNDLE": bundle.path, "OUT": tmp_path / "out"}
+    status, out, err = vlatool(*[names.get(word, word) for word in COMMANDS[command]])
+    assert status == 3, err
+    assert not ran(mine)
+    assert out == ""
+    assert str(mine) in err
+    assert "which you did not name" in err
+    assert f"--trust {mine}" in err
+    assert not (mine / "workload.json").exists()
+
+
+def test_a_bundle_alone_plays_no_episodes(vlatool, float_bundle, mine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mine)
+    status, _, err = vlatool("evaluate", "closed-loop", float_bundle.path, "--episodes", 2)
+    assert status == 3
+    assert "This would run make() of environment.py in" in err
+    assert not ran(mine)
+    status, _, err = vlatool("evaluate", "closed-loop", float_bundle.path, "--episodes", 2, "--policy", mine)
+    assert status == 0, err
+    assert ran(mine)
+
+
+def test_an_environment_of_a_package_is_named_by_the_user_alone(vlatool, float_bundle, copied) -> None:
+    made = copied(float_bundle)
+    other = replace(made.manifest, environment={"make": "http.server:test", "tasks": ["reach"]})
+    seal(made.path, other)
+    status, _, err = vlatool("evaluate", "closed-loop", made.path, "--episodes", 2)
+    assert status == 3
+    assert "test() of the package http.server, which the bundle names and you did not" in err
+
+
+def test_what_is_trusted_runs_until_it_changes(vlatool, mine, bundle, tmp_path: Path) -> None:
+    status, _, err = vlatool("export", bundle.path, "-o", tmp_path / "one", "--trust", mine)
+    assert status == 0, err
+    assert ran(mine)
+    assert stat.S_IMODE(trust.place().stat().st_mode) == 0o600
+    (mine / "ran").unlink()
+    status, _, err = vlatool("export", bundle.path, "-o", tmp_path / "two")
+    assert status == 0, err
+    (mine / "ran").unlink()
+    (mine / "helper.py").write_text("x = 1\n")
+    status, _, err = vlatool("export", bundle.path, "-o", tmp_path / "three")
+    assert status == 3
+    assert "which has changed since you trusted it" in err
+    assert not ran(mine)
+
+
+def test_a_policy_that_is_named_needs_no_trust(vlatool, mine, tmp_path: Path) -> None:
+    assert vlatool("export", mine, "-o", tmp_path / "out")[0] == 0
+    assert ran(mine)
+    assert not trust.place().exists()
+
+
+def test_rebuild_takes_the_source_from_the_command_line(vlatool, mine, tmp_path: Path) -> None:
+    assert vlatool("export", mine, "-o", tmp_path / "out")[0] == 0
+    (mine / "ran").unlink()
+    status, _, err = vlatool("rebuild", tmp_path / "out", "--check")
+    assert status == 3
+    assert "name the policy: --source DIR" in err
+    assert not ran(mine)
+    assert vlatool("rebuild", tmp_path / "out", "--check", "--source", mine)[0] == 0
+    assert vlatool("rebuild", tmp_path / "out", "--check", "--trust", mine)[0] == 0
+
+
+def forged(bundle: Bundle, **source: Any) -> Bundle:
+    """Change what a source bundle says of its source, with good hashes."""
+    manifest = replace(bundle.manifest, source={**bundle.manifest.source, **source})
+    (bundle.path / MANIFEST).write_bytes(manifest_bytes(manifest))
+    return Bundle(bundle.path, manifest)
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ({"factory": "subprocess:check_output"}, "names the factory subprocess:check_output, which the description"),
+        ({"factory": "vlatool.statistics:wilson"}, "which the description in .* does not name"),
+        ({"factory": "../evil.py:make"}, "which the description in .* does not name"),
+        ({"factory": "/evil.py:make"}, "which the description in .* does not name"),
+        ({"factory": 3}, "was not made from a torch policy"),
+        ({"factory": "x"}, "names no factory"),
+        ({"arguments": {"layers": 1, "path": "evil.pt"}}, "says arguments: .*evil.pt"),
+        ({"weights": "*.bin"}, r"says weights: '\*.bin'"),
+        ({"code": {"../policy.py": "0"}}, "which is no file beside the factory"),
+        ({"code": ["policy.py"]}, "makes no sense"),
+    ],
+)
+def test_the_policys_own_description_says_what_runs(mine, bundle, source, says: str) -> None:
+    trust.name(mine)
+    with pytest.raises(SourceError, match=says):
+        load_modules(forged(bundle, **source))
+    assert not ran(mine)
+
+
+@pytest.mark.parametrize("folder", ["mine/../other", "relative", "/a/../b", "", "/a\0b", 3, ["/a"]])
+def test_a_place_that_is_no_absolute_path_is_refused(bundle, folder) -> None:
+    (bundle.path / LOCATION).write_text(json.dumps({"folder": folder}))
+    with pytest.raises(SourceError):
+        load_modules(bundle)
+
+
+def test_another_function_of_the_policys_own_files_may_be_named(vlatool, mine, tmp_path: Path) -> None:
+    (mine / "other.py").write_text("from policy import make as build\n")
+    assert vlatool("export", f"{mine / 'other.py'}:build", "-o", tmp_path / "out")[0] == 0
+
+
+def test_a_recipe_names_no_policy(vlatool, mine, policy_template, tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(
+        f"candidates:\n  evil:\n    - sources.torch_module: {{policy: {mine}}}\n    - export.onnx: {{}}\n"
+    )
+    status, _, err = vlatool("optimize", policy_template, "--recipe", recipe, "-o", tmp_path / "out")
+    assert status == 3
+    assert "the policy is named on the command line" in err
+    assert not ran(mine)
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "says"),
+    [
+        ("{}", 0o600, "makes no sense"),
+        ("[", 0o600, "cannot be read"),
+        ('{"schema": 1, "trusted": {"/a": 3}}', 0o600, "makes no sense"),
+        ('{"schema": 1, "trusted": {}}', 0o622, "can be written by others"),
+    ],
+)
+def test_a_file_of_trust_that_is_not_the_users_is_not_believed(tmp_path: Path, text: str, mode: int, says: str) -> None:
+    trust.place().parent.mkdir()
+    trust.place().write_text(text)
+    trust.place().chmod(mode)
+    with pytest.raises(SourceError, match=says):
+        trust.require(tmp_path, "something")
+
+
+def test_the_hash_is_of_all_that_may_hold_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a.py", "b/c.so", "weights.pt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("1")
+    hashes = {trust.content(tmp_path)}
+    for name in ("a.py", "b/c.so", "weights.pt", "new.yaml"):
+        (tmp_path / name).write_text("2")
+        hashes.add(trust.content(tmp_path))
+    assert len(hashes) == 5
+    (tmp_path / "data.npz").write_text("any")
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__/a.pyc").write_text("any")
+    assert trust.content(tmp_path) in hashes
+    os.rename(tmp_path / "a.py", tmp_path / "z.py")
+    assert trust.content(tmp_path) not in hashes
+    monkeypatch.setattr(trust, "MOST_FILES", 2)
+    with pytest.raises(UsageError, match="more than 2 files"):
+        trust.trust(tmp_path)
+
+
+def test_only_a_directory_is_trusted(vlatool, tmp_path: Path) -> None:
+    assert vlatool("profiles", "list", "--trust", tmp_path / "none")[0] == 2
+    assert vlatool("profiles", "list", "--trust")[0] == 2
+
+
+def test_trust_of_a_copy_is_asked_again(vlatool, mine, bundle, tmp_path: Path) -> None:
+    moved = Path(shutil.copytree(mine, tmp_path / "moved"))
+    trust.trust(mine)
+    (bundle.path / LOCATION).write_text(json.dumps({"folder": str(moved)}))
+    assert vlatool("export", bundle.path, "-o", tmp_path / "out")[0] == 3
+    assert not ran(moved)
