@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from vlatool import __version__
-from vlatool.bundle import LOCATION, MANIFEST, Bundle, hash_file, writing
+from vlatool.bundle import LOCATION, MANIFEST, Bundle, hash_file
 from vlatool.differences import Compared, compare_bundles
 from vlatool.errors import BundleError, DataError, SourceError, VlatoolError
 from vlatool.finish import DECIDED, HANDED_OUT, history, reseal
@@ -23,6 +23,7 @@ from vlatool.report import read_report
 from vlatool.sources._description import read_location
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Transform, build_stage, installed_version, source_of, stage_class
+from vlatool.writing import writing
 
 Entry = dict[str, Any]
 TOLD_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")

@@ -16,10 +16,10 @@ from typing import Any
 
 import typer
 
-from vlatool.bundle import OURS, writing
 from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.report import Report
 from vlatool.stage import Context, Tell
+from vlatool.writing import OURS, writing
 
 
 def command_line() -> str:

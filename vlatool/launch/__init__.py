@@ -7,11 +7,12 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
-from vlatool.bundle import Bundle, writing
+from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError, OutputError
 from vlatool.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
 from vlatool.stage import Context, Measure, Stage, Transform
+from vlatool.writing import writing
 
 
 def run_transform(
