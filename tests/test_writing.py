@@ -1,15 +1,20 @@
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from vlatool.errors import OutputError
+from vlatool.moves import exchange, move_new
 from vlatool.writing import _is_alive, writing
+from vlatool.written import LEDGER
 
 WRITER = """
 import sys
@@ -20,6 +25,36 @@ with writing(Path(sys.argv[1]), force=True) as draft:
     (draft / "graphs/main.onnx").write_bytes(b"half of the weights")
     print(draft, flush=True)
     sys.stdin.readline()
+"""
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from vlatool.writing import writing
+with writing(Path(sys.argv[1])) as draft:
+    (draft / "half").touch()
+    print(draft.parent, flush=True)
+    os.kill(os.getpid(), 9)
+"""
+KILLED_LATE = """
+import os, sys
+from pathlib import Path
+from vlatool import writing as module
+def kill(*_args, **_options):
+    os.kill(os.getpid(), 9)
+replace = module._replace
+def last_rename_is_missing(*arguments):
+    module.move_new = kill
+    replace(*arguments)
+if sys.argv[2] != "exchange":
+    module.exchange = lambda one, other: False
+if sys.argv[3] == "between":
+    module._replace = last_rename_is_missing
+else:
+    module.prune = kill
+with module.writing(Path(sys.argv[1]), force=True) as draft:
+    (draft / "new").touch()
 """
 
 
@@ -37,7 +72,29 @@ def stop_half_way(draft: Path) -> None:
 
 
 def content(directory: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    files = {path.name: path for path in directory.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in files.items() if name != LEDGER}
+
+
+def written(directory: Path) -> Path:
+    """A directory that vlatool wrote."""
+    with writing(directory) as draft:
+        fill(draft)
+    return directory
+
+
+def written_meanwhile(first: Path, final: Path) -> None:
+    fill(first)
+    with writing(final) as second:
+        (second / "second").touch()
+        assert first.is_dir()
+
+
+def abandoned(final: Path) -> Path:
+    """The draft of a writer that was killed."""
+    done = subprocess.run([sys.executable, "-c", KILLED, str(final)], stdout=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL
+    return Path(done.stdout.strip())
 
 
 @pytest.fixture
@@ -66,7 +123,7 @@ def test_nothing_is_left_when_the_block_raises(tmp_path: Path):
 
 
 def test_the_old_content_stays_when_the_block_raises(tmp_path: Path):
-    before = content(fill(tmp_path / "out"))
+    before = content(written(tmp_path / "out"))
     with pytest.raises(RuntimeError, match="half-way"), writing(tmp_path / "out", force=True) as draft:
         stop_half_way(draft)
     assert content(tmp_path / "out") == before
@@ -82,19 +139,18 @@ def test_an_existing_output_is_refused(tmp_path: Path):
 
 
 def test_force_replaces_all_of_the_old_content(tmp_path: Path):
-    fill(tmp_path / "out")
+    written(tmp_path / "out")
     with writing(tmp_path / "out", force=True) as draft:
         (draft / "new").write_bytes(b"1")
     assert content(tmp_path / "out") == {"new": b"1"}
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_force_replaces_a_file(tmp_path: Path):
+def test_force_replaces_no_file(tmp_path: Path):
     (tmp_path / "out").write_text("a file")
-    with writing(tmp_path / "out", force=True) as draft:
-        (draft / "new").touch()
-    assert content(tmp_path / "out") == {"new": b""}
-    assert os.listdir(tmp_path) == ["out"]
+    with pytest.raises(OutputError, match="is no directory"), writing(tmp_path / "out", force=True):
+        pytest.fail("the block must not run")
+    assert (tmp_path / "out").read_text() == "a file"
 
 
 def test_a_relative_output_does_not_follow_a_change_of_directory(tmp_path: Path, monkeypatch):
@@ -108,13 +164,28 @@ def test_a_relative_output_does_not_follow_a_change_of_directory(tmp_path: Path,
 
 @pytest.mark.parametrize("name", ["out", "run[1]", "*"])
 def test_the_draft_of_a_dead_process_is_swept(tmp_path: Path, name: str):
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    stale = tmp_path / f".{name}.tmp-{child.pid}-0badcafe"
-    fill(stale)
+    assert abandoned(tmp_path / name).is_dir()
     with writing(tmp_path / name) as draft:
         (draft / "new").touch()
     assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("name", [".out.tmp-123-abc", ".out.tmp-999999999-0badcafe", ".out.old-0badcafe"])
+def test_a_directory_that_is_only_called_like_a_draft_is_left_alone(tmp_path: Path, name: str):
+    before = content(fill(tmp_path / name))
+    with writing(tmp_path / "out") as draft:
+        (draft / "new").touch()
+    assert content(tmp_path / name) == before
+
+
+def test_a_copy_of_a_draft_is_left_alone(tmp_path: Path):
+    draft = abandoned(tmp_path / "out")
+    copy = tmp_path / ".out.tmp-999999999-0badcafe"
+    shutil.copytree(draft, copy)
+    with writing(tmp_path / "out") as own:
+        (own / "new").touch()
+    assert not draft.exists()
+    assert (copy / "content/half").is_file()
 
 
 def test_the_draft_of_another_output_is_left_alone(tmp_path: Path):
@@ -130,20 +201,37 @@ def test_a_draft_that_another_sweep_takes_away_is_not_alive(tmp_path: Path):
 
 def test_the_draft_of_a_living_process_is_left_alone(tmp_path: Path, writer):
     process, draft = writer
-    with writing(tmp_path / "out") as own:
-        (own / "new").touch()
+    written(tmp_path / "out")
     assert (draft / "graphs/main.onnx").read_bytes() == b"half of the weights"
     process.communicate("go on\n")
     assert process.returncode == 0
     assert content(tmp_path / "out") == {"main.onnx": b"half of the weights"}
 
 
-def test_the_draft_of_another_thread_is_left_alone(tmp_path: Path):
-    with writing(tmp_path / "out") as first:
-        (first / "first").touch()
-        with writing(tmp_path / "out") as second:
-            (second / "second").touch()
-            assert first.is_dir()
+def test_of_two_writers_without_force_exactly_one_ends_well(tmp_path: Path):
+    with pytest.raises(OutputError, match="exists already"), writing(tmp_path / "out") as first:
+        written_meanwhile(first, tmp_path / "out")
+    assert content(tmp_path / "out") == {"second": b""}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_of_many_writers_at_once_exactly_one_ends_well(tmp_path: Path):
+    together = threading.Barrier(8)
+
+    def write(number: int) -> str:
+        try:
+            with writing(tmp_path / "out") as draft:
+                (draft / str(number)).touch()
+                together.wait(60)
+        except OutputError as error:
+            return error.message
+        return ""
+
+    with ThreadPoolExecutor(8) as pool:
+        told = list(pool.map(write, range(8)))
+    assert told.count("") == 1
+    assert content(tmp_path / "out") == {str(told.index("")): b""}
+    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_a_killed_writer_leaves_nothing_at_the_output_and_the_next_run_succeeds(tmp_path: Path, writer):
@@ -166,12 +254,85 @@ def test_a_killed_writer_leaves_the_old_content(tmp_path: Path, writer):
     assert content(tmp_path / "out") == before
 
 
-def test_an_old_directory_that_a_killed_writer_set_aside_goes_once_there_is_a_new_one(tmp_path: Path):
-    fill(tmp_path / "out")
-    fill(tmp_path / ".out.old-0badcafe")
+@pytest.mark.parametrize("how", ["exchange", "two renames"])
+def test_what_was_replaced_goes_with_the_next_run_when_the_writer_was_killed(tmp_path: Path, how: str):
+    written(tmp_path / "out")
+    done = subprocess.run([sys.executable, "-c", KILLED_LATE, str(tmp_path / "out"), how, "after"], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert content(tmp_path / "out") == {"new": b""}
+    assert len(os.listdir(tmp_path)) == 2
     with writing(tmp_path / "out", force=True) as draft:
-        (draft / "new").touch()
+        (draft / "newer").touch()
+    assert content(tmp_path / "out") == {"newer": b""}
     assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_writer_killed_between_two_renames_has_lost_nothing(tmp_path: Path):
+    before = content(written(tmp_path / "out"))
+    done = subprocess.run([sys.executable, "-c", KILLED_LATE, str(tmp_path / "out"), "renames", "between"], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(OutputError, match="exists already"), writing(tmp_path / "out"):
+        pass
+    assert content(tmp_path / "out") == before
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_file_that_came_while_it_was_written_is_never_replaced(tmp_path: Path):
+    written(tmp_path / "out")
+    message = "out/notes.txt was not written by vlatool"
+    with pytest.raises(OutputError, match=message), writing(tmp_path / "out", force=True) as draft:
+        assert (draft / "new").write_text("new") < (tmp_path / "out/notes.txt").write_text("mine")
+    assert (tmp_path / "out/notes.txt").read_text() == "mine"
+    assert (tmp_path / "out/graphs/main.onnx").is_file()
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_what_came_at_the_last_moment_is_kept_beside_it(tmp_path: Path, monkeypatch):
+    written(tmp_path / "out")
+
+    def late(one: Path, other: Path) -> bool:
+        (other / "notes.txt").write_text("mine")
+        return exchange(one, other)
+
+    monkeypatch.setattr("vlatool.writing.exchange", late)
+    with (
+        pytest.warns(UserWarning, match="was not written by vlatool"),
+        writing(tmp_path / "out", force=True) as draft,
+    ):
+        (draft / "new").touch()
+    (kept,) = tmp_path.glob("out.kept-*")
+    assert (kept / "notes.txt").read_text() == "mine"
+    assert content(tmp_path / "out") == {"new": b""}
+
+
+def test_without_an_exchange_the_old_one_comes_back_when_the_new_one_cannot(tmp_path: Path, monkeypatch):
+    before = content(written(tmp_path / "out"))
+    moves = []
+
+    def fail_once(source: Path, target: Path) -> None:
+        moves.append(target)
+        if len(moves) == 2:  # the first finds that there is something
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        move_new(source, target)
+
+    monkeypatch.setattr("vlatool.writing.exchange", lambda one, other: False)
+    monkeypatch.setattr("vlatool.writing.move_new", fail_once)
+    with pytest.raises(OutputError, match="disk is full"), writing(tmp_path / "out", force=True) as draft:
+        (draft / "new").touch()
+    assert content(tmp_path / "out") == before
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_damaged_directory_of_the_cache_is_replaced_and_what_is_not_ours_is_kept(tmp_path: Path):
+    out = written(tmp_path / "out")
+    (out / "graphs/main.onnx").write_bytes(b"damaged")
+    (out / "notes.txt").write_text("mine")
+    with pytest.warns(UserWarning, match="was not written by vlatool"), writing(out, damaged=True) as draft:
+        (draft / "new").touch()
+    (kept,) = tmp_path.glob("out.kept-*")
+    assert content(kept) == {"notes.txt": b"mine"}
+    assert content(out) == {"new": b""}
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,11 @@ from typing import Any
 
 from vlatool.errors import BundleError
 from vlatool.manifest import FileRecord, Manifest
+from vlatool.written import LEDGER
 
 MANIFEST = "manifest.json"
 LOCATION = "location.json"
-UNRECORDED = ("reports", "recipe.yaml", MANIFEST, "SIGNATURE", LOCATION)
+UNRECORDED = ("reports", "recipe.yaml", MANIFEST, "SIGNATURE", LOCATION, LEDGER)
 """Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
 
 

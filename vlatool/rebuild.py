@@ -24,6 +24,7 @@ from vlatool.sources._description import read_location
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Transform, build_stage, installed_version, source_of, stage_class
 from vlatool.writing import writing
+from vlatool.written import LEDGER
 
 Entry = dict[str, Any]
 TOLD_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
@@ -180,7 +181,7 @@ def rebuild(
         compared = compare_bundles(bundle, made, left_out)
         if out is not None:
             with writing(out, force=force) as draft:
-                shutil.copytree(made.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION))
+                shutil.copytree(made.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER))
         return Rebuilt(bundle, made.hash, start.source, compared, tuple(same), left_out)
 
 
