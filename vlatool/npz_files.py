@@ -75,6 +75,20 @@ def open_npz(
         raise error(f"{where} cannot be read: {told}.", "write it again with np.savez") from foreign
 
 
+def declared_bytes(path: str | os.PathLike[str]) -> int:
+    """Return what the arrays of an ``.npz`` file would take in memory, as its table of contents says.
+
+    Raises:
+        DataError: when the file cannot be read or is no archive of arrays.
+    """
+    try:
+        with _stream(path) as stream, zipfile.ZipFile(_with_small_directory(stream)) as archive:
+            return sum(entry.file_size for entry in archive.infolist())
+    except FOREIGN as foreign:
+        told = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
+        raise DataError(f"{path} cannot be read: {told}.", "write it again with np.savez") from foreign
+
+
 def _told(error: BaseException) -> str:
     return (str(error).strip().rstrip(".").splitlines() or [type(error).__name__])[0][:200] or type(error).__name__
 
