@@ -338,10 +338,22 @@ def test_a_copy_replaces_a_file_only_when_told(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="exists"):
         copy_profile("raspberry-pi-5", "mine", tmp_path / "mine.yaml")
     assert (tmp_path / "mine.yaml").read_text() == "precious"
-    copy_profile("raspberry-pi-5", "mine", tmp_path / "mine.yaml", force=True)
-    assert load_profile(tmp_path / "mine.yaml").name == "mine"
+    with pytest.raises(OutputError, match="was not written by vlatool, or was changed since"):
+        copy_profile("raspberry-pi-5", "mine", tmp_path / "mine.yaml", force=True)
+    assert (tmp_path / "mine.yaml").read_text() == "precious"
     with pytest.raises(OutputError, match="cannot be written: Is a directory"):
         copy_profile("raspberry-pi-5", "mine", tmp_path, force=True)
+
+
+def test_a_copy_that_nobody_changed_is_replaced_when_told(tmp_path: Path) -> None:
+    copy_profile("raspberry-pi-5", "first", tmp_path / "mine.yaml")
+    copy_profile(str(tmp_path / "mine.yaml"), "mine", tmp_path / "mine.yaml", force=True)
+    assert load_profile(tmp_path / "mine.yaml").name == "mine"
+    assert (tmp_path / "mine.yaml").read_text().count("written by vlatool") == 1
+    with (tmp_path / "mine.yaml").open("a") as stream:
+        stream.write("# measured by me\n")
+    with pytest.raises(OutputError, match="was changed since"):
+        copy_profile("raspberry-pi-5", "mine", tmp_path / "mine.yaml", force=True)
 
 
 def test_profiles_are_frozen() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.errors import require
+from vlatool.npz_files import open_npz
 
 NAMED = 5
 """How many names a sentence lists before it counts the rest."""
@@ -135,8 +136,7 @@ def _first_difference(one: Path, two: Path) -> int:
 
 
 def _explain_npz(one: Path, two: Path) -> str:
-    with np.load(one, allow_pickle=False) as left, np.load(two, allow_pickle=False) as right:
-        a, b = dict(left), dict(right)
+    a, b = open_npz(one, "golden_bytes"), open_npz(two, "golden_bytes")
     said = []
     for name in sorted({*a, *b}):
         if name not in a or name not in b:

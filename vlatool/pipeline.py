@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.benchmark.latency import Latency
-from vlatool.bundle import Bundle, writing
+from vlatool.bundle import Bundle
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate._paired import compare_success
 from vlatool.evaluate.closed_loop import ClosedLoop
@@ -31,6 +31,7 @@ from vlatool.sources._description import FILE, read_description
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Stage, Transform, build_stage
+from vlatool.writing import writing
 
 BASELINE = "float32"
 EXPLAIN_SECONDS = 20.0

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat
 
 from vlatool._profile_problems import problem, wrong_names, wrong_sources
 from vlatool.errors import OutputError, ProfileError, nearest
-from vlatool.files import whole_file
+from vlatool.files import unstamped, write_own
 from vlatool.yaml_files import read_mapping
 
 SEARCH_PATH = "VLATOOL_PROFILES"
@@ -283,18 +283,15 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
 
     Raises:
         ProfileError: when there is no such profile, or the name is not one.
-        OutputError: when the file exists and ``force`` is not given, or cannot be written.
+        OutputError: when the file exists and ``force`` is not given, was changed by hand, or cannot be written.
     """
     load_profile(like)
     path = Path(like) if like.endswith(SUFFIXES) or os.sep in like else _found()[like]
     if not re.fullmatch(NAME, name):
         raise ProfileError(f"'{name}' is no name of a profile; allowed: lower-case letters, digits and hyphens.")
-    if target.exists() and not force:
-        raise OutputError(f"{target} exists.", "choose another file, or pass --force")
-    text = re.sub(r"(?m)^name: .*$", f"name: {name}", path.read_text(encoding="utf-8"), count=1)
+    text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
     try:
-        with whole_file(target) as draft:
-            draft.write_text(text, encoding="utf-8")
+        write_own(target, text, force=force)
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
 

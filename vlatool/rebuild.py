@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from vlatool import __version__, trust
-from vlatool.bundle import LOCATION, MANIFEST, Bundle, hash_file, writing
+from vlatool.bundle import LOCATION, MANIFEST, Bundle, hash_file
 from vlatool.differences import Compared, compare_bundles
 from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.finish import DECIDED, HANDED_OUT, history, reseal
@@ -22,6 +22,8 @@ from vlatool.sources._description import read_description, read_location
 from vlatool.sources._factory import factory_file
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Transform, build_stage, installed_version, source_of, stage_class
+from vlatool.writing import writing
+from vlatool.written import LEDGER
 
 Entry = dict[str, Any]
 TOLD_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
@@ -178,7 +180,7 @@ def rebuild(
         compared = compare_bundles(bundle, made, left_out)
         if out is not None:
             with writing(out, force=force) as draft:
-                shutil.copytree(made.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION))
+                shutil.copytree(made.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER))
         return Rebuilt(bundle, made.hash, start.source, compared, tuple(same), left_out)
 
 

@@ -19,7 +19,7 @@ from vlatool.hwselect._latency import LatencyModel, shipped
 from vlatool.hwselect._measured import measured_questions
 from vlatool.hwselect._select import Choice, Wants, choose, in_the_cloud
 from vlatool.hwselect._simulate import Change, bounds, changes, parts_of, timeline
-from vlatool.hwselect._stored import digest, read_workload, write_workload
+from vlatool.hwselect._stored import digest, read_workload, refuse_other, write_workload
 from vlatool.hwselect._torch_workload import counted_apart
 from vlatool.hwselect._workload import Workload, workload
 from vlatool.launch import cached_transform
@@ -30,6 +30,7 @@ from vlatool.report import Report
 from vlatool.sources._description import read_location
 from vlatool.sources._origin import origin_of
 from vlatool.stage import Context
+from vlatool.written import note_file
 
 CARRIED = "workload.json"
 """File beside ``policy.yaml`` that holds the count of a policy."""
@@ -133,7 +134,7 @@ def carry_count(source: str, context: Context) -> Path:
     Raises:
         UsageError: when the source is a bundle or an ONNX file, which are counted without torch, or its factory lies in
             a package, whose changes nobody would notice.
-        OutputError: when the file cannot be written.
+        OutputError: when the file cannot be written, or is none that was counted.
     """
     bundle = opened(source, context)
     if not _may_carry(bundle):
@@ -145,9 +146,11 @@ def carry_count(source: str, context: Context) -> Path:
             "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
         )
     file = origin_of(bundle).folder / CARRIED
+    refuse_other(file)
     found = counted(bundle, context)
     try:
         write_workload(file, found, digest(bundle))
+        note_file(file)
     except OSError as error:
         raise OutputError(f"{file} cannot be written: {error.strerror}.", "make the folder writable") from error
     return file

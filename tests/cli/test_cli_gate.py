@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -53,7 +54,7 @@ def test_json_junit_and_a_directory_of_reports(vlatool, float_bundle, slowdown, 
     assert (found["kind"], found["verdict"]) == ("gate", "fail")
     assert found["command"].startswith("vlatool")
     assert ElementTree.parse(tmp_path / "deep/gate.xml").getroot().get("failures") == "1"
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.html", "report.md"}
+    assert {path.name for path in (tmp_path / "out").glob("[!.]*")} == {"report.json", "report.html", "report.md"}
 
 
 def test_junit_may_lie_in_the_directory_of_reports(vlatool, float_bundle, slowdown, config, tmp_path) -> None:
@@ -117,6 +118,26 @@ def test_init_writes_what_the_gate_then_reads(vlatool, float_bundle, slowdown, t
     assert vlatool("gate", "init", tmp_path, "--force")[0] == 0
 
 
+def test_init_with_force_replaces_only_what_nobody_changed(vlatool, tmp_path) -> None:
+    assert vlatool("gate", "init", tmp_path)[0] == 0
+    (tmp_path / "gate.yaml").write_text((tmp_path / "gate.yaml").read_text().replace("0.05", "0.02"))
+    before = (tmp_path / "gate.yaml").read_text()
+    code, _, err = vlatool("gate", "init", tmp_path, "--force")
+    assert (code, (tmp_path / "gate.yaml").read_text()) == (3, before)
+    assert "gate.yaml was not written by vlatool, or was changed since" in err
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "link.xml", "bundle/gate.xml"])
+def test_junit_is_written_over_nothing_that_is_not_vlatools(vlatool, float_bundle, tmp_path, name) -> None:
+    shutil.copytree(float_bundle.path, tmp_path / "bundle")
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "link.xml").symlink_to("notes.txt")
+    line = ["gate", tmp_path / "bundle", "--baseline", float_bundle.path, "--junit", tmp_path / name, "--force"]
+    code, _, err = vlatool(*line)
+    assert (code, (tmp_path / "notes.txt").read_text()) == (3, "mine"), err
+    assert not (tmp_path / "bundle/gate.xml").exists()
+
+
 def test_init_writes_nothing_where_it_cannot_write_all(vlatool, tmp_path) -> None:
     (tmp_path / ".github").write_text("in the way")
     code, out, err = vlatool("gate", "init", tmp_path)
@@ -137,7 +158,7 @@ def test_init_writes_nothing_where_it_cannot_write_all(vlatool, tmp_path) -> Non
         (["{bundle}", "--baseline", "{bundle}", "--config", "{tmp}/none.yaml"], 3, "There is no gate"),
         (["{bundle}", "--baseline", "{bundle}", "--margin=-1"], 2, "--margin"),
         (["{bundle}", "--baseline", "{bundle}", "--seed=-1"], 2, "--seed"),
-        (["{bundle}", "--baseline", "{bundle}", "-o", "{tmp}"], 3, "exists already"),
+        (["{bundle}", "--baseline", "{bundle}", "-o", "{tmp}"], 3, "is the current directory"),
         (["{bundle}", "--baseline", "{tmp}"], 3, "manifest"),
         (["{bundle}", "--baselin", "{bundle}"], 2, "--baseline"),
     ],

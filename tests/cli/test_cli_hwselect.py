@@ -99,7 +99,7 @@ def test_hwselect_writes_three_reports(vlatool, float_bundle, tmp_path):
     out = tmp_path / "report"
     code, told, _ = vlatool("hwselect", float_bundle.path, *SMALL, "-o", out)
     assert code == 0
-    assert {path.name for path in out.iterdir()} == {"report.json", "report.html", "report.md"}
+    assert {path.name for path in out.glob("[!.]*")} == {"report.json", "report.html", "report.md"}
     assert told.endswith(f"report: {out / 'report.html'}\n")
     assert read_report(out).kind == "hwselect"
     assert "raspberry-pi-5" in (out / "report.html").read_text()

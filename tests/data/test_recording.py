@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vlatool.bundle import Bundle, seal
-from vlatool.data import observations_for, read_recording, recorded_observations, synthetic_observations
+from vlatool.data import npz, observations_for, read_recording, recorded_observations, synthetic_observations
 from vlatool.errors import DataError
 from vlatool.manifest import Manifest
 from vlatool.spec import PolicySpec, TensorSpec
@@ -253,3 +253,36 @@ def test_a_named_recording_comes_before_the_bundles_own(tmp_path: Path, float_bu
     own = recorded_observations(float_bundle, 2)
     other = recorded_observations(float_bundle, 2, float_bundle.path / "data/evaluation.npz")
     assert not np.array_equal(own[0]["image"], other[0]["image"])
+
+
+@pytest.mark.parametrize("packed", ["recording.npz", "calibration.npz"])
+def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, packed: str):
+    path = tmp_path / packed
+    header = b"{'descr': '|u1', 'fortran_order': False, 'shape': (9000000000,), }"
+    header = header.ljust(128 - 10 - 1) + b"\n"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("state.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    content = bytearray(path.read_bytes())
+    at = content.rfind(b"PK\1\2") + 24
+    content[at : at + 4] = (0xFFFFFFF0).to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"MB are free|cannot be read|recording_bytes"):
+        read_recording(path, SPEC)
+
+
+def test_a_recording_larger_than_the_limit_says_how_to_raise_it(tmp_path: Path, monkeypatch):
+    path = tmp_path / "recording.npz"
+    np.savez_compressed(path, **arrays(), more=np.zeros(1 << 20))
+    monkeypatch.setenv("VLATOOL_LIMITS", "recording_bytes=1e6")
+    with pytest.raises(DataError, match="the limit 'recording_bytes' allows 1000000") as caught:
+        read_recording(path, SPEC)
+    monkeypatch.setenv("VLATOOL_LIMITS", caught.value.fix.partition("VLATOOL_LIMITS=")[2])
+    read_recording(path, SPEC)
+
+
+def test_a_recording_larger_than_the_memory_is_refused(tmp_path: Path, monkeypatch):
+    path = tmp_path / "recording.npz"
+    np.savez_compressed(path, **arrays(), more=np.zeros(1 << 20))
+    monkeypatch.setattr(npz, "memory", lambda: {"memory_available_mb": 4000.0, "memory_limit_mb": 5.0})
+    with pytest.raises(DataError, match="takes 8 MB of memory, unpacked; 5 MB are free"):
+        read_recording(path, SPEC)

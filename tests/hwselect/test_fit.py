@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.errors import DataError
+from vlatool.errors import DataError, OutputError
 from vlatool.hwselect import _fit, _latency
 from vlatool.hwselect._features import Question, Shares, rows_of
 from vlatool.hwselect._fit import ALL_COUNT, Scores, assess, conformal, fit_files, fitted, loss, thinned, tune
@@ -259,3 +259,12 @@ def test_few_draws_widen_the_interval() -> None:
     assert many.reach(0) == 8
     plain = Scores(np.arange(1.0, 101.0), np.arange(100), np.zeros(100, int), np.arange(100))
     assert plain.reach(0) == 81
+
+
+@pytest.mark.parametrize("text", ["mine", "[]", '{"about": 1}', None])
+def test_a_fit_replaces_no_file_that_is_no_model(tmp_path: Path, text: str | None) -> None:
+    name = "latency.npz" if text is None else "latency.json"
+    (tmp_path / name).write_text(text or "mine")
+    with pytest.raises(OutputError, match=f"{name} is no model"):
+        fit_files(tmp_path / "points.csv", tmp_path, 0, 0)
+    assert (tmp_path / name).read_text() == (text or "mine")

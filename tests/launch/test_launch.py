@@ -12,6 +12,7 @@ from vlatool.launch import cache_directory, cached_measure, cached_path, cached_
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage import Context
+from vlatool.writing import writing
 
 
 def stamps(folder: Path) -> dict[str, tuple[int, int]]:
@@ -36,8 +37,8 @@ def test_a_stage_runs_into_place_and_nothing_is_left_beside_it(float_bundle, tmp
 
 
 def test_an_output_that_exists_is_kept_without_force_and_replaced_with_it(float_bundle, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "old").touch()
+    with writing(tmp_path / "out") as draft:
+        (draft / "old").touch()
     with pytest.raises(OutputError, match="exists already"):
         run_transform(DynamicInt8(), float_bundle, tmp_path / "out", Context())
     assert (tmp_path / "out" / "old").exists()

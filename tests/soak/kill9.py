@@ -31,6 +31,7 @@ from pathlib import Path
 
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError
+from vlatool.written import LEDGER
 
 COMMANDS = ("export", "quantize", "optimize")
 RECIPE = """\
@@ -138,9 +139,10 @@ def differences(reference: Path, other: Path) -> list[str]:
 
 
 def contents(bundle: Path) -> dict[str, bytes]:
-    """Relative path -> bytes of every file but the reports."""
+    """Relative path -> bytes of every file but the reports and the list that holds their hashes."""
     files = {path.relative_to(bundle).as_posix(): path for path in bundle.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in files.items() if not name.startswith("reports/")}
+    kept = {name: path for name, path in files.items() if not name.startswith("reports/") and name != LEDGER}
+    return {name: path.read_bytes() for name, path in kept.items()}
 
 
 def make_policy(folder: Path) -> Path:

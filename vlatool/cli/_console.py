@@ -16,10 +16,12 @@ from typing import Any
 
 import typer
 
-from vlatool.bundle import OURS, writing
 from vlatool.errors import GateFailed, Inconclusive, OutputError
+from vlatool.host import cache_directory
+from vlatool.outputs import refuse_inputs, refuse_replacing
 from vlatool.report import Report
 from vlatool.stage import Context, Tell
+from vlatool.writing import writing
 
 
 def command_line() -> str:
@@ -91,21 +93,28 @@ def plain_warnings() -> Iterator[None]:
         warnings.showwarning = elsewhere
 
 
-def refuse_existing(out: Path | None, force: bool) -> None:
-    """Say before the work, not after it, that the output exists.
+def refuse_existing(out: Path | None, force: bool, *inputs: str | os.PathLike[str] | None) -> None:
+    """Say before the work, not after it, that the output cannot be written.
+
+    Args:
+        out: The output, None when there is none.
+        force: Whether what vlatool wrote there may be replaced.
+        inputs: What the command reads.
 
     Raises:
-        OutputError: when it does and --force was not given, or when it is a directory that vlatool did not write.
+        OutputError: when it is, holds or lies in an input, exists (and not ``force``), or is not vlatool's to replace.
     """
     if out is None:
         return
-    if not os.path.exists(out):
+    refuse_inputs(out, inputs)
+    refuse_replacing(out, force=force, further={"the cache": cache_directory()})
+    if not os.path.lexists(out):
         _refuse_unwritable(out)
-        return
-    if not force:
-        raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
-    if out.is_dir() and any(out.iterdir()) and not any((out / name).exists() for name in OURS):
-        raise OutputError(f"{out} was not written by vlatool, so --force does not replace it.", "remove it yourself")
+
+
+def file_or_none(named: str | None) -> str | None:
+    """Return what names a file rather than a thing by its name, such as a profile."""
+    return named if named and os.path.isfile(named) else None
 
 
 def _refuse_unwritable(out: Path) -> None:

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.cli._console import default_workers, progress, refuse_existing, show
+from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.launch import cache_directory, run_transform
 from vlatool.report import Report
-from vlatool.stage import Context, Measure, Transform
+from vlatool.stage import Context, Measure, Stage, Transform
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
@@ -67,7 +67,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     from vlatool.pipeline import exported, source_stage, sourced
 
     bundle: Bundle | None
-    refuse_existing(out, force)
+    refuse_existing(out, force, source, *named_files(stage))
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)
@@ -102,6 +102,13 @@ def _refuse(made: Bundle) -> None:
     for finding in made.manifest.findings:
         fix = f"vlatool explain {made.path}; load, optimize and gate refuse the bundle (to overrule: {finding['name']})"
         raise GateFailed(f"{made.path} was written, but it is wrong: {finding['message']}", fix)
+
+
+def named_files(stage: Stage) -> tuple[Path, ...]:
+    """Return the files and directories that the options of a stage name."""
+    values = [getattr(stage, name) for name in type(stage).model_fields]
+    each = [one for value in values for one in (value if isinstance(value, tuple) else (value,))]
+    return tuple(one for one in each if isinstance(one, Path))
 
 
 def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
@@ -151,7 +158,7 @@ def measure(
     """Measure a bundle, or a policy that is exported first; here, or on a target."""
     if remote_python is not None and target is None:
         raise UsageError("--remote-python is the Python of a target.", "name it: --target user@host")
-    refuse_existing(out, force)
+    refuse_existing(out, force, source, file_or_none(profile), *named_files(stage))
     board = None
     if profile:
         from vlatool.profile import load_profile

@@ -33,7 +33,7 @@ def compare(
 
     if len(paths) < 2:
         raise UsageError("compare needs two or more bundles, or two or more reports.")
-    refuse_existing(output, force)
+    refuse_existing(output, force, *paths)
     for path in paths:
         if not path.exists():
             raise DataError(f"There is no report at {path}, and no bundle.")

@@ -33,7 +33,7 @@ def explain(
     from vlatool.explain import Options
     from vlatool.explain import explain as found_out
 
-    refuse_existing(output, force)
+    refuse_existing(output, force, bundle, baseline, data)
     with progress() as context:
         options = Options(baseline, data, samples, threads=threads, suggest=suggest, seconds=seconds)
         report = found_out(Bundle.open(bundle), options, context)

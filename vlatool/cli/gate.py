@@ -16,7 +16,8 @@ from vlatool.cli._console import command_line, default_workers, emit, progress, 
 from vlatool.cli._default import group_with
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
-from vlatool.files import whole_file
+from vlatool.files import refuse_file, write_own
+from vlatool.outputs import refuse_inputs
 
 if TYPE_CHECKING:
     from vlatool.gate import Gate
@@ -58,9 +59,9 @@ def run(
         raise UsageError("There is no baseline.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)")
     if not base.exists():
         raise BundleError(f"There is no baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
-    refuse_existing(output, force)
+    refuse_existing(output, force, candidate, *_read_by(gate, base), config)
     if junit is not None:
-        _place(junit)
+        _place(junit, candidate, *_read_by(gate, base), config)
     with progress(workers or default_workers()) as context:
         bundle = opened(candidate, context)
         report = run_gate(bundle, Bundle.open(base), gate, context, seed)
@@ -87,17 +88,21 @@ def init(
     from vlatool.gate_files import gate_files
 
     files = {directory / name: text for name, text in gate_files(baseline.as_posix(), candidate.as_posix()).items()}
-    present = [path for path in files if path.exists()]
-    if present and not force:
-        raise OutputError(f"{present[0]} exists already.", "pass --force to replace it")
+    for path in files:
+        refuse_file(path, force=force)
     for path in files:
         path.parent.mkdir(parents=True, exist_ok=True)
     for path, text in files.items():
-        with whole_file(path) as draft:
-            draft.write_text(text, encoding="utf-8")
+        write_own(path, text, force=force)
         emit(f"written: {path}\n")
     emit("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
     emit(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")
+
+
+def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
+    """Return what a gate reads beside the candidate."""
+    accuracy = gate.accuracy
+    return (base, *((accuracy.data, accuracy.policy) if accuracy else ()))
 
 
 def _gate(config: Path | None, margin: float | None) -> Gate:
@@ -109,8 +114,8 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
     return gate.model_copy(update={"latency": (gate.latency or LatencyClaim()).model_copy(update={"margin": margin})})
 
 
-def _place(junit: Path) -> None:
-    """Say before the work that the file cannot be written.
+def _place(junit: Path, *inputs: str | Path | None) -> None:
+    """Say before the work that the file cannot be written, is or lies in an input, or is not vlatool's to replace.
 
     Raises:
         OutputError: when it cannot.
@@ -120,14 +125,15 @@ def _place(junit: Path) -> None:
     above = next(folder for folder in junit.absolute().parents if folder.exists())
     if not (above.is_dir() and os.access(above, os.W_OK)):
         raise OutputError(f"--junit {junit} cannot be written: {above} is no directory that may be written to.")
+    refuse_inputs(junit, inputs)
+    if os.path.lexists(junit):
+        refuse_file(junit, force=True)
 
 
 def _write_junit(report: Report, path: Path) -> None:
     from vlatool.render import render
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as draft:
-        draft.write_text(render(report, "junit"), encoding="utf-8")
+    write_own(path, render(report, "junit"), force=True, comment="<!-- {} -->")
 
 
 def _tell_github(report: Report) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.errors import UsageError
 
@@ -79,7 +79,7 @@ def select(
         raise UsageError(f"--network-ms is {network_ms:g}; allowed: 0 or more.")
     if hours > 24:
         raise UsageError(f"--hours is {hours:g}; a day has 24.")
-    refuse_existing(output, force)
+    refuse_existing(output, force, source, calibration, *map(file_or_none, boards or ()))
     with progress() as context:
         asked = Asked(
             hz=hz, latency_ms=latency_ms, watts=max_watts, price=max_price, memory_gb=memory, battery_wh=battery_wh,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vlatool.cli._console import default_workers, emit, leave, progress, refuse_existing, terminal_text
+from vlatool.cli._console import default_workers, emit, file_or_none, leave, progress, refuse_existing, terminal_text
 from vlatool.errors import UsageError
 
 
@@ -51,6 +51,8 @@ def optimize(
     from vlatool.profile import load_profile
     from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
 
+    if not dry_run:
+        refuse_existing(output, force, source, recipe, file_or_none(profile), cache)
     board = load_profile(profile) if profile else None
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
@@ -75,7 +77,6 @@ def optimize(
         for line in plan.lines():
             typer.echo(line)
         return
-    refuse_existing(output, force)
     with progress(workers or default_workers()) as context:
         report = pipeline.optimize(plan, output, context, force=force)
     emit(report.to_json() if as_json else terminal_text(report, brief=True))

@@ -42,7 +42,7 @@ def rebuild(
 
     if not check and output is None:
         raise UsageError("rebuild has nothing to do.", "pass --check to compare, -o OUT to keep the bundle, or both")
-    refuse_existing(output, force)
+    refuse_existing(output, force, bundle, source, *(file or ()))
     opened = Bundle.open(bundle)
     versions = version_changes(build_record(opened))
     if versions and not as_json:

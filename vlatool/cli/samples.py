@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from vlatool import registry
-from vlatool.bundle import writing
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.errors import MissingExtra, UsageError, VlatoolError, nearest
+from vlatool.writing import writing
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import DataError
+from vlatool.host import memory
+from vlatool.limits import check
+from vlatool.npz_files import declared_bytes, open_npz
+
+LIMIT = "recording_bytes"
 
 
 class NpzReader:
@@ -21,22 +23,22 @@ class NpzReader:
         """Return the arrays of a file by name.
 
         Raises:
-            DataError: when the file is corrupt, is a single array, or holds Python objects.
+            DataError: when the file is corrupt, is a single array, holds Python objects, or would not fit into the
+                limit or the memory; before anything is unpacked.
         """
-        try:
-            with path.open("rb") as stream:
-                stored = np.load(stream, allow_pickle=False)
-                if not hasattr(stored, "files"):
-                    raise DataError(f"{path} is one array, not an archive of named arrays.", "write it with np.savez")
-                return {name: stored[name] for name in stored.files}
-        except (
-            OSError,
-            ValueError,
-            EOFError,
-            NotImplementedError,
-            zlib.error,
-            zipfile.BadZipFile,
-            zipfile.LargeZipFile,
-        ) as error:
-            reason = "it holds pickled objects, which are refused" if "pickle" in str(error) else str(error)
-            raise DataError(f"{path} cannot be read: {reason}.", "write it again with np.savez") from error
+        needed = declared_bytes(path)
+        check(LIMIT, needed, f"{path}, unpacked,", DataError)
+        free = _free_mb()
+        if free is not None and needed > free * 1e6:
+            raise DataError(
+                f"{path} takes {needed / 1e6:,.0f} MB of memory, unpacked; {free:,.0f} MB are free.",
+                "record fewer samples, or use a machine with more memory",
+            )
+        return open_npz(path, LIMIT)
+
+
+def _free_mb() -> float | None:
+    """Return how much memory a process may still take in MB; None where it is not known."""
+    found = memory()
+    told = [found[name] for name in ("memory_available_mb", "memory_limit_mb")]
+    return min((each for each in told if each is not None), default=None)

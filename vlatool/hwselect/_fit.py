@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import os
 import time
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError
+from vlatool.errors import DataError, OutputError
 from vlatool.hwselect._features import Shares, rows_of
 from vlatool.hwselect._folds import UNITS, Folds, Sample
 from vlatool.hwselect._latency import DATA, LEVEL, Known, LatencyModel, read_model, write
@@ -257,6 +260,24 @@ def fit(
     return LatencyModel(parts, shares, bounds, about)
 
 
+def _refuse_other(out: Path) -> None:
+    """Refuse files called as the model's that are no model.
+
+    Raises:
+        OutputError: when there are.
+    """
+    present = [out / name for name in ("latency.npz", "latency.json") if os.path.lexists(out / name)]
+    if not present:
+        return
+    try:
+        ours = set(json.loads((out / "latency.json").read_text(encoding="utf-8"))) == {"about", "parts"}
+        ours = ours and zipfile.is_zipfile(out / "latency.npz") and not any(path.is_symlink() for path in present)
+    except (OSError, ValueError, TypeError, RecursionError):
+        ours = False
+    if not ours:
+        raise OutputError(f"{present[0]} is no model that vlatool wrote.", "name another directory, or move it away")
+
+
 def fit_files(
     path: Path, out: Path, seconds: float, seed: int, anew: bool = False, tell: Callable[[str], None] = lambda _: None
 ) -> None:
@@ -269,7 +290,10 @@ def fit_files(
 
     Raises:
         DataError: when the file is malformed, or has no row to fit on.
+        OutputError: when other files have the names of the model's.
     """
+    _refuse_other(out)
+    _refuse_other(out)
     points = read_points(path)
     shipped = not anew and (DATA / "latency.json").is_file()
     before = read_model(DATA) if shipped else None  # and not the user's own: the search begins at what was shipped

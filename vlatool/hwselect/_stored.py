@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 from vlatool import __version__
 from vlatool.bundle import Bundle
+from vlatool.errors import OutputError
 from vlatool.files import whole_file
 from vlatool.hwselect._workload import GraphWorkload, Workload
 
@@ -63,6 +65,22 @@ def from_values(data: Any) -> Workload | None:
         return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
+
+
+def refuse_other(file: Path) -> None:
+    """Refuse a file that ``write_workload`` did not write.
+
+    Raises:
+        OutputError: when there is one.
+    """
+    if not os.path.lexists(file):
+        return
+    try:
+        data = {} if file.is_symlink() else json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        data = {}
+    if not isinstance(data, dict) or set(data) != {"layout", "digest", "graphs", "runs"}:
+        raise OutputError(f"{file} is none that vlatool wrote.", "move it away yourself")
 
 
 def write_workload(file: Path, found: Workload, of: str = "") -> None:

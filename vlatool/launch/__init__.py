@@ -2,33 +2,42 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
-from vlatool.bundle import Bundle, writing
-from vlatool.errors import BundleError, DataError, OutputError
+from vlatool.bundle import Bundle
+from vlatool.errors import BundleError, DataError
 from vlatool.host import cache_directory as cache_directory
 from vlatool.launch._inside import run_apart
+from vlatool.outputs import refuse_replacing
 from vlatool.report import REPORT, Report, read_report
 from vlatool.stage import Context, Measure, Stage, Transform
+from vlatool.writing import writing
 
 
 def run_transform(
-    stage: Transform, source: Bundle | None, out: Path, context: Context, *, force: bool = False
+    stage: Transform, source: Bundle | None, out: Path, context: Context, *, force: bool = False, damaged: bool = False
 ) -> Bundle:
     """Run a stage that makes a bundle; ``out`` appears whole or not at all.
 
     A stage that runs a user's code does so in a child process.
 
+    Args:
+        stage: What runs.
+        source: Its input; None for a stage that starts a chain.
+        out: The new bundle.
+        context: Whom to tell.
+        force: Replace a directory that vlatool wrote.
+        damaged: See ``vlatool.writing.writing``.
+
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
     """
-    if not force and os.path.exists(out):
-        raise OutputError(f"{out} exists already.", "choose another output, or pass --force to replace it")
+    if not damaged:
+        refuse_replacing(out, force=force)
     stage.check(source, None)
-    with writing(out, force=force) as draft:
+    with writing(out, force=force, damaged=damaged) as draft:
         if stage.runs(source):
             run_apart(stage, source, draft, context)
         else:
@@ -54,7 +63,7 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
             return Bundle.open(path)
         except BundleError:
             context.tell(f"the cached {stage.name()} is damaged; making it again", None)
-    return run_transform(stage, source, path, context, force=True)
+    return run_transform(stage, source, path, context, damaged=True)
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
@@ -66,6 +75,6 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
         except DataError:
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
     report = replace(stage.run(source, context), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
-    with writing(path, force=True) as draft:
+    with writing(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
     return report

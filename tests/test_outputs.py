@@ -1,0 +1,81 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from vlatool.errors import OutputError
+from vlatool.outputs import refuse_inputs, refuse_replacing
+from vlatool.writing import writing
+
+
+@pytest.fixture
+def work(tmp_path: Path, monkeypatch) -> Path:
+    """A current directory that vlatool wrote, so that nothing else protects it."""
+    place = tmp_path / "home/work"
+    for folder in (place, place / "sub"):
+        with writing(folder) as draft:
+            (draft / "report.json").touch()
+    monkeypatch.chdir(place / "sub")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return place
+
+
+@pytest.mark.parametrize("out", [".", "..", "../..", "/", "../sub", "../../../home"])
+@pytest.mark.parametrize("force", [True, False])
+def test_what_holds_the_current_or_the_home_directory_is_never_replaced(work: Path, out: str, force: bool):
+    with pytest.raises(OutputError, match=r"is the (current|home) directory, or holds it"):
+        refuse_replacing(Path(out), force=force)
+
+
+def test_what_holds_the_cache_is_never_replaced(work: Path, tmp_path: Path):
+    with writing(tmp_path / "out") as draft:
+        (draft / "report.json").touch()
+    with pytest.raises(OutputError, match="is the cache, or holds it"):
+        refuse_replacing(tmp_path / "out", force=True, further={"the cache": tmp_path / "out/cache"})
+
+
+@pytest.mark.parametrize("target", ["out", "nowhere"])
+def test_nothing_is_replaced_through_a_link(tmp_path: Path, target: str):
+    with writing(tmp_path / "out") as draft:
+        (draft / "report.json").touch()
+    (tmp_path / "link").symlink_to(target)
+    with pytest.raises(OutputError, match="is a link"):
+        refuse_replacing(tmp_path / "link", force=True)
+
+
+def test_a_file_system_of_its_own_is_never_replaced(tmp_path: Path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr(os.path, "ismount", lambda _path: True)
+    with pytest.raises(OutputError, match="file system of its own"):
+        refuse_replacing(tmp_path / "out", force=True)
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("policy", "is an input"), (".", "holds policy"), ("policy/sub", "lies in policy"), ("link", "is an input"),
+        ("link/deep/sub", "lies in policy"), ("policy/policy.py", "lies in policy"),
+    ],
+)  # fmt: skip
+def test_an_input_is_never_the_output(tmp_path: Path, monkeypatch, out: str, message: str):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy/policy.py").touch()
+    (tmp_path / "link").symlink_to("policy")
+    with pytest.raises(OutputError, match=message):
+        refuse_inputs(Path(out), [None, "policy"])
+
+
+@pytest.mark.parametrize("given", ["policy/policy.py", "policy/policy.py:make", "./policy/../policy/policy.py:make"])
+def test_a_directory_that_holds_an_input_file_is_never_the_output(tmp_path: Path, monkeypatch, given: str):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "policy").mkdir()
+    (tmp_path / "policy/policy.py").touch()
+    with pytest.raises(OutputError, match="an input of this command"):
+        refuse_inputs(Path("policy"), [given])
+    refuse_inputs(Path("policy/out"), [given])
+
+
+def test_a_name_that_is_no_file_is_no_input(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refuse_inputs(Path("raspberry-pi-5"), ["raspberry-pi-5", "", None])
