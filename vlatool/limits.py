@@ -1,0 +1,108 @@
+"""How large what comes from outside may be: every limit by name, and how a person raises one.
+
+``VLATOOL_LIMITS=golden_bytes=1e9,files=50000`` in the environment raises (or lowers) limits for one process.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+
+from vlatool.errors import UsageError, VlatoolError, nearest
+
+VARIABLE = "VLATOOL_LIMITS"
+KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One limit.
+
+    Args:
+        default: The largest value that is allowed.
+        unit: What is counted: ``bytes``, ``files``, ``levels``, ...
+        what: What the limit is for, as a part of a sentence.
+    """
+
+    default: int
+    unit: str
+    what: str
+
+
+LIMITS = {
+    "manifest_bytes": Limit(4 * MIB, "bytes", "manifest.json"),
+    "files": Limit(10_000, "files", "files of a bundle"),
+    "json_depth": Limit(64, "levels", "lists and mappings inside each other in a JSON file"),
+    "graph_bytes": Limit(2 * GIB, "bytes", "one graph, without the weights that lie beside it"),
+    "graph_depth": Limit(64, "levels", "subgraphs and attributes inside each other in a graph"),
+    "golden_bytes": Limit(256 * MIB, "bytes", "the golden file, unpacked"),
+    "recording_bytes": Limit(8 * GIB, "bytes", "a recording of observations, unpacked"),
+    "arrays": Limit(4096, "arrays", "arrays in one .npz file"),
+    "statistics_bytes": Limit(16 * MIB, "bytes", "a file of normalisation statistics"),
+    "tokenizer_bytes": Limit(64 * MIB, "bytes", "a tokenizer or vocabulary"),
+    "elements": Limit(1 << 28, "elements", "one value of a program or one input or output of a spec"),
+    "repeat": Limit(10_000, "runs", "runs of one step of a program"),
+    "runs": Limit(100_000, "runs", "runs of graphs in one inference"),
+    "tensors": Limit(1024, "tensors", "inputs and outputs of a spec"),
+    "steps": Limit(1024, "steps", "steps of a program"),
+}
+"""Name -> limit."""
+
+
+def limit(name: str) -> int:
+    """Return a limit: the default, or what ``VLATOOL_LIMITS`` says.
+
+    Raises:
+        UsageError: when the variable is malformed or names an unknown limit.
+
+    Example:
+        >>> limit("files")
+        10000
+    """
+    told = os.environ.get(VARIABLE)
+    return _told(told).get(name, LIMITS[name].default) if told else LIMITS[name].default
+
+
+def check(name: str, got: int, where: str, error: type[VlatoolError]) -> None:
+    """Refuse more than a limit allows.
+
+    Args:
+        name: Of the limit.
+        got: What was found, in the unit of the limit.
+        where: What is too large, as the start of a sentence.
+        error: Type of the error that is raised.
+    """
+    allowed = limit(name)
+    if got > allowed:
+        raise error(
+            f"{where} has {_number(got)} {LIMITS[name].unit}; the limit '{name}' allows {allowed}.",
+            f"if it is right, raise the limit: {VARIABLE}={name}={_number(got)}",
+        )
+
+
+def _number(value: int) -> str:
+    """Numbers of thousands of digits are neither readable nor, for Python, printable."""
+    return str(value) if value.bit_length() <= 64 else f"more than 2^{value.bit_length() - 1}"
+
+
+def _told(text: str) -> dict[str, int]:
+    found = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = part.partition("=")
+        if name not in LIMITS:
+            raise UsageError(f"{VARIABLE} names the unknown limit '{name}'; {nearest(name, LIMITS)}.")
+        found[name] = _whole(name, value)
+    return found
+
+
+def _whole(name: str, value: str) -> int:
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < 2**63:
+        raise UsageError(
+            f"{VARIABLE} sets {name} to '{value[:40]}'; it must be a number of {LIMITS[name].unit} from 0."
+        )
+    return int(value) if value.isdigit() else int(number)
