@@ -102,6 +102,8 @@ def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]
 def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> None:
     """Run the first observations and store ``in.NAME``, ``noise.NAME`` and ``out.NAME``, each with a sample axis.
 
+    They follow each other without a reset between, so that what a program keeps shows in the second.
+
     Args:
         draft: The bundle as written so far; its graphs are what runs.
         observations: Raw observations without the batch axis.
@@ -110,9 +112,8 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     policy = Policy.open(draft, threads=1, seed=SEED)
     random = np.random.default_rng(SEED)
     arrays: dict[str, list[Any]] = {}
-    for observation in observations[:GOLDEN_COUNT]:
+    for observation in (observations * GOLDEN_COUNT)[:GOLDEN_COUNT]:
         noise = {name: draw(wanted, random) for step in draft.manifest.program for name, wanted in step.noise.items()}
-        policy.reset()
         outputs = policy.infer(observation, noise=noise).outputs
         for prefix, values in (("in", observation), ("noise", noise), ("out", outputs)):
             for name, value in values.items():

@@ -45,6 +45,9 @@ def load(
     """
     from vlatool.bundle import Bundle
 
-    policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=seed)
+    bundle = Bundle.described(path)
+    bundle.check_tree()
+    policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed)
+    bundle.verify()
     policy.warm_up(warmup, golden_tolerance)
     return policy
