@@ -1,14 +1,15 @@
-import errno
 import json
 import os
 import shutil
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from vlatool.bundle import LOCATION, Bundle, _digest, hash_file, manifest_bytes, seal
+from vlatool.bundle import DIGEST, LOCATION, Bundle, _digest, digest_of, hash_file, manifest_bytes, seal
 from vlatool.errors import BundleError
-from vlatool.manifest import Manifest
+from vlatool.manifest import Graph, Manifest, single_graph
 from vlatool.spec import PolicySpec, TensorSpec
 
 MANIFEST = Manifest("tiny", "1.0.0", PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0))
@@ -20,6 +21,12 @@ def fill(directory: Path) -> Path:
     (directory / "assets").mkdir()
     (directory / "assets/words.json").write_text("{}")
     return directory
+
+
+def rewrite(bundle: Bundle, text: bytes) -> None:
+    """Write another manifest and its digest."""
+    (bundle.path / "manifest.json").write_bytes(text)
+    (bundle.path / DIGEST).write_bytes(digest_of(text))
 
 
 @pytest.fixture
@@ -140,25 +147,186 @@ def test_a_file_is_no_bundle(tmp_path: Path):
         Bundle.open(tmp_path / "model.onnx")
 
 
-@pytest.mark.parametrize("text", [b"", b'{"schema": 1,', b"\xff\xfe"])
-def test_a_manifest_that_is_no_json(bundle, text):
-    (bundle.path / "manifest.json").write_bytes(text)
-    with pytest.raises(BundleError, match="not valid JSON"):
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (b"", "Expecting value"),
+        (b'{"schema": 1,', "Expecting property name"),
+        (b"\xff\xfe", "utf-8"),
+        (b'{"schema": 1, "schema": 1}', "'schema' occurs twice"),
+        (b'{"schema": NaN}', "NaN is no number"),
+        (b'{"schema": 1e999}', "1e999 is too large"),
+        (b'{"schema": %s}' % (b"1" * 5000), "a number of 5000 digits"),
+        (b'{"name": "\\ud800"}', "half of a character"),
+        (b"[" * 100000, "too deep"),
+        (b"[" * 70 + b"]" * 70, "the limit 'json_depth'"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_manifest_that_is_no_json(bundle, text, reason):
+    rewrite(bundle, text)
+    with pytest.raises(BundleError, match=r"manifest.json is not valid JSON") as caught:
+        Bundle.open(bundle.path)
+    assert reason in caught.value.message
+
+
+def test_a_manifest_larger_than_the_limit_is_not_read(bundle, monkeypatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "manifest_bytes=300")
+    with pytest.raises(BundleError, match="the limit 'manifest_bytes' allows 300"):
         Bundle.open(bundle.path)
 
 
-def test_a_manifest_that_cannot_be_read(bundle, monkeypatch):
-    def refuse(*_args, **_options):
-        raise PermissionError(errno.EACCES, "Permission denied")
+def test_a_manifest_of_a_million_files_is_refused(bundle):
+    data = json.loads((bundle.path / "manifest.json").read_text())
+    data["files"] = {str(number): {"sha256": "0" * 64, "bytes": 1} for number in range(10_001)}
+    rewrite(bundle, json.dumps(data).encode())
+    with pytest.raises(BundleError, match="10001 files; the limit 'files' allows 10000"):
+        Bundle.open(bundle.path)
 
-    monkeypatch.setattr(Path, "read_text", refuse)
-    with pytest.raises(BundleError, match="cannot be read: Permission denied"):
+
+@pytest.mark.parametrize("bit", range(8))
+def test_a_flipped_bit_of_the_manifest_or_its_digest_is_seen(bundle, bit):
+    for name in ("manifest.json", DIGEST):
+        before = (bundle.path / name).read_bytes()
+        for at in range(0, len(before), 7):
+            changed = bytearray(before)
+            changed[at] ^= 1 << bit
+            (bundle.path / name).write_bytes(changed)
+            with pytest.raises(BundleError, match=r"manifest.json has changed"):
+                Bundle.open(bundle.path)
+        (bundle.path / name).write_bytes(before)
+    assert Bundle.open(bundle.path) == bundle
+
+
+def test_the_digest_is_one_that_sha256sum_reads(bundle):
+    told = subprocess.run(["sha256sum", "-c", DIGEST], cwd=bundle.path, capture_output=True, text=True, check=False)
+    assert (told.returncode, told.stdout) == (0, "manifest.json: OK\n")
+
+
+def test_a_bundle_without_a_digest_is_refused_and_says_how_to_write_one(bundle):
+    (bundle.path / DIGEST).unlink()
+    with pytest.raises(BundleError, match=r"has no manifest.sha256") as caught:
+        Bundle.open(bundle.path)
+    command = caught.value.fix.partition(": ")[2]
+    subprocess.run(command, shell=True, check=True)
+    assert Bundle.open(bundle.path) == bundle
+
+
+@pytest.mark.parametrize("name", ["new.txt", "assets/new.txt", "graphs/more/weights.data", ".hidden"])
+def test_a_file_that_the_manifest_does_not_record_is_refused(bundle, name):
+    (bundle.path / name).parent.mkdir(exist_ok=True)
+    (bundle.path / name).touch()
+    with pytest.raises(BundleError, match=f"holds {name}, which its manifest does not record") as caught:
+        Bundle.open(bundle.path)
+    assert "remove it" in caught.value.fix
+
+
+def test_what_is_written_about_a_bundle_and_what_desktops_leave_is_no_part_of_it(bundle):
+    (bundle.path / "reports").mkdir()
+    (bundle.path / "empty").mkdir()
+    for name in ("reports/report.html", "recipe.yaml", "SIGNATURE", ".DS_Store", "graphs/Thumbs.db"):
+        (bundle.path / name).touch()
+    assert Bundle.open(bundle.path) == bundle
+    assert seal(bundle.path, MANIFEST).manifest.files == bundle.manifest.files
+
+
+def test_a_linked_directory_is_refused_at_every_level(tmp_path: Path, bundle):
+    shutil.move(bundle.path / "graphs", tmp_path / "elsewhere")
+    (bundle.path / "graphs").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BundleError, match=r"holds graphs, which"):
+        Bundle.open(bundle.path)
+    for call in (bundle.read, bundle.file):
+        with pytest.raises(BundleError, match=r"lacks the file graphs/main.onnx \(missing, or a link\)"):
+            call("graphs/main.onnx")
+
+
+def test_the_path_to_a_bundle_may_be_a_link(tmp_path: Path, bundle):
+    (tmp_path / "current").symlink_to(bundle.path)
+    assert Bundle.open(tmp_path / "current").manifest == bundle.manifest
+
+
+def test_what_is_read_is_what_was_hashed(bundle):
+    assert bundle.read("assets/words.json") == b"{}" == bundle.asset("words.json")
+    (bundle.path / "assets/words.json").write_text("[]")
+    with pytest.raises(BundleError, match=r"words.json has changed: its SHA-256"):
+        bundle.read("assets/words.json")
+
+
+def test_a_file_larger_than_its_limit_is_not_read(bundle, monkeypatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "tokenizer_bytes=1")
+    with pytest.raises(BundleError, match=r"words.json has 2 bytes; the limit 'tokenizer_bytes' allows 1"):
+        bundle.asset("words.json", "tokenizer_bytes")
+
+
+def test_a_pipe_in_the_place_of_a_file_is_seen_and_not_waited_for(bundle):
+    (bundle.path / "assets/words.json").unlink()
+    os.mkfifo(bundle.path / "assets/words.json")
+    with pytest.raises(BundleError, match=r"lacks the file assets/words.json"):
+        Bundle.open(bundle.path)
+
+
+@pytest.mark.parametrize("golden", ["golden/golden.npz", "graphs/other.onnx"])
+def test_a_golden_file_without_a_record_is_refused(bundle, golden):
+    seal(bundle.path, replace(MANIFEST, golden=golden))
+    with pytest.raises(BundleError, match=f"names {golden}, the golden file, but records no hash"):
+        Bundle.open(bundle.path)
+
+
+def test_the_size_of_the_graphs_counts_everything_beside_them(bundle):
+    graphs = {"main": Graph("main.onnx")}
+    for name in ("main.onnx", "weights.data"):
+        (bundle.path / name).write_bytes(b"12345")
+    program = single_graph(MANIFEST.spec)
+    sealed = seal(bundle.path, MANIFEST)
+    assert replace(sealed, manifest=replace(sealed.manifest, graphs=graphs, program=program)).graph_bytes == 10
+
+
+def test_files_that_an_engine_opens_by_name_are_those_that_were_hashed(bundle):
+    with bundle.held("graphs", ["graphs/main.onnx"]) as place:
+        assert (place / "main.onnx").read_bytes() == b"weights" * 100
+
+
+def rename_over(folder: Path) -> None:
+    (folder / "new").write_bytes(b"weights" * 100)
+    (folder / "new").replace(folder / "main.onnx")
+
+
+def swap_and_swap_back(folder: Path) -> None:
+    folder.rename(folder.with_name("away"))
+    shutil.copytree(folder.with_name("away"), folder)
+    shutil.rmtree(folder)
+    folder.with_name("away").rename(folder)
+
+
+def rewrite_in_place(folder: Path) -> None:
+    found = (folder / "main.onnx").stat()
+    with (folder / "main.onnx").open("r+b") as stream:
+        stream.write(b"WEIGHTS")
+    os.utime(folder / "main.onnx", ns=(found.st_atime_ns, found.st_mtime_ns))
+
+
+@pytest.mark.parametrize("attack", [rename_over, swap_and_swap_back, rewrite_in_place])
+def test_what_changes_while_an_engine_opens_it_is_seen(bundle, attack):
+    with pytest.raises(BundleError, match="was changed while"), bundle.held("graphs", ["graphs/main.onnx"]):
+        attack(bundle.path / "graphs")
+
+
+def test_a_held_file_is_verified(bundle):
+    (bundle.path / "graphs/main.onnx").write_bytes(b"Weights" * 100)
+    with pytest.raises(BundleError, match="its SHA-256"), bundle.held("graphs", ["graphs/main.onnx"]):
+        pytest.fail("the block must not run")
+
+
+def test_a_manifest_that_is_a_link_is_refused(tmp_path: Path, bundle):
+    shutil.move(bundle.path / "manifest.json", tmp_path / "elsewhere.json")
+    (bundle.path / "manifest.json").symlink_to(tmp_path / "elsewhere.json")
+    with pytest.raises(BundleError, match=r"lacks the file manifest.json \(missing, or a link\)"):
         Bundle.open(bundle.path)
 
 
 def test_a_newer_bundle_asks_for_an_upgrade(bundle):
     data = json.loads((bundle.path / "manifest.json").read_text())
-    (bundle.path / "manifest.json").write_text(json.dumps({**data, "schema": 9}))
+    rewrite(bundle, json.dumps({**data, "schema": 9}).encode())
     with pytest.raises(BundleError, match="schema 9") as caught:
         Bundle.open(bundle.path)
     assert caught.value.fix == "upgrade vlatool"

@@ -1,14 +1,24 @@
 import json
 
 import pytest
+from _edits import put
 
 from vlatool.errors import BundleError, SpecError
-from vlatool.manifest import FileRecord, Graph, Manifest, ProgramStep, check_program, program_from, single_graph
+from vlatool.manifest import (
+    FileRecord,
+    Graph,
+    Manifest,
+    ProgramStep,
+    check_files,
+    check_program,
+    program_from,
+    single_graph,
+)
 from vlatool.spec import PolicySpec, TensorSpec
 
 SPEC = PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0)
 GRAPHS = {"main": Graph("graphs/main.onnx", {"float32": 1.0}, 20)}
-FILES = {"graphs/main.onnx": FileRecord("00", 3)}
+FILES = {"graphs/main.onnx": FileRecord("0" * 64, 3)}
 DIFFUSION = [
     {"graph": "encode", "feeds": {"image": "x"}, "gives": {"memory": "memory"}, "keep": {"memory": {"shape": [1, 2]}}},
     {
@@ -31,7 +41,7 @@ MANIFESTS = [
         SPEC,
         DIFFUSION_GRAPHS,
         program_from(DIFFUSION),
-        {graph.file: FileRecord("11", 5) for graph in DIFFUSION_GRAPHS.values()},
+        {graph.file: FileRecord("1" * 64, 5) for graph in DIFFUSION_GRAPHS.values()},
         accuracy={"success": {"value": 0.9}},
         parts={"head": ["head*"]},
         environment={"make": "e.py:make", "tasks": ["reach"]},
@@ -56,8 +66,31 @@ def test_empty_values_are_left_out():
     assert plain["program"] == [{"graph": "main", "feeds": {"x": "x"}, "gives": {"y": "y"}}]
 
 
-def test_a_key_of_a_later_vlatool_within_the_schema_is_passed_over():
-    assert Manifest.from_dict({**MANIFESTS[1].to_dict(), "colour": "red"}) == MANIFESTS[1]
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        ([], "The manifest has the unknown key 'folden'; did you mean 'golden'"),
+        (["graphs", "main"], "The graph 'main' has the unknown key 'folden'"),
+        (["program", 0], "Step 0 of the program has the unknown key 'folden'"),
+        (["files", "graphs/main.onnx"], "The record of 'graphs/main.onnx' has the unknown key 'folden'"),
+        (["spec"], "The spec has the unknown key 'folden'"),
+        (["spec", "inputs", 0], "The tensor 'x' has the unknown key 'folden'"),
+    ],
+    ids=str,
+)
+def test_an_unknown_key_is_refused_at_every_level(where, message):
+    data = json.loads(json.dumps(MANIFESTS[1].to_dict()))
+    put(*where, "folden", "golden/golden.npz")(data)
+    with pytest.raises((BundleError, SpecError), match=message):
+        Manifest.from_dict(data)
+
+
+@pytest.mark.parametrize(("entry", "word"), [(0, "keep"), (1, "noise")])
+def test_an_unknown_key_of_noise_or_a_kept_value_is_refused(entry, word):
+    data = json.loads(json.dumps(DIFFUSION))
+    next(iter(data[entry][word].values()))["colour"] = "red"
+    with pytest.raises(SpecError, match="has the unknown key 'colour'"):
+        program_from(data)
 
 
 def test_a_newer_schema_asks_for_an_upgrade():
@@ -96,20 +129,51 @@ def test_a_manifest_must_be_a_mapping(data):
         {"files": {"graphs/main.onnx": {"sha256": "00"}}},
         {"files": {"graphs/main.onnx": 3}},
         {"files": None},
+        {"files": {"graphs/main.onnx": {"sha256": "0" * 64, "bytes": True}}},
+        {"files": {"graphs/main.onnx": {"sha256": "0" * 64, "bytes": -1}}},
+        {"files": {"graphs/main.onnx": {"sha256": "0" * 64, "bytes": float("nan")}}},
+        {"files": {"graphs/main.onnx": {"sha256": "0" * 64, "bytes": 2**70}}},
+        {"files": {"graphs/main.onnx": {"sha256": "0" * 63 + "G", "bytes": 3}}},
+        {"files": {"graphs/main.onnx": {"sha256": ["0" * 64], "bytes": 3}}},
+        {"name": 3},
+        {"name": ""},
+        {"version": None},
+        {"engine": ["ort_cpu"]},
+        {"golden": {"file": "golden/golden.npz"}},
+        {"parent": True},
+        {"build": {"stage": "x"}},
+        {"build": [["stage"]]},
+        {"build": [{"stage": 3}]},
+        {"parts": {"head": "head*"}},
+        {"parts": {"head": [1]}},
+        {"accuracy": {"success": {"value": True}}},
+        {"accuracy": {"success": {"value": float("nan")}}},
+        {"accuracy": {"success": {"value": 10**400}}},
+        {"made_by": []},
+        {"description": "\ud800"},
+        {"schema": True},
+        {"graphs": {"main": {"file": "graphs/main.onnx", "precision": {"float32": "all"}}}},
+        {"graphs": {"main": {"file": "graphs/main.onnx", "precision": {"float32": 2}}}},
+        {"graphs": {"main": {"file": "graphs/main.onnx", "opset": 2.5}}},
+        {"graphs": {"main": {"file": "graphs/main.onnx", "compute": ["float32"]}}},
+        {"graphs": {str(number): {"file": "graphs/main.onnx"} for number in range(300)}},
         {"program": [{"graph": "main", "feeds": {"x": "x"}, "gives": {"y": "y"}, "schedule": 3}]},
         {"program": [{"graph": "main", "feeds": ["x"], "gives": ["y"]}]},
     ],
-    ids=str,
+    ids=lambda change: ascii(change)[:60],
 )
 def test_a_malformed_manifest_is_the_bundles_fault_and_no_traceback(change):
     with pytest.raises((BundleError, SpecError)):
         Manifest.from_dict({**MANIFESTS[1].to_dict(), **change})
 
 
-@pytest.mark.parametrize("path", ["../main.onnx", "/etc/passwd", "graphs/../../main.onnx", ""])
+@pytest.mark.parametrize(
+    "path",
+    ["../main.onnx", "/etc/passwd", "graphs/../../main.onnx", "", "a\\b", "a\0b", "./a", "a//b", "*/_ORT_MEM_ADDR_/*"],
+)
 def test_a_path_that_leaves_the_bundle_is_refused(path):
     with pytest.raises(BundleError, match="not inside the bundle"):
-        Manifest("evil", "1", SPEC, files={path: FileRecord("00", 3)})
+        Manifest("evil", "1", SPEC, files={path: FileRecord("0" * 64, 3)})
     with pytest.raises(BundleError, match="not inside the bundle"):
         Manifest("evil", "1", SPEC, {"main": Graph(path)}, files={})
 
@@ -153,6 +217,22 @@ def test_a_value_may_come_from_schedule_noise_or_keep():
     [
         ({"repeat": 0}, "repeats 'main' 0 times"),
         ({"repeat": 1.5}, "repeats 'main' 1.5 times"),
+        ({"repeat": True}, "repeats 'main' True times"),
+        ({"repeat": 10_000_000}, "10000000 runs; the limit 'repeat' allows 10000"),
+        ({"repeat": 2**70}, "more than 2.* runs; the limit 'repeat'"),
+        ({"schedule": {"t": [float("nan")]}}, "schedule of 't' must be a number"),
+        ({"schedule": {"t": ["1"]}}, "schedule of 't' must be a number"),
+        ({"schedule": {"t": [2**64]}}, "no int64 holds"),
+        ({"noise": {"n": {"shape": [1 << 30]}}}, "the limit 'elements'"),
+        ({"noise": {"n": {"shape": [1.5]}}}, "An axis of the shape of the noise 'n' must be a whole number"),
+        ({"noise": {"n": {"shape": [-1]}}}, "An axis of the shape of the noise 'n'"),
+        ({"noise": {"n": {"shape": "12"}}}, "the shape of the noise 'n' must be a list"),
+        ({"keep": {"k": {"shape": [1 << 20, 1 << 20]}}}, "the limit 'elements'"),
+        ({"keep": {"k": {"shape": [1], "dtype": "object"}}}, "dtype 'object'; allowed: float32"),
+        ({"keep": {"k": {"shape": [True]}}}, "An axis of the shape of the kept value 'k'"),
+        ({"feeds": {"a": 3}}, "A value in 'feeds' of 'main' must be text"),
+        ({"feeds": {3: "x"}}, "A key of 'feeds' of 'main' must be text"),
+        ({"graph": ["main"]}, "The graph of a step must be text"),
         ({"repeat": 3, "schedule": {"t": [1, 2]}}, "schedule of 't' has 2 numbers, but 'main' runs 3 times"),
         ({"noise": {"n": {}}}, "noise 'n' needs a shape"),
         ({"noise": {"n": {"shape": [1], "distribution": "cauchy"}}}, "distribution of normal, uniform, zeros"),
@@ -161,6 +241,27 @@ def test_a_value_may_come_from_schedule_noise_or_keep():
 def test_an_impossible_step_is_refused(changes, message):
     with pytest.raises(SpecError, match=message):
         step(**changes)
+
+
+def test_a_program_of_too_many_runs_steps_or_values_is_refused():
+    with pytest.raises(SpecError, match="200000 runs; the limit 'runs' allows 100000"):
+        check_program([step(repeat=10_000)] * 20, GRAPHS, SPEC)
+    with pytest.raises(SpecError, match="1025 steps; the limit 'steps' allows 1024"):
+        check_program([step()] * 1025, GRAPHS, SPEC)
+    kept = [step(keep={f"k{number}": {"shape": [1 << 26]}}) for number in range(3)]
+    with pytest.raises(SpecError, match="the limit 'state_elements'"):
+        check_program(kept, GRAPHS, SPEC)
+
+
+def test_what_the_manifest_names_needs_a_record():
+    text = TensorSpec("say", (1, 5), "int64", "text", tokenizer="words.json", max_tokens=5)
+    state = TensorSpec("x", (1, 2), normalisation="mean_std", statistics="stats.json#x")
+    spec = PolicySpec((text, state), SPEC.outputs, 10.0)
+    for missing in ("words.json", "stats.json"):
+        others = {f"assets/{name}": FileRecord("0" * 64, 1) for name in {"words.json", "stats.json"} - {missing}}
+        manifest = Manifest("plain", "1", spec, GRAPHS, (step(gives={"b": "y"}),), {**FILES, **others})
+        with pytest.raises(BundleError, match=f"names assets/{missing}, which '(say|x)' needs, but records no hash"):
+            check_files(manifest)
 
 
 def test_a_kept_value_needs_a_shape():

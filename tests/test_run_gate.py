@@ -9,7 +9,7 @@ import pytest
 
 from vlatool import run_gate as run_gate_module
 from vlatool.benchmark._pairs import Job, Pairs
-from vlatool.bundle import Bundle
+from vlatool.bundle import DIGEST, Bundle, digest_of
 from vlatool.claims import _timed
 from vlatool.errors import BundleError, DataError, GraphError
 from vlatool.gate import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
@@ -127,6 +127,7 @@ def test_bundles_that_mean_something_else_are_refused(
     manifest = json.loads((other / "manifest.json").read_text())
     manifest["spec"][side][0][field] = value
     (other / "manifest.json").write_text(json.dumps(manifest))
+    (other / DIGEST).write_bytes(digest_of((other / "manifest.json").read_bytes()))
     with pytest.raises(BundleError, match=says):
         run_gate(Bundle.open(other, verify=False), float_bundle, QUICK, Context())
 

@@ -54,8 +54,8 @@ def test_the_action_is_the_first_output_and_the_rate_follows_from_what_is_execut
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"name": ""}, "needs a name"),
-        ({"name": 3}, "needs a name; got 3"),
+        ({"name": ""}, "name of a tensor must be text"),
+        ({"name": 3}, "name of a tensor must be text .*got 3"),
         ({"dtype": "float23"}, "dtype 'float23'; did you mean 'float32'"),
         ({"kind": "tekst"}, "kind 'tekst'; did you mean 'text'"),
         ({"normalisation": "meanstd"}, "normalisation 'meanstd'; did you mean 'mean_std'"),
@@ -71,6 +71,13 @@ def test_the_action_is_the_first_output_and_the_rate_follows_from_what_is_execut
         ({"normalisation": "mean_std", "statistics": "stats.json"}, "FILE#KEY"),
         ({"kind": "discrete"}, "needs 'labels'"),
         ({"colour": "red"}, "unknown key 'colour'"),
+        ({"shape": [1, 10**9]}, "1000000000 elements; the limit 'elements'"),
+        ({"shape": [2**62, 2**62]}, "more than 2"),
+        ({"name": "\ud800"}, "half of a character"),
+        ({"labels": [1, 2]}, "label or unit of 'state' must be text"),
+        ({"dtype": ["float32"]}, "it must be text"),
+        ({"kind": "text", "tokenizer": "words.json", "max_tokens": 10**9}, "limit 'tokens'"),
+        ({"kind": "text", "tokenizer": "words.json", "max_tokens": True}, "max_tokens of 'state' must be a whole"),
         ({"shpe": [1]}, "unknown key 'shpe'; did you mean 'shape'"),
     ],
 )
@@ -78,6 +85,34 @@ def test_an_impossible_tensor_is_refused(change, message):
     with pytest.raises(SpecError, match=message) as caught:
         TensorSpec.from_dict({"name": "state", "shape": [1, 2], **change})
     assert caught.value.exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("file", "reason"),
+    [
+        ("../words.json", "leaves the directory"),
+        ("deep/../../words.json", "leaves the directory"),
+        ("/etc/passwd", "is absolute"),
+        ("..", "leaves the directory"),
+        ("C:\\words.json", "characters that no file"),
+        ("..\\words.json", "characters that no file"),
+        ("words\0.json", "characters that no file"),
+        ("./words.json", "empty or a dot"),
+        ("deep//words.json", "empty or a dot"),
+        ("x" * 300, "too long"),
+    ],
+)
+def test_a_file_that_is_not_in_the_folder_is_refused(file, reason):
+    with pytest.raises(SpecError, match=reason):
+        TensorSpec.from_dict({**TEXT, "tokenizer": file})
+    with pytest.raises(SpecError, match=reason):
+        TensorSpec.from_dict({**STATE, "statistics": f"{file}#x"})
+
+
+def test_the_files_of_a_tensor():
+    assert TensorSpec.from_dict(TEXT).assets() == ["words.json"]
+    assert TensorSpec.from_dict(STATE).assets() == ["s.json"]
+    assert TensorSpec.from_dict(IMAGE).assets() == []
 
 
 @pytest.mark.parametrize("change", [{"tokenizer": ""}, {"max_tokens": 0}])
@@ -123,11 +158,11 @@ def test_a_tensor_without_a_name_is_refused():
         ({"outputs": [{**ACTION, "name": "image"}]}, "'image' occurs 2 times"),
         ({"control_hz": 0}, "control_hz is 0"),
         ({"control_hz": -1.0}, "control_hz is -1.0"),
-        ({"control_hz": float("nan")}, "control_hz is nan"),
-        ({"control_hz": True}, "control_hz is True"),
-        ({"control_hz": "fast"}, "control_hz is 'fast'"),
-        ({"chunk": 0}, "chunk is 0"),
-        ({"chunk": 2.0}, "chunk is 2.0"),
+        ({"control_hz": float("nan")}, "control_hz must be a number; got nan"),
+        ({"control_hz": True}, "control_hz must be a number; got True"),
+        ({"control_hz": "fast"}, "control_hz must be a number; got 'fast'"),
+        ({"chunk": 0}, "chunk must be a whole number from 1; got 0"),
+        ({"chunk": 2.0}, "chunk must be a whole number from 1; got 2.0"),
         ({"chunk": 2, "execute": 3}, "execute 3"),
         ({"chunks": 2}, "unknown key 'chunks'; did you mean 'chunk'"),
     ],

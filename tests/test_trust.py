@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from vlatool import trust
-from vlatool.bundle import LOCATION, MANIFEST, Bundle, manifest_bytes, seal
+from vlatool.bundle import LOCATION, Bundle, seal, write_manifest
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
 from vlatool.export._torch_policy import load_modules
@@ -148,7 +148,7 @@ def test_rebuild_takes_the_source_from_the_command_line(vlatool, mine, tmp_path:
 def forged(bundle: Bundle, **source: Any) -> Bundle:
     """Change what a source bundle says of its source, with good hashes."""
     manifest = replace(bundle.manifest, source={**bundle.manifest.source, **source})
-    (bundle.path / MANIFEST).write_bytes(manifest_bytes(manifest))
+    write_manifest(bundle.path, manifest)
     return Bundle(bundle.path, manifest)
 
 

@@ -22,7 +22,7 @@ import pytest
 import yaml
 from _edits import put, take
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle import DIGEST, MANIFEST, Bundle, digest_of, seal
 from vlatool.cli import main
 from vlatool.errors import VlatoolError
 from vlatool.export.onnx import ExportOnnx
@@ -92,6 +92,8 @@ class Workshop:
         path = Path(shutil.copytree(self.bundles[of].path, self.root / "damaged"))
         if file:
             (path / file).write_bytes(content((path / file).read_bytes()) if callable(content) else content)
+        if file == MANIFEST:
+            (path / DIGEST).write_bytes(digest_of((path / file).read_bytes()))
         if sealed:
             seal(path, self.bundles[of].manifest)
         return path
@@ -376,9 +378,9 @@ BUNDLES = [
     Row("a manifest without a spec", "The manifest has no 'spec'", 3,
         lambda at: ["inspect", at.manifest(take("spec"))]),
     Row("a manifest that leads out of the bundle", "'../../etc/passwd', which is not inside the bundle", 3,
-        lambda at: ["inspect", at.manifest(put("files", "../../etc/passwd", {"sha256": "", "bytes": 1}))]),
+        lambda at: ["inspect", at.manifest(put("files", "../../etc/passwd", {"sha256": "0" * 64, "bytes": 1}))]),
     Row("a manifest with an absolute path", "which is not inside the bundle", 3,
-        lambda at: ["inspect", at.manifest(put("files", "/etc/passwd", {"sha256": "", "bytes": 1}))]),
+        lambda at: ["inspect", at.manifest(put("files", "/etc/passwd", {"sha256": "0" * 64, "bytes": 1}))]),
     Row("a graph's file that is a number", "graphs", 3,
         lambda at: ["inspect", at.manifest(put("graphs", "main", "file", 3))]),
     Row("feeds that are no mapping", "feeds", 3,
@@ -456,7 +458,7 @@ SOURCES = [
         lambda at: at.changed_after, called),
     Row("no statistics", "names statistics.json, which is not in", 3,
         lambda at: ["export", at.policy(drop="statistics.json"), *at.to]),
-    Row("statistics that are not JSON", "are not valid JSON", 3,
+    Row("statistics that are not JSON", "is not valid JSON", 3,
         lambda at: ["export", at.policy(statistics="{"), *at.to]),
     Row("statistics of another name", "has no statistics 'proprio'", 3,
         lambda at: ["export", at.policy(statistics={"propio": {}}), *at.to]),

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vlatool.errors import BundleError
-from vlatool.manifest import FileRecord, Manifest
+from vlatool.json_files import read_json
+from vlatool.limits import check, limit
+from vlatool.manifest import FileRecord, Manifest, check_files
+from vlatool.sealed_files import FIX, LITTER, held, open_inside, read_all, read_sealed, unlisted, verify_sealed
 from vlatool.written import LEDGER
 
 MANIFEST = "manifest.json"
+DIGEST = "manifest.sha256"
+"""The SHA-256 of the manifest, as ``sha256sum`` writes it: what protects everything that the manifest says."""
 LOCATION = "location.json"
-UNRECORDED = ("reports", "recipe.yaml", MANIFEST, "SIGNATURE", LOCATION, LEDGER)
+UNRECORDED = ("reports", "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
 """Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
+ASSETS = "assets"
 
 
 @dataclass(frozen=True)
@@ -31,20 +39,102 @@ class Bundle:
 
     path: Path
     manifest: Manifest
+    _verified: set[str] = field(default_factory=set, repr=False, compare=False)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], *, verify: bool = True) -> Bundle:
-        """Read the manifest and check size and SHA-256 of every file before anything else is parsed.
+        """Read the manifest, hold it against its digest, and check every file before anything else is parsed.
+
+        Args:
+            path: The directory.
+            verify: Check that the files are those of the manifest, with their sizes and SHA-256, and no others.
 
         Raises:
-            BundleError: when the directory is missing, is no bundle, or a file is missing, changed or a link.
+            BundleError: when the directory is missing, is no bundle, or a file is missing, changed, a link or unknown.
+            SpecError: for an impossible spec or program.
+        """
+        bundle = cls.described(path)
+        if verify:
+            bundle.verify()
+        return bundle
+
+    @classmethod
+    def described(cls, path: str | os.PathLike[str]) -> Bundle:
+        """Read the manifest, hold it against its digest; the files are checked when they are read (``read``).
+
+        Raises:
+            BundleError: when the directory is missing or is no bundle, or the manifest is changed or makes no sense.
+            SpecError: for an impossible spec or program.
         """
         root = Path(path)
-        manifest = Manifest.from_dict(_read_manifest(root))
-        if verify:
-            for name, record in manifest.files.items():
-                _verify(root, name, record)
-        return cls(root, manifest)
+        return cls(root, Manifest.from_dict(_read_manifest(root)))
+
+    def verify(self) -> None:
+        """Check every file that was not verified by reading it, and that nothing else is there.
+
+        Raises:
+            BundleError: when a file is missing, changed, a link, or not in the manifest.
+        """
+        self.check_tree()
+        for name in [name for name in self.manifest.files if name not in self._verified]:
+            verify_sealed(self.path, name, *self._record(name))
+
+    def check_tree(self) -> None:
+        """Refuse what the manifest does not record, and a manifest that names files which it does not record.
+
+        Raises:
+            BundleError: naming the first such file.
+        """
+        check_files(self.manifest)
+        try:
+            stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED)
+        except OSError as error:
+            raise BundleError(f"{self.path} cannot be read: {error.strerror}.") from error
+        if stranger:
+            raise BundleError(
+                f"The bundle {self.path} holds {stranger}, which its manifest does not record.",
+                f"remove it, or put it into {self.path / 'reports'}; or copy or export the bundle again",
+            )
+
+    def read(self, name: str, allowed: str = "") -> bytes:
+        """Return the content of a recorded file: the very bytes that were verified, read once.
+
+        Args:
+            name: As in the manifest.
+            allowed: Name of the limit on its size.
+
+        Raises:
+            BundleError: when the manifest does not record it, it is larger than the limit, or it is not what the
+                manifest says.
+        """
+        sha256, size = self._record(name)
+        if allowed:
+            check(allowed, size, f"{self.path / name}", BundleError)
+        content = read_sealed(self.path, name, sha256, size)
+        self._verified.add(name)
+        return content
+
+    def asset(self, name: str, allowed: str = "") -> bytes:
+        """Return the content of a file of ``assets/``; see ``read``."""
+        return self.read(f"{ASSETS}/{name}", allowed)
+
+    @contextlib.contextmanager
+    def held(self, folder: str, names: Iterable[str]) -> Iterator[Path]:
+        """Verify files that an engine opens by name, and give the directory ``folder`` while they stay as they are.
+
+        Raises:
+            BundleError: when a file is not what the manifest says, or changed before the block ended.
+        """
+        files = {name: self._record(name) for name in names}
+        with held(self.path, folder, files) as place:
+            yield place
+        self._verified.update(files)
+
+    def _record(self, name: str) -> tuple[str, int]:
+        if name not in self.manifest.files:
+            raise BundleError(f"The bundle {self.path} has no file '{name}'.")
+        record = self.manifest.files[name]
+        return record.sha256, record.bytes
 
     @property
     def hash(self) -> str:
@@ -52,14 +142,18 @@ class Bundle:
         return "sha256:" + hashlib.sha256(manifest_bytes(self.manifest)).hexdigest()
 
     def file(self, name: str) -> Path:
-        """Return the path of a recorded file.
+        """Return the path of a recorded file, to which no link leads.
 
         Raises:
-            BundleError: when the manifest does not record it.
+            BundleError: when the manifest does not record it, or it or a directory above it is a link.
         """
-        if name not in self.manifest.files:
-            raise BundleError(f"The bundle {self.path} has no file '{name}'.")
-        return self.path / name
+        self._record(name)
+        path = self.path
+        for part in name.split("/"):
+            path /= part
+            if path.is_symlink():
+                raise BundleError(f"The bundle {self.path} lacks the file {name} (missing, or a link).", FIX)
+        return path
 
     @property
     def size_bytes(self) -> int:
@@ -71,30 +165,44 @@ class Bundle:
         """Bytes of all graphs, with the weights that lie beside them, whatever their files are called."""
         graphs = tuple(graph.file for graph in self.manifest.graphs.values())
         folders = tuple(f"{folder}/" for graph in graphs if (folder := graph.rpartition("/")[0]))
-        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith((*graphs, *folders)))
+        beside = () if len(folders) == len(graphs) else tuple(name for name in self.manifest.files if "/" not in name)
+        wanted = (*graphs, *folders, *beside)
+        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(wanted))
 
 
 def seal(directory: Path, manifest: Manifest) -> Bundle:
-    """Hash every file below ``directory``, write ``manifest.json`` last, and return the bundle."""
+    """Hash every file below ``directory``, write ``manifest.json`` and its digest last, and return the bundle."""
     files = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
-        if path.is_file() and name.partition("/")[0] not in UNRECORDED:
+        if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
             files[name] = FileRecord(hash_file(path), path.stat().st_size)
     sealed = replace(manifest, files=files)
-    (directory / MANIFEST).write_bytes(manifest_bytes(sealed))
+    write_manifest(directory, sealed)
     return Bundle(directory, sealed)
 
 
 def restate(bundle: Bundle, manifest: Manifest) -> Bundle:
     """Write another manifest for a bundle whose files stay as they are, and return it."""
-    (bundle.path / MANIFEST).write_bytes(manifest_bytes(manifest))
+    write_manifest(bundle.path, manifest)
     return Bundle(bundle.path, manifest)
+
+
+def write_manifest(directory: Path, manifest: Manifest) -> None:
+    """Write ``manifest.json`` and ``manifest.sha256``."""
+    content = manifest_bytes(manifest)
+    (directory / MANIFEST).write_bytes(content)
+    (directory / DIGEST).write_bytes(digest_of(content))
 
 
 def manifest_bytes(manifest: Manifest) -> bytes:
     """Return the one way in which a manifest is written."""
     return (json.dumps(manifest.to_dict(), indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def digest_of(content: bytes) -> bytes:
+    """Return what ``manifest.sha256`` says of a manifest: ``sha256sum -c manifest.sha256`` reads it, too."""
+    return f"{hashlib.sha256(content).hexdigest()}  {MANIFEST}\n".encode()
 
 
 def hash_file(path: Path) -> str:
@@ -121,21 +229,25 @@ def _read_manifest(root: Path) -> Any:
             f"{root} is not a bundle: it has no {MANIFEST} (found: {found or 'nothing'}).",
             "make one with: vlatool export SOURCE -o BUNDLE",
         )
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise BundleError(f"{path} is not valid JSON: {error}.", "export the policy again") from error
-    except OSError as error:
-        raise BundleError(f"{path} cannot be read: {error.strerror}.") from error
+    content = _read_small(root, MANIFEST, limit("manifest_bytes"))
+    check("manifest_bytes", len(content), f"{path}", BundleError)
+    _check_digest(root, content)
+    return read_json(content, f"{path}", BundleError, "export the policy again", strict=True)
 
 
-def _verify(root: Path, name: str, record: FileRecord) -> None:
-    path = root / name
-    fix = "copy or export the bundle again"
-    if path.is_symlink() or not path.is_file():
-        raise BundleError(f"The bundle {root} lacks the file {name} (missing, or a link).", fix)
-    size = path.stat().st_size
-    if size != record.bytes:
-        raise BundleError(f"{path} has {size} bytes; the manifest says {record.bytes}.", fix)
-    if hash_file(path) != record.sha256:
-        raise BundleError(f"{path} has changed: its SHA-256 is not the manifest's.", fix)
+def _check_digest(root: Path, content: bytes) -> None:
+    if not (root / DIGEST).exists():
+        raise BundleError(
+            f"{root} has no {DIGEST}: a vlatool before there was one made it, or the file was taken away.",
+            f"export the policy again; or, if you trust this copy: cd {root} && sha256sum {MANIFEST} > {DIGEST}",
+        )
+    if _read_small(root, DIGEST, 4096) != digest_of(content):
+        raise BundleError(
+            f"{root / MANIFEST} has changed: its SHA-256 is not what {DIGEST} says.", "copy or export the bundle again"
+        )
+
+
+def _read_small(root: Path, name: str, most: int) -> bytes:
+    """Return the content of a file that is not recorded: up to ``most`` bytes, and one more when it has more."""
+    with open_inside(root, name) as handle:
+        return read_all(handle, min(os.fstat(handle).st_size, most))

@@ -15,6 +15,7 @@ import numpy as np
 from vlatool.bundle import Bundle, restate, seal
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.runtime.engines._reference import ReferenceSession
+from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.policy import DEFAULT_ENGINE, Policy, load_golden, relative_error
 from vlatool.runtime.program import Program, draw
 
@@ -145,7 +146,8 @@ def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]
 def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> float:
     """Run the first observations and store ``in.NAME``, ``noise.NAME`` and ``out.NAME``, each with a sample axis.
 
-    The outputs are what the graphs say: the engine that the bundle is made for may compute something else.
+    The outputs are what the graphs say: the engine that the bundle is made for may compute something else. The samples
+    follow each other without a reset between, so that what a program keeps shows in the second.
 
     Args:
         draft: The bundle as written so far; its graphs are what runs.
@@ -159,7 +161,7 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     steps = draft.manifest.program
     samples = [
         (observation, {name: draw(wanted, random) for step in steps for name, wanted in step.noise.items()})
-        for observation in observations[:GOLDEN_COUNT]
+        for observation in (observations * GOLDEN_COUNT)[:GOLDEN_COUNT]
     ]
     given = [_outputs(Policy.open(draft, threads=1, seed=SEED), samples)]
     given.insert(0, _outputs(reference_policy(draft), samples))
@@ -176,16 +178,14 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
 
 
 def _outputs(policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[Mapping[str, Any]]:
-    found = []
-    for observation, noise in samples:
-        policy.reset()
-        found.append(policy.infer(observation, noise=noise).outputs)
-    return found
+    policy.reset()
+    return [policy.infer(observation, noise=noise).outputs for observation, noise in samples]
 
 
 def reference_policy(bundle: Bundle) -> Policy:
     """Open a bundle in what computes its graphs as they are written, whatever engine it was made for."""
-    sessions = {name: ReferenceSession(bundle.file(graph.file), 1) for name, graph in bundle.manifest.graphs.items()}
+    graphs = bundle.manifest.graphs.items()
+    sessions = {name: open_graph(bundle, replace(graph, compute=""), ReferenceSession, 1) for name, graph in graphs}
     return Policy(bundle, Program(bundle.manifest.program, sessions, SEED), "reference")
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
-from pathlib import PurePosixPath
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from typing import Any
 
+from vlatool._step_checks import DISTRIBUTIONS as DISTRIBUTIONS
+from vlatool._step_checks import check_step, drawn_and_kept
 from vlatool.errors import BundleError, SpecError, nearest
+from vlatool.limits import check
 from vlatool.spec import PolicySpec
+from vlatool.typed import finite, known, listed, mapping, outside, shown, text, whole
 
 SCHEMA = 1
 GOLDEN_TOLERANCE = 0.05
 """Allowed relative L2 difference from the golden action where a manifest says none."""
 COMPUTES = ("", "float32", "bfloat16")
-DISTRIBUTIONS = ("normal", "uniform", "zeros")
+SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,14 @@ class Graph:
     compute: str = ""
 
     def __post_init__(self) -> None:
+        _inside(self.file)
+        for name, share in mapping(self.precision, f"The precision of {self.file}", BundleError).items():
+            if not 0 <= finite(share, f"The share of {name} in {self.file}", BundleError) <= 1.001:
+                raise BundleError(f"The share of {name} in {self.file} is {shown(share)}; allowed: 0 to 1.")
+        whole(self.opset, f"The opset of {self.file}", BundleError)
         if self.compute not in COMPUTES:
             raise BundleError(
-                f"The graph {self.file} computes in {self.compute!r}; allowed: {', '.join(COMPUTES[1:])}."
+                f"The graph {self.file} computes in {shown(self.compute)}; allowed: {', '.join(COMPUTES[1:])}."
             )
 
 
@@ -73,26 +82,7 @@ class ProgramStep:
     keep: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
-            if not isinstance(getattr(self, word), Mapping):
-                raise SpecError(f"'{word}' of '{self.graph}' must be a mapping; got {getattr(self, word)!r}.")
-        if not isinstance(self.repeat, int) or self.repeat < 1:
-            raise SpecError(f"The program repeats '{self.graph}' {self.repeat!r} times; allowed: from 1.")
-        for value, numbers in self.schedule.items():
-            if not isinstance(numbers, list | tuple):
-                raise SpecError(f"The schedule of '{value}' must be a list of numbers; got {numbers!r}.")
-            if len(numbers) != self.repeat:
-                got = f"{len(numbers)} numbers, but '{self.graph}' runs {self.repeat} times"
-                raise SpecError(f"The schedule of '{value}' has {got}.")
-        for value, noise in self.noise.items():
-            if not isinstance(noise, Mapping):
-                raise SpecError(f"The noise '{value}' must be a mapping; got {noise!r}.")
-            if noise.get("distribution", "normal") not in DISTRIBUTIONS or not noise.get("shape"):
-                raise SpecError(f"The noise '{value}' needs a shape and a distribution of {', '.join(DISTRIBUTIONS)}.")
-
-        for value, kept in self.keep.items():
-            if not isinstance(kept, Mapping) or not kept.get("shape"):
-                raise SpecError(f"The kept value '{value}' needs a shape.")
+        check_step(self)
 
     def sources(self) -> set[str]:
         """Values that this entry brings into being before its graph runs."""
@@ -151,6 +141,8 @@ class Manifest:
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
+        check("files", len(self.files), "The manifest", BundleError)
+        check("graphs", len(self.graphs), "The manifest", BundleError)
         for path in (*self.files, *(graph.file for graph in self.graphs.values())):
             _inside(path)
         for graph in self.graphs.values():
@@ -159,8 +151,11 @@ class Manifest:
         if self.graphs and not self.program:
             raise BundleError(f"The manifest has graphs, but no program that runs them to '{self.spec.action.name}'.")
         for name, found in self.accuracy.items():
-            if not isinstance(found, Mapping) or not isinstance(found.get("value"), int | float):
-                raise BundleError(f"The manifest's accuracy '{name}' must have a number as 'value'; got {found!r}.")
+            if not isinstance(found, Mapping) or "value" not in found:
+                raise BundleError(
+                    f"The manifest's accuracy '{name}' must have a number as 'value'; got {shown(found)}."
+                )
+            finite(found["value"], f"The manifest's accuracy '{name}'", BundleError)
         if self.program:
             check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
 
@@ -174,24 +169,25 @@ class Manifest:
         """
         if not isinstance(data, Mapping):
             raise BundleError(f"The manifest must be a mapping; got {type(data).__name__}.")
-        _check_schema(data.get("schema"))
-        for key in ("graphs", "files", "made_by", "source", "environment", "parts", "accuracy"):
-            if not isinstance(data.get(key, {}), Mapping):
-                raise BundleError(f"The manifest has '{key}': {data[key]!r}; it must be a mapping.")
-        known = {item.name for item in fields(cls)}
-        values = {key: data[key] for key in data if key in known}
+        values = mapping(data, "The manifest", BundleError)
+        check_schema(values.get("schema"))
+        known(values, [item.name for item in fields(cls)], "The manifest", BundleError)
+        for item in fields(cls):
+            if item.name in values:
+                _check_type(item.name, values[item.name], item)
         for key in ("name", "version", "spec"):
             if key not in values:
                 raise BundleError(f"The manifest has no '{key}'.", "export the policy again")
-        try:
-            values["spec"] = PolicySpec.from_dict(values["spec"])
-            values["graphs"] = {name: Graph(**graph) for name, graph in data.get("graphs", {}).items()}
-            values["program"] = program_from(data.get("program", []))
-            values["build"] = _build_record(data.get("build", ()))
-            values["findings"] = _findings(data.get("findings", ()))
-            values["files"] = {path: FileRecord(**record) for path, record in data.get("files", {}).items()}
-        except (TypeError, AttributeError) as error:
-            raise BundleError(f"The manifest is malformed: {error}.", "export the policy again") from error
+        check("files", len(values.get("files", ())), "The manifest", BundleError)
+        values["spec"] = PolicySpec.from_dict(values["spec"])
+        values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
+        values["program"] = program_from(values.get("program", []))
+        values["build"] = _build_record(values.get("build", ()))
+        values["findings"] = _findings(values.get("findings", ()))
+        values["files"] = {path: _record(path, record) for path, record in values.get("files", {}).items()}
+        for part, globs in values.get("parts", {}).items():
+            for glob in listed(globs, f"The part '{part}' of the manifest", BundleError):
+                text(glob, f"A glob of the part '{part}'", BundleError)
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -214,16 +210,15 @@ def program_from(data: Any) -> tuple[ProgramStep, ...]:
     Raises:
         SpecError: for anything but a list of mappings with ``graph``, ``feeds`` and ``gives``.
     """
-    known = [item.name for item in fields(ProgramStep)]
+    words = [item.name for item in fields(ProgramStep)]
     if not isinstance(data, list | tuple):
         raise SpecError(f"The program must be a list of steps; got {type(data).__name__}.")
+    check("steps", len(data), "The program", SpecError)
     steps = []
     for number, entry in enumerate(data):
         if not isinstance(entry, Mapping) or not {"graph", "feeds", "gives"} <= set(entry):
-            raise SpecError(f"Step {number} of the program needs 'graph', 'feeds' and 'gives'; got {entry!r}.")
-        for key in entry:
-            if key not in known:
-                raise SpecError(f"Step {number} of the program has the unknown key '{key}'; {nearest(key, known)}.")
+            raise SpecError(f"Step {number} of the program needs 'graph', 'feeds' and 'gives'; got {shown(entry)}.")
+        known(entry, words, f"Step {number} of the program", SpecError)
         steps.append(ProgramStep(**entry))
     return tuple(steps)
 
@@ -242,6 +237,10 @@ def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: P
         SpecError: naming the step and the value.
     """
     graph_names = list(graphs)
+    program = tuple(program)
+    check("steps", len(program), "The program", SpecError)
+    check("runs", sum(step.repeat for step in program), "The program", SpecError)
+    check("state_elements", sum(map(drawn_and_kept, program)), "Noise and kept values of the program", SpecError)
     values = {tensor.name for tensor in spec.inputs}
     for number, step in enumerate(program):
         if step.graph not in graph_names:
@@ -261,21 +260,75 @@ def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: P
             raise SpecError(f"No step of the program gives the output '{tensor.name}'; {nearest(tensor.name, values)}.")
 
 
-def _check_schema(schema: Any) -> None:
-    if not isinstance(schema, int) or schema < 1:
-        raise BundleError(f"The manifest has the schema {schema!r}; this vlatool reads 1 to {SCHEMA}.")
+def check_files(manifest: Manifest) -> None:
+    """Check that every file which the manifest names has a record: golden file, statistics and tokenizers.
+
+    Raises:
+        BundleError: naming the first that has none.
+    """
+    named = {manifest.golden: "the golden file"} if manifest.golden else {}
+    for tensor in (*manifest.spec.inputs, *manifest.spec.outputs) if manifest.graphs else ():
+        for file in tensor.assets():
+            named[f"assets/{file}"] = f"which '{tensor.name}' needs"
+    for path, what in named.items():
+        if path not in manifest.files:
+            raise BundleError(f"The manifest names {path}, {what}, but records no hash for it.", "export it again")
+
+
+def check_schema(schema: Any) -> None:
+    """Check the version of a manifest.
+
+    Raises:
+        BundleError: when it is newer than this vlatool, or none.
+    """
+    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
+        raise BundleError(f"The manifest has the schema {shown(schema)}; this vlatool reads 1 to {SCHEMA}.")
     if schema > SCHEMA:
         raise BundleError(
-            f"The bundle has the manifest schema {schema}; this vlatool reads up to {SCHEMA}.", "upgrade vlatool"
+            f"The bundle has the manifest schema {shown(schema)}; this vlatool reads up to {SCHEMA}.",
+            "upgrade vlatool",
         )
 
 
-def _inside(path: str) -> None:
+def _check_type(name: str, value: Any, item: Any) -> None:
+    """Hold a value against the type that its field has by default: text, a mapping or a list."""
+    where = f"The manifest's '{name}'"
+    if name in ("spec", "schema"):
+        return
+    if name == "golden_tolerance":
+        if finite(value, where, BundleError) < 0:
+            raise BundleError(f"{where} is {shown(value)}; allowed: a number from 0.")
+        return
+    if item.default == "" or (item.default is MISSING and item.default_factory is MISSING):
+        text(value, where, BundleError, empty=item.default == "")
+    elif item.default_factory is dict:
+        mapping(value, where, BundleError)
+    elif name != "program":
+        listed(value, where, BundleError)
+
+
+def _graph(name: str, data: Any) -> Graph:
+    values = mapping(data, f"The graph '{name}'", BundleError)
+    known(values, [item.name for item in fields(Graph)], f"The graph '{name}'", BundleError)
+    if "file" not in values:
+        raise BundleError(f"The graph '{name}' has no 'file'.", "export the policy again")
+    return Graph(**values)
+
+
+def _record(path: str, data: Any) -> FileRecord:
+    values = mapping(data, f"The record of {shown(path)}", BundleError)
+    known(values, ("sha256", "bytes"), f"The record of {shown(path)}", BundleError)
+    digest = values.get("sha256")
+    if not isinstance(digest, str) or not SHA256.fullmatch(digest):
+        raise BundleError(f"The record of {shown(path)} has the SHA-256 {shown(digest)}; it must be 64 hex digits.")
+    return FileRecord(digest, whole(values.get("bytes"), f"The size of {shown(path)}", BundleError))
+
+
+def _inside(path: Any) -> None:
     if not isinstance(path, str):
-        raise BundleError(f"The manifest names the file {path!r} in graphs or files; a file is text.")
-    pure = PurePosixPath(path)
-    if pure.is_absolute() or ".." in pure.parts or not path:
-        raise BundleError(f"The manifest names the file '{path}', which is not inside the bundle.")
+        raise BundleError(f"The manifest names the file {shown(path)} in graphs or files; a file is text.")
+    if reason := outside(path):
+        raise BundleError(f"The manifest names the file {shown(path)}, which is not inside the bundle: {reason}.")
 
 
 def _findings(data: Any) -> tuple[dict[str, Any], ...]:
@@ -288,7 +341,8 @@ def _findings(data: Any) -> tuple[dict[str, Any], ...]:
 
 
 def _build_record(data: Any) -> tuple[dict[str, Any], ...]:
-    if not isinstance(data, list | tuple) or not all(isinstance(item, Mapping) and "stage" in item for item in data):
+    named = all(isinstance(item, Mapping) and isinstance(item.get("stage"), str) for item in data)
+    if not isinstance(data, list | tuple) or not named:
         raise BundleError("The manifest has a malformed 'build'; it must be a list of mappings that name a stage.")
     return tuple(dict(item) for item in data)
 

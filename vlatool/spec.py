@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from vlatool.errors import SpecError, nearest
+from vlatool.limits import check
+from vlatool.typed import finite, known, mapping, outside, shown, text, whole
 
 DTYPES = ("float32", "float16", "int64", "int32", "uint8", "bool")
 KINDS = ("tensor", "text", "discrete")
@@ -56,29 +58,40 @@ class TensorSpec:
                 f"'{self.name}' is normalised by {self.normalisation}, but 'statistics' is '{self.statistics}'.",
                 "name the statistics as FILE#KEY, for example statistics.json#proprio",
             )
+        for file in self.assets():
+            if reason := outside(file):
+                raise SpecError(
+                    f"'{self.name}' names the file {shown(file)}: {reason}.",
+                    "statistics and tokenizers lie in the policy's folder; name them relative to it",
+                )
 
     def _check_words(self) -> None:
-        if not self.name or not isinstance(self.name, str):
-            raise SpecError(f"A tensor needs a name; got {self.name!r}.")
+        text(self.name, "The name of a tensor", SpecError, empty=False)
         for field in ("statistics", "tokenizer"):
-            if not isinstance(getattr(self, field), str):
-                raise SpecError(f"'{self.name}' has {field} {getattr(self, field)!r}; it must be text.")
+            text(getattr(self, field), f"The {field} of '{self.name}'", SpecError)
         if not isinstance(self.labels, tuple) or not isinstance(self.unit, str | tuple):
-            raise SpecError(f"'{self.name}' has labels {self.labels!r} and unit {self.unit!r}; labels must be a list.")
-        if not isinstance(self.max_tokens, int):
-            raise SpecError(f"'{self.name}' has max_tokens {self.max_tokens!r}; it must be a whole number.")
+            got = f"labels {shown(self.labels)} and unit {shown(self.unit)}"
+            raise SpecError(f"'{self.name}' has {got}; labels must be a list.")
+        for word in (*self.labels, *(self.unit if isinstance(self.unit, tuple) else (self.unit,))):
+            text(word, f"A label or unit of '{self.name}'", SpecError)
+        whole(self.max_tokens, f"The max_tokens of '{self.name}'", SpecError)
+        check("tokens", self.max_tokens, f"'{self.name}'", SpecError)
         allowed = {"dtype": DTYPES, "kind": KINDS, "normalisation": NORMALISATIONS, "mode": MODES}
         for field, values in allowed.items():
             got = getattr(self, field)
             if got not in values:
-                raise SpecError(f"'{self.name}' has {field} '{got}'; {nearest(str(got), [v for v in values if v])}.")
+                told = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
+                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {told}.")
 
     def _check_shape(self) -> None:
         for axis in self.shape:
             if isinstance(axis, bool) or not isinstance(axis, int | str) or (isinstance(axis, int) and axis < 1):
                 raise SpecError(
-                    f"'{self.name}' has the shape {list(self.shape)}; each axis is a whole number from 1 or a name."
+                    f"'{self.name}' has the shape {shown(self.shape)}; each axis is a whole number from 1 or a name."
                 )
+            if isinstance(axis, str):
+                text(axis, f"An axis of '{self.name}'", SpecError, empty=False)
+        check("elements", self.elements, f"'{self.name}'", SpecError)
         width = self.width
         for field in ("labels", "unit"):
             value = getattr(self, field)
@@ -93,6 +106,11 @@ class TensorSpec:
             )
         if self.kind == "discrete" and not self.labels:
             raise SpecError(f"The discrete output '{self.name}' needs 'labels', one for each action.")
+
+    def assets(self) -> list[str]:
+        """Return the files, relative to the assets, that this tensor needs."""
+        file = self.statistics.partition("#")[0]
+        return [*([file] if self.statistics else []), *([self.tokenizer] if self.tokenizer else [])]
 
     @property
     def width(self) -> int:
@@ -116,7 +134,7 @@ class TensorSpec:
         Raises:
             SpecError: for an unknown key or an impossible value.
         """
-        values = _known_only(cls, data, f"tensor '{data.get('name', '?') if isinstance(data, Mapping) else data}'")
+        values = _known_only(cls, data, f"tensor {shown(data.get('name', '?') if isinstance(data, Mapping) else data)}")
         if values.get("kind") == "text":
             values.setdefault("dtype", "int64")
             values.setdefault("shape", [1, values.get("max_tokens", 1)])
@@ -124,7 +142,7 @@ class TensorSpec:
             if isinstance(values.get(key), list):
                 values[key] = tuple(values[key])
         if "name" not in values or not isinstance(values.get("shape"), tuple):
-            raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {dict(data)}.")
+            raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {shown(values.get('shape'))}.")
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -153,17 +171,18 @@ class PolicySpec:
     def __post_init__(self) -> None:
         if not self.inputs or not self.outputs:
             raise SpecError("A policy needs at least one input and one output.")
+        check("tensors", len(self.inputs) + len(self.outputs), "The spec", SpecError)
         names = [tensor.name for tensor in (*self.inputs, *self.outputs)]
         for name in names:
             if names.count(name) > 1:
                 raise SpecError(
                     f"The name '{name}' occurs {names.count(name)} times; each input and output needs its own."
                 )
-        number = isinstance(self.control_hz, int | float) and not isinstance(self.control_hz, bool)
-        if not number or not 0 < self.control_hz < 1e5:
-            raise SpecError(f"control_hz is {self.control_hz!r}; allowed: a rate in Hz above 0.")
-        whole = isinstance(self.chunk, int) and isinstance(self.execute, int)
-        if not whole or self.chunk < 1 or not 0 <= self.execute <= self.chunk:
+        if not 0 < finite(self.control_hz, "control_hz", SpecError) < 1e5:
+            raise SpecError(f"control_hz is {shown(self.control_hz)}; allowed: a rate in Hz above 0.")
+        whole(self.chunk, "chunk", SpecError, 1)
+        check("elements", self.chunk, "chunk", SpecError)
+        if whole(self.execute, "execute", SpecError) > self.chunk:
             raise SpecError(f"chunk is {self.chunk!r} and execute {self.execute!r}; allowed: 1 <= execute <= chunk.")
 
     @property
@@ -192,7 +211,7 @@ class PolicySpec:
         for key in ("inputs", "outputs"):
             listed = values.get(key)
             if not isinstance(listed, list | tuple):
-                raise SpecError(f"The spec needs '{key}', a list of tensors; got {listed!r}.")
+                raise SpecError(f"The spec needs '{key}', a list of tensors; got {shown(listed)}.")
             values[key] = tuple(TensorSpec.from_dict(item) for item in listed)
         if "control_hz" not in values:
             raise SpecError("The spec needs 'control_hz', the rate of the control loop in Hz.")
@@ -209,11 +228,8 @@ class PolicySpec:
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
     if not isinstance(data, Mapping):
         raise SpecError(f"The {where} must be a mapping; got {type(data).__name__}.")
-    known = [field.name for field in fields(cls)]
-    for key in data:
-        if key not in known:
-            raise SpecError(f"The {where} has the unknown key '{key}'; {nearest(str(key), known)}.")
-    return dict(data)
+    known(data, [field.name for field in fields(cls)], f"The {where}", SpecError)
+    return mapping(data, f"The {where}", SpecError)
 
 
 def _plain(value: Any) -> dict[str, Any]:

@@ -191,7 +191,7 @@ def large(tmp_path: Path) -> Bundle:
 def test_the_result_comes_back_with_what_the_target_is_and_not_who(there, bundle, large):
     found = there.measure(bundle, large, bundle)
     assert found["hashes"] == [bundle.hash, large.hash, bundle.hash]
-    assert found["files"][1] == ["empty", "graphs/main.onnx", "manifest.json"]
+    assert found["files"][1] == ["empty", "graphs/main.onnx", "manifest.json", "manifest.sha256"]
     assert found["names"] == ["my_bundle", "large", "my_bundle"]
     assert found["private"] == "0o700"
     assert "and one on standard error" in found["log"]

@@ -81,7 +81,9 @@ def test_a_wrong_width(tmp_path: Path, row):
         load(tmp_path, "mean_std", {"state": {"mean": row, "std": [1, 1]}})
 
 
-@pytest.mark.parametrize("row", [["a", "b"], [[1], [2, 3]], {"x": 1}])
+@pytest.mark.parametrize(
+    "row", [["a", "b"], ["1", "2"], [True, False], True, "12", [10**400, 1], [[1], [2, 3]], {"x": 1}]
+)
 def test_what_is_no_list_of_numbers(tmp_path: Path, row):
     with pytest.raises(SpecError, match="is not a list of numbers"):
         load(tmp_path, "mean_std", {"state": {"mean": row, "std": [1, 1]}})
@@ -105,3 +107,33 @@ def test_a_value_that_is_not_finite(tmp_path: Path, value):
 def test_no_spread_is_refused_with_the_element(tmp_path: Path, normalisation, change):
     with pytest.raises(SpecError, match=r"'state' have no spread in the elements \[1\]"):
         load(tmp_path, normalisation, {"state": {**ROWS, **change}})
+
+
+@pytest.mark.parametrize("value", [1e300, 10**39])
+def test_a_value_beyond_float32_is_not_finite(tmp_path: Path, value):
+    with pytest.raises(SpecError, match=r"'std' of 'state'.*not finite"):
+        load(tmp_path, "mean_std", {"state": {"mean": [0, 0], "std": [1, value]}})
+
+
+def test_a_range_beyond_float32_is_refused(tmp_path: Path):
+    with pytest.raises(SpecError, match="'state' span more than float32 holds"):
+        load(tmp_path, "min_max", {"state": {"min": [-3e38, 0], "max": [3e38, 1]}})
+
+
+def test_a_bomb_is_not_read(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "statistics_bytes=100")
+    with pytest.raises(SpecError, match="the limit 'statistics_bytes' allows 100"):
+        load(tmp_path, "mean_std", {"state": ROWS, "more": list(range(100))})
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"state": 1, "state": 2}'])
+def test_what_python_cannot_parse_is_no_traceback(tmp_path: Path, text):
+    with pytest.raises(SpecError, match="is not valid JSON"):
+        load(tmp_path, "mean_std", text)
+
+
+def test_a_link_is_not_followed(tmp_path: Path):
+    (tmp_path / "other.json").write_text(json.dumps({"state": ROWS}))
+    (tmp_path / "link.json").symlink_to(tmp_path / "other.json")
+    with pytest.raises(SpecError, match="'state' are missing"):
+        load(tmp_path, "mean_std", where="link.json#state")

@@ -1,11 +1,13 @@
+import contextlib
 import json
+import random
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vlatool.errors import SpecError
+from vlatool.errors import DataError, SpecError
 from vlatool.runtime.tokenizer import Tokenizer
 
 WORDS = {"kind": "words", "pad": 0, "unknown": 1, "words": {"go": 2, "to": 3, "ball": 4}}
@@ -128,3 +130,56 @@ def test_ids_of_a_vocabulary_are_whole_numbers(tmp_path: Path):
 def test_a_missing_file(tmp_path: Path):
     with pytest.raises(SpecError, match=r"'instruction' cannot be read: .*absent.json \(No such file"):
         Tokenizer(tmp_path / "absent.json", 4, "instruction")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("[" * 100_000, "too deep inside each other"),
+        ('{"kind": "words", "kind": "words"}', "'kind' occurs twice"),
+        ({**WORDS, "pad": True}, "'pad' and 'unknown'"),
+        ({**WORDS, "unknown": 2**64}, "'pad' and 'unknown'"),
+        ({**WORDS, "words": {"go": True}}, "'words'"),
+        ({**WORDS, "words": {"go": 2**80}}, "'words'"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_a_damaged_vocabulary_is_a_spec_error_and_no_traceback(tmp_path: Path, data, message):
+    with pytest.raises(SpecError, match=message):
+        tokenizer(tmp_path, data)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"\x80", b""])
+def test_bytes_that_are_no_text(content):
+    with pytest.raises(SpecError, match=r"tokenizer of 'say' is not valid JSON|words.json of 'say' is not valid JSON"):
+        Tokenizer(Path("words.json"), 4, "say", content)
+
+
+def test_a_bomb_is_not_read(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "tokenizer_bytes=1000")
+    with pytest.raises(SpecError, match="the limit 'tokenizer_bytes' allows 1000"):
+        tokenizer(tmp_path, {**WORDS, "words": {str(number): number for number in range(1000)}})
+
+
+def test_a_link_is_not_followed(tmp_path: Path):
+    (tmp_path / "words.json").write_text(json.dumps(WORDS))
+    (tmp_path / "link.json").symlink_to(tmp_path / "words.json")
+    with pytest.raises(SpecError, match="'say' cannot be read"):
+        Tokenizer(tmp_path / "link.json", 4, "say")
+
+
+def test_text_that_the_library_refuses_is_a_data_error(tmp_path: Path):
+    tokenize = tokenizer(tmp_path, LIBRARY)
+    with pytest.raises(DataError, match="The instruction cannot be turned into tokens"):
+        tokenize("half of a character: \ud800")
+
+
+def test_whatever_is_changed_in_a_file_of_the_library_it_is_a_spec_error(tmp_path: Path):
+    chance = random.Random(0)
+    original = json.dumps(LIBRARY).encode()
+    for _ in range(300):
+        changed = bytearray(original)
+        for _ in range(chance.choice((1, 3))):
+            changed[chance.randrange(len(changed))] ^= 1 << chance.randrange(8)
+        with contextlib.suppress(SpecError):
+            Tokenizer(tmp_path / "t.json", 4, "say", bytes(changed))

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlatool.bundle import MANIFEST, Bundle, manifest_bytes
+from vlatool.bundle import DIGEST, MANIFEST, Bundle, digest_of, manifest_bytes
 from vlatool.errors import BundleError
 
 PIECE = 8 << 20
@@ -138,7 +138,8 @@ def _bundle(bundle: Bundle, folder: str) -> Iterator[Item]:
             )
         yield Item(f"{folder}/{name}", record.bytes, path, sha256=record.sha256)
     content = manifest_bytes(bundle.manifest)
-    yield Item(f"{folder}/{MANIFEST}", len(content), content=content)
+    for name, told in ((MANIFEST, content), (DIGEST, digest_of(content))):
+        yield Item(f"{folder}/{name}", len(told), content=told)
 
 
 def _tar(pieces: Sequence[tuple[str, bytes]]) -> bytes:

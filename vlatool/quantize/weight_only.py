@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from vlatool.bundle import MANIFEST, Bundle, hash_file, manifest_bytes
+from vlatool.bundle import Bundle, hash_file, write_manifest
 from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import BundleError, DataError, require
 from vlatool.finish import SEED, carry_over, finish, history
@@ -216,5 +216,5 @@ def _sealed(bundle: Bundle, out: Path, written: Written, made_by: dict[str, Any]
         source=origin,
         files=dict(sorted(files.items())),
     )
-    (out / MANIFEST).write_bytes(manifest_bytes(manifest))
+    write_manifest(out, manifest)
     return Bundle(out, manifest)

@@ -62,12 +62,14 @@ def load(
     from vlatool.bundle import Bundle
 
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
-    bundle = Bundle.open(path)
+    bundle = Bundle.described(path)
     refuse_findings(bundle, accept)
+    bundle.check_tree()
     if probe:
         from vlatool.runtime.probe import probe as tried
 
         tried(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
+    bundle.verify()
     policy.warm_up(warmup, golden_tolerance, first_run_s)
     return policy

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError
+from vlatool.errors import DataError, SpecError
+from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer
 from vlatool.spec import PolicySpec, TensorSpec
@@ -25,13 +25,13 @@ class ObservationEncoder:
 
     Args:
         spec: The policy's spec.
-        assets: Directory of statistics and tokenizers.
+        assets: Directory of statistics and tokenizers, or the bundle that has them.
 
     Raises:
         SpecError: when statistics or a tokenizer are missing or do not fit.
     """
 
-    def __init__(self, spec: PolicySpec, assets: Path) -> None:
+    def __init__(self, spec: PolicySpec, assets: Assets) -> None:
         self.names = [tensor.name for tensor in spec.inputs]
         self._encoders = [(tensor.name, _encoder(tensor, assets)) for tensor in spec.inputs]
 
@@ -64,7 +64,7 @@ class ObservationEncoder:
         return DataError(f"The observation has no '{name}' (it has: {has}); {takes}")
 
 
-def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
+def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
     if tensor.kind == "text":
         return _text_encoder(tensor, assets)
     dtype = np.dtype(tensor.dtype)
@@ -106,8 +106,13 @@ def _encoder(tensor: TensorSpec, assets: Path) -> Encoder:
     return encode
 
 
-def _text_encoder(tensor: TensorSpec, assets: Path) -> Encoder:
-    tokenizer = Tokenizer(assets / tensor.tokenizer, tensor.max_tokens, tensor.name)
+def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
+    try:
+        content = read_asset(assets, tensor.tokenizer, "tokenizer_bytes")
+    except OSError as error:
+        where = f"{asset_path(assets, tensor.tokenizer)} ({error.strerror})"
+        raise SpecError(f"The tokenizer of '{tensor.name}' cannot be read: {where}.") from error
+    tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content)
 
     def encode(value: Any) -> Array:
         if isinstance(value, str):

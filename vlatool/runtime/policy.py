@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
-import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +14,13 @@ from numpy.typing import NDArray
 
 from vlatool import registry
 from vlatool.bundle import Bundle
-from vlatool.errors import BundleError, DataError, GraphError, UsageError
-from vlatool.manifest import GOLDEN_TOLERANCE
+from vlatool.errors import BundleError, DataError, GraphError, UsageError, nearest
+from vlatool.limits import check
+from vlatool.manifest import GOLDEN_TOLERANCE, check_files
+from vlatool.npz_files import open_npz
+from vlatool.runtime.assets import Assets
 from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, not_finite
+from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
@@ -27,7 +29,10 @@ from vlatool.spec import PolicySpec, TensorSpec
 DEFAULT_ENGINE = "ort_cpu"
 FIRST_RUN_S = 60.0
 """How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
+GOLDEN_STEPS = 2
+"""Golden observations in a row that a program with kept values needs: the first alone does not show what was kept."""
 Array = NDArray[Any]
+Golden = tuple[dict[str, Any], dict[str, Array], Array]
 
 
 class Action(NamedTuple):
@@ -63,8 +68,8 @@ class Policy:
         self.engine = engine
         self.spec: PolicySpec = bundle.manifest.spec
         self.program = program
-        self.encode = ObservationEncoder(self.spec, bundle.path / "assets")
-        self._decode = _Decoder(self.spec, bundle.path / "assets")
+        self.encode = ObservationEncoder(self.spec, bundle)
+        self._decode = _Decoder(self.spec, bundle)
         self._outputs = Outputs(self.spec.outputs, action=False)
         self._sequence = 0
         self._turn = threading.Lock()
@@ -90,8 +95,9 @@ class Policy:
         check_sizes(manifest, limit_mb)
         engine = engine or manifest.engine or DEFAULT_ENGINE
         session = registry.load("engines", engine)
+        check_files(manifest)
         sessions: dict[str, Session] = {
-            name: session(bundle.file(graph.file), threads, graph.compute) for name, graph in manifest.graphs.items()
+            name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()
         }
         check_graphs(manifest, sessions, limit_mb)
         return cls(bundle, Program(manifest.program, sessions, seed), engine)
@@ -176,28 +182,39 @@ class Policy:
                 session.deadline = None
 
     def warm_up(self, inferences: int, tolerance: float | None = None, first_run_s: float = FIRST_RUN_S) -> None:
-        """Run the golden observation, each time ``first_run_s`` at most, and compare the action with the recorded one.
+        """Run the golden observations one after the other, as they were recorded, and compare the actions.
 
         Args:
-            inferences: How often.
+            inferences: At least so many, and each golden observation once; none when 0.
             tolerance: Largest relative L2 difference; the one in the manifest when None.
-            first_run_s: Seconds.
+            first_run_s: Seconds that each may take.
 
         Raises:
-            GraphError: when the difference is larger or not a number, or a run takes longer.
+            BundleError: when a program that keeps values has but one golden step.
+            DataError: when the golden file cannot be read.
+            GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
         if tolerance is None:
             tolerance = self.bundle.manifest.golden_tolerance or GOLDEN_TOLERANCE
-        golden = load_golden(self.bundle)
-        if golden is None:
+        steps = load_goldens(self.bundle)
+        if self.program.keeps and steps and len(steps) < GOLDEN_STEPS:
+            raise BundleError(
+                f"The golden file of {self.bundle.path} has one step; a policy that keeps values needs {GOLDEN_STEPS}.",
+                "export the policy again",
+            )
+        if not steps or not inferences:
             return
-        observation, noise, expected = golden
-        for _ in range(inferences):
+        errors = []
+        for number in range(max(inferences, len(steps))):
+            observation, noise, expected = steps[number % len(steps)]
+            if not number % len(steps):
+                self.reset()
             with self.stopped_after(first_run_s):
                 got = self.infer(observation, noise=noise).outputs[self.spec.action.name]
-            self.golden_error = relative_error(got, expected)
-            self.reset()
-        if inferences and not (self.golden_error or 0.0) <= tolerance:
+            errors.append(relative_error(got, expected))
+        self.reset()
+        self.golden_error = next(filter(math.isnan, errors), max(errors))
+        if not self.golden_error <= tolerance:
             raise GraphError(
                 f"This machine computes another golden action than recorded: relative error {self.golden_error:.3g}, "
                 f"allowed {tolerance:g}.",
@@ -227,7 +244,7 @@ def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
 class _Decoder:
     """The action output -> a chunk in physical units, or indices of discrete actions."""
 
-    def __init__(self, spec: PolicySpec, assets: Path) -> None:
+    def __init__(self, spec: PolicySpec, assets: Assets) -> None:
         self.tensor: TensorSpec = spec.action
         self.normaliser: Normaliser | None = load_normaliser(spec.action, assets)
         self._floating = np.dtype(spec.action.dtype).kind == "f"
@@ -248,26 +265,55 @@ class _Decoder:
         return physical.reshape(-1, physical.shape[-1]), tensor.labels
 
 
-def load_golden(bundle: Bundle) -> tuple[dict[str, Any], dict[str, Array], Array] | None:
+def load_golden(bundle: Bundle) -> Golden | None:
     """Return the first golden (observation, noise, raw action output), or None when the bundle has none.
 
     Raises:
-        DataError: when the file cannot be read.
+        BundleError: when the file is not the one that the manifest records.
+        DataError: when the file cannot be read or does not fit the spec.
     """
-    if not bundle.manifest.golden:
-        return None
-    path = bundle.file(bundle.manifest.golden)
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
-            observation = {tensor.name: stored[f"in.{tensor.name}"][0] for tensor in bundle.manifest.spec.inputs}
-            noise = {key[6:]: stored[key][0] for key in stored.files if key.startswith("noise.")}
-            return observation, noise, stored[f"out.{bundle.manifest.spec.action.name}"][0]
-    except (ValueError, KeyError, OSError, EOFError, zlib.error, zipfile.BadZipFile) as error:
-        raise DataError(f"The golden file {path} cannot be read: {error}.") from error
+    return next(iter(load_goldens(bundle)), None)
+
+
+def load_goldens(bundle: Bundle) -> list[Golden]:
+    """Return every golden (observation, noise, raw action output), in the order in which they follow a reset.
+
+    Raises:
+        BundleError: when the file is not the one that the manifest records.
+        DataError: when the file cannot be read or does not fit the spec.
+    """
+    name, spec = bundle.manifest.golden, bundle.manifest.spec
+    if not name:
+        return []
+    where = f"The golden file {bundle.path / name}"
+    stored = open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=where)
+    noise = [key for key in stored if key.startswith("noise.")]
+    action = f"out.{spec.action.name}"
+    needed = [*(f"in.{tensor.name}" for tensor in spec.inputs), *noise, action]
+    for key in needed:
+        if key not in stored:
+            raise DataError(f"{where} cannot be read: it has no '{key}'; {nearest(key, stored)}.")
+        numbers = stored[key].dtype.kind in "fiu" or (key not in noise and key != action)
+        if not stored[key].ndim or not len(stored[key]) or not numbers:
+            raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.")
+    counts = {len(stored[key]) for key in needed}
+    if len(counts) > 1:
+        raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.")
+    check("golden_steps", max(counts), where, DataError)
+    return [
+        (
+            {tensor.name: stored[f"in.{tensor.name}"][step] for tensor in spec.inputs},
+            {key.removeprefix("noise."): stored[key][step] for key in noise},
+            stored[action][step],
+        )
+        for step in range(counts.pop())
+    ]
 
 
 def relative_error(got: Array, expected: Array) -> float:
-    """Return ``|got - expected|₂ / |expected|₂`` (the absolute norm when expected is zero)."""
+    """Return ``|got - expected|₂ / |expected|₂`` (the absolute norm when that is zero); infinite for other sizes."""
     wide = np.asarray(expected, np.float64).reshape(-1)
-    distance = float(np.linalg.norm(np.asarray(got, np.float64).reshape(-1) - wide))
-    return distance / (float(np.linalg.norm(wide)) or 1.0)
+    flat = np.asarray(got, np.float64).reshape(-1)
+    if flat.shape != wide.shape:
+        return math.inf
+    return float(np.linalg.norm(flat - wide)) / (float(np.linalg.norm(wide)) or 1.0)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import functools
-import json
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import SpecError, nearest
+from vlatool.json_files import read_json
+from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.spec import STATISTICS_OF, TensorSpec
 
 Array = NDArray[np.float32]
@@ -62,7 +62,7 @@ class Normaliser:
         return found
 
 
-def load_normaliser(tensor: TensorSpec, assets: Path) -> Normaliser | None:
+def load_normaliser(tensor: TensorSpec, assets: Assets) -> Normaliser | None:
     """Return the normaliser of a tensor, or None when its spec says ``normalisation: none``.
 
     Raises:
@@ -73,25 +73,27 @@ def load_normaliser(tensor: TensorSpec, assets: Path) -> Normaliser | None:
     first, second = STATISTICS_OF[tensor.normalisation]
     low = _row(tensor, assets, first)
     high = _row(tensor, assets, second)
-    offset, scale = (low, high) if first == "mean" else ((low + high) / 2, (high - low) / 2)
+    with np.errstate(over="ignore"):
+        offset, scale = (low, high) if first == "mean" else ((low + high) / 2, (high - low) / 2)
     if not np.all(scale > 0):
         raise SpecError(
             f"The statistics of '{tensor.name}' have no spread in the elements {np.flatnonzero(scale <= 0).tolist()}.",
             "give those elements a positive std (or a wider range)",
         )
+    if not np.isfinite([offset, scale]).all():
+        raise SpecError(f"The statistics of '{tensor.name}' span more than float32 holds.", "repair the statistics")
     return Normaliser(offset.astype(np.float32), scale.astype(np.float32))
 
 
-def _row(tensor: TensorSpec, assets: Path, key: str) -> Array:
+def _row(tensor: TensorSpec, assets: Assets, key: str) -> Array:
     file, _, entry = tensor.statistics.partition("#")
-    path = assets / file
+    path = asset_path(assets, file)
     fix = "normalisation is never skipped in silence: put the training statistics into the policy's folder"
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        content = read_asset(assets, file, "statistics_bytes")
     except OSError as error:
         raise SpecError(f"The statistics of '{tensor.name}' are missing: {path} ({error.strerror}).", fix) from error
-    except ValueError as error:
-        raise SpecError(f"The statistics of '{tensor.name}' are not valid JSON: {path}: {error}.", fix) from error
+    table = read_json(content, f"The file {path} with the statistics of '{tensor.name}'", SpecError, fix)
     if not isinstance(table, dict) or entry not in table:
         known = table if isinstance(table, dict) else ()
         raise SpecError(f"{path} has no statistics '{entry}' for '{tensor.name}'; {nearest(entry, known)}.", fix)
@@ -102,11 +104,20 @@ def _row(tensor: TensorSpec, assets: Path, key: str) -> Array:
 
 def _checked(values: object, tensor: TensorSpec, where: str) -> Array:
     try:
-        row = np.asarray(values, np.float32)
-    except (TypeError, ValueError) as error:
+        if not _numbers(values):
+            raise ValueError
+        with np.errstate(all="ignore"):
+            row = np.asarray(values, np.float32)
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise SpecError(f"{where} is not a list of numbers.") from error
     if row.shape != (tensor.width,):
         raise SpecError(f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {tensor.width} elements.")
     if not np.all(np.isfinite(row)):
         raise SpecError(f"{where} has values that are not finite.")
     return row
+
+
+def _numbers(values: object) -> bool:
+    """Say whether a value may be numbers or lists of them: text and truth values would become numbers, too."""
+    inner = values if isinstance(values, list) else [values]
+    return not any(isinstance(item, str | bool | dict) for item in inner)

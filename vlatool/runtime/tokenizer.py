@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import SpecError, require
+from vlatool.errors import DataError, SpecError, VlatoolError, require
+from vlatool.json_files import read_json
+from vlatool.runtime.assets import read_asset
 
 Encode = Callable[[str], list[int]]
 
@@ -24,6 +26,7 @@ class Tokenizer:
             ``{"kind": "words", "pad": 0, "unknown": 1, "words": {"go": 2}}`` (lower case, split at white space).
         max_tokens: Width that ids are padded or cut to.
         name: The input's name, for messages.
+        content: What the file holds; it is read from ``path`` when None.
 
     Raises:
         SpecError: when the file is missing or is neither of the two.
@@ -31,15 +34,18 @@ class Tokenizer:
 
     remembered = 64
 
-    def __init__(self, path: Path, max_tokens: int, name: str) -> None:
+    def __init__(self, path: Path, max_tokens: int, name: str, content: bytes | None = None) -> None:
         self.max_tokens = max_tokens
         self.name = name
         self._cache: dict[str, NDArray[np.int64]] = {}
-        data = _read(path, name)
+        content = _content(path, name) if content is None else content
+        data = read_json(content, f"The tokenizer {path} of '{name}'", SpecError)
+        if not isinstance(data, dict):
+            raise SpecError(f"The tokenizer of '{name}' must be a mapping: {path}.")
         if data.get("kind") == "words":
             self.pad, self._encode = _words(data, path, name)
         elif "model" in data:
-            self.pad, self._encode = _library(path)
+            self.pad, self._encode = _library(content, path, name)
         else:
             raise SpecError(
                 f"{path} is no tokenizer: it has neither 'model' (tokenizers library) nor kind 'words' (vocabulary)."
@@ -66,47 +72,58 @@ class Tokenizer:
         return row
 
 
-def _read(path: Path, name: str) -> dict[str, Any]:
+def _content(path: Path, name: str) -> bytes:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        return read_asset(path.parent, path.name, "tokenizer_bytes")
     except OSError as error:
         raise SpecError(f"The tokenizer of '{name}' cannot be read: {path} ({error.strerror}).") from error
-    except ValueError as error:
-        raise SpecError(f"The tokenizer of '{name}' is not valid JSON: {path}: {error}.") from error
-    if not isinstance(data, dict):
-        raise SpecError(f"The tokenizer of '{name}' must be a mapping: {path}.")
-    return data
 
 
 def _words(data: dict[str, Any], path: Path, name: str) -> tuple[int, Encode]:
     words, pad, unknown = data.get("words"), data.get("pad"), data.get("unknown")
-    ids = isinstance(words, dict) and all(isinstance(number, int) for number in words.values())
-    if not isinstance(words, dict) or not ids or not isinstance(pad, int) or not isinstance(unknown, int):
+    if not isinstance(words, dict) or not all(map(_is_id, words.values())) or not _is_id(pad) or not _is_id(unknown):
         raise SpecError(f"The vocabulary {path} needs 'words' (a mapping), 'pad' and 'unknown' (ids).")
+    ids: dict[str, int] = words
+    other, filler = int(str(unknown)), int(str(pad))
 
     def encode(text: str) -> list[int]:
         parts = text.lower().split()
-        strange = [part for part in parts if part not in words]
+        strange = [part for part in parts if part not in ids]
         if strange:
             warnings.warn(
                 f"the {name} has words that the policy was not trained on: {', '.join(strange)}", stacklevel=5
             )
-        return [words.get(part, unknown) for part in parts]
+        return [ids.get(part, other) for part in parts]
+
+    return filler, encode
+
+
+def _is_id(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
+
+
+def _library(content: bytes, path: Path, name: str) -> tuple[int, Encode]:
+    library = require("tokenizers", "text")
+    with _foreign(SpecError, f"{path} is no file of the tokenizers library"):
+        tokenizer = library.Tokenizer.from_buffer(content)
+        tokenizer.no_truncation()
+        padding = tokenizer.padding or {}
+        tokenizer.no_padding()
+        pad = int(padding.get("pad_id", 0))
+
+    def encode(text: str) -> list[int]:
+        with _foreign(DataError, f"The {name} cannot be turned into tokens"):
+            return list(tokenizer.encode(text).ids)
 
     return pad, encode
 
 
-def _library(path: Path) -> tuple[int, Encode]:
-    library = require("tokenizers", "text")
+@contextlib.contextmanager
+def _foreign(error: type[VlatoolError], what: str) -> Iterator[None]:
+    """The seam: the library raises plain Exception, and where it panics, something that is not even that."""
     try:
-        tokenizer = library.Tokenizer.from_file(str(path))
-    except Exception as error:  # the seam: the library raises plain Exception
-        raise SpecError(f"{path} is no file of the tokenizers library: {error}.") from error
-    tokenizer.no_truncation()
-    padding = tokenizer.padding or {}
-    tokenizer.no_padding()
-
-    def encode(text: str) -> list[int]:
-        return list(tokenizer.encode(text).ids)
-
-    return int(padding.get("pad_id", 0)), encode
+        yield
+    except BaseException as foreign:
+        if isinstance(foreign, Exception) or type(foreign).__name__ == "PanicException":
+            raise error(f"{what}: {str(foreign)[:300]}.") from foreign
+        raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import io
 import os
 import time
 from collections.abc import Mapping
@@ -29,18 +30,22 @@ class OpenvinoSession:
         path: The ONNX file; external data is found beside it.
         threads: Threads; the cores that this process may use when None.
         compute: Dtype of what is not quantized: ``float32`` (also when empty) or ``bfloat16``.
+        opened: What is opened in the place of ``path``: the content of the file, or another name of it.
 
     Raises:
         GraphError: when OpenVINO refuses the file or computes in another dtype than it was told to.
         MissingExtra: when openvino is not installed.
     """
 
-    def __init__(self, path: Path, threads: int | None = None, compute: str = "") -> None:
+    def __init__(
+        self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
+    ) -> None:
         openvino = require("openvino", "openvino")
         settings = settings_for(threads, compute)
         try:
             core = openvino.Core()
-            model = core.read_model(str(path))
+            wanted = path if opened is None else opened
+            model = core.read_model(io.BytesIO(wanted) if isinstance(wanted, bytes) else str(wanted))
             self._compiled = core.compile_model(model, DEVICE, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours

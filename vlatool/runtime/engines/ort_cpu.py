@@ -39,6 +39,7 @@ class OrtCpuSession:
         path: The ONNX file; external data is found beside it.
         threads: Intra-op threads; the cores that this process may use when None.
         compute: ``float32`` or empty.
+        opened: What is opened in the place of ``path``: the content of the file, or another name of it.
 
     Raises:
         GraphError: when ONNX Runtime refuses the file, opened it on another provider, or shall compute in another
@@ -49,7 +50,9 @@ class OrtCpuSession:
     optimized: ClassVar[bool] = True
     """Whether ONNX Runtime may rewrite the graph."""
 
-    def __init__(self, path: Path, threads: int | None = None, compute: str = "") -> None:
+    def __init__(
+        self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
+    ) -> None:
         ort = require("onnxruntime", "ort")
         if compute not in ("", "float32"):
             raise GraphError(f"ONNX Runtime on the CPU does not compute in {compute}.", "use the engine openvino")
@@ -60,7 +63,7 @@ class OrtCpuSession:
         if not self.optimized:
             options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         try:
-            self._session = _open(ort, path, options)
+            self._session = _open(ort, path if opened is None else opened, options)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
             raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}") from error
         self._session.disable_fallback()
@@ -187,19 +190,27 @@ def _buffer(node: Any) -> Array | None:
     return np.zeros(node.shape, dtype)
 
 
-def _open(ort: Any, path: Path, options: Any) -> Any:
+def _open(ort: Any, model: Path | bytes, options: Any) -> Any:
     """Open a session; without the rewriting of QDQ pairs where that breaks the graph.
 
     ONNX Runtime (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such
     type. The first error is the one that is told.
     """
     try:
-        return ort.InferenceSession(str(path), options, providers=[PROVIDER], enable_fallback=0)
+        return _session(ort, model, options)
     except Exception:
         options.add_session_config_entry("session.disable_quant_qdq", "1")
         with contextlib.suppress(Exception):
-            return ort.InferenceSession(str(path), options, providers=[PROVIDER], enable_fallback=0)
+            return _session(ort, model, options)
         raise
+
+
+def _session(ort: Any, model: Path | bytes, options: Any) -> Any:
+    wanted = model if isinstance(model, bytes) else str(model)
+    session = ort.InferenceSession(wanted, options, providers=[PROVIDER], enable_fallback=0)
+    if getattr(session, "_model_bytes", None):
+        session._model_bytes = b""  # Python's wrapper would keep the whole content for a fallback, which is off
+    return session
 
 
 def _first_line(error: Exception) -> str:

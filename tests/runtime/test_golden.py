@@ -1,0 +1,134 @@
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper
+
+from vlatool.bundle import Bundle, seal
+from vlatool.errors import BundleError, DataError, GraphError
+from vlatool.finish import GOLDEN, save_npz, write_golden
+from vlatool.manifest import Graph, Manifest, ProgramStep
+from vlatool.npz_files import open_npz
+from vlatool.runtime import load
+from vlatool.runtime.policy import load_golden, load_goldens, relative_error
+from vlatool.spec import PolicySpec, TensorSpec
+
+SPEC = PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0)
+STEP = ProgramStep("main", {"x": "x", "m": "memory"}, {"y": "y", "n": "memory"}, keep={"memory": {"shape": [1, 2]}})
+OBSERVATIONS = [{"x": np.array([1, 2], np.float32)}, {"x": np.array([1, -1], np.float32)}]
+
+
+def recurrent(folder: Path) -> Bundle:
+    """``y = memory + x``, and the memory becomes ``y``."""
+    (folder / "graphs").mkdir(parents=True)
+    value = helper.make_tensor_value_info
+    nodes = [helper.make_node("Add", ["x", "m"], ["y"]), helper.make_node("Identity", ["y"], ["n"])]
+    inputs, outputs = ([value(name, 1, (1, 2)) for name in names] for names in ("xm", "yn"))
+    graph = helper.make_graph(nodes, "m", inputs, outputs)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10)
+    onnx.save(model, folder / "graphs/main.onnx")
+    sealed = seal(folder, Manifest("m", "1", SPEC, program=(STEP,)))
+    return seal(folder, replace(sealed.manifest, graphs={"main": Graph("graphs/main.onnx")}))
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Bundle:
+    draft = recurrent(tmp_path)
+    write_golden(draft, OBSERVATIONS, tmp_path)
+    return seal(tmp_path, replace(draft.manifest, golden=GOLDEN))
+
+
+def rewritten(bundle: Bundle, change: Any) -> Bundle:
+    arrays = open_npz(bundle.path / GOLDEN)
+    change(arrays)
+    save_npz(bundle.path / GOLDEN, arrays)
+    return seal(bundle.path, bundle.manifest)
+
+
+def test_golden_steps_follow_each_other_without_a_reset(bundle):
+    assert [golden[2].tolist() for golden in load_goldens(bundle)] == [[[1, 2]], [[2, 1]]]
+    first = load_golden(bundle)
+    assert first is not None
+    assert first[2].tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize("warmup", [1, 2, 5])
+def test_they_are_replayed_in_the_same_way(bundle, warmup):
+    policy = load(bundle.path, warmup=warmup)
+    assert policy.golden_error == 0.0
+    assert policy.infer(OBSERVATIONS[0]).chunk.tolist() == [[1, 2]]
+
+
+def test_a_policy_whose_state_is_dropped_is_refused(bundle):
+    dropped = replace(STEP, gives={"y": "y"})
+    seal(bundle.path, replace(bundle.manifest, program=(dropped,)))
+    with pytest.raises(GraphError, match="another golden action"):
+        load(bundle.path)
+    noisy = replace(STEP, gives={"y": "y"}, keep={}, noise={"memory": {"shape": [1, 2], "distribution": "zeros"}})
+    seal(bundle.path, replace(bundle.manifest, program=(noisy,)))
+    with pytest.raises(GraphError, match="another golden action"):
+        load(bundle.path)
+
+
+def test_a_program_that_keeps_values_needs_two_golden_steps(bundle):
+    def cut(arrays: dict[str, Any]) -> None:
+        arrays.update({name: array[:1] for name, array in arrays.items()})
+
+    with pytest.raises(BundleError, match="has one step; a policy that keeps values needs 2"):
+        load(rewritten(bundle, cut).path)
+
+
+def test_one_observation_gives_two_golden_steps(tmp_path: Path):
+    draft = recurrent(tmp_path)
+    write_golden(draft, OBSERVATIONS[:1], tmp_path)
+    sealed = seal(tmp_path, replace(draft.manifest, golden=GOLDEN))
+    assert [golden[2].tolist() for golden in load_goldens(sealed)] == [[[1, 2]], [[2, 4]]]
+
+
+def test_a_golden_bomb_is_refused_before_it_is_unpacked(bundle, monkeypatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "golden_bytes=2e6")
+    bomb = rewritten(bundle, lambda arrays: arrays.update(bomb=np.zeros(3_000_000, np.uint8)))
+    assert (bundle.path / GOLDEN).stat().st_size < 10_000
+    with pytest.raises(DataError, match="the limit 'golden_bytes' allows 2000000"):
+        load(bomb.path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"in.x": None}, "it has no 'in.x'"),
+        ({"out.y": None}, "it has no 'out.y'"),
+        ({"out.y": np.array(["a", "b"])}, "no numbers"),
+        ({"out.y": np.zeros((0, 1, 2))}, "no steps"),
+        ({"in.x": np.array(1.0)}, "no steps"),
+        ({"out.y": np.zeros((3, 1, 2))}, r"arrays have \[2, 3\] steps"),
+        ({"in.x": np.zeros((100, 2)), "out.y": np.zeros((100, 1, 2))}, "the limit 'golden_steps'"),
+        ({"in.x": np.zeros((2, 7), np.float32)}, "has the shape"),
+        ({"in.x": np.zeros((2, 2), np.complex64)}, "complex64"),
+        ({"noise.z": np.zeros((2, 2))}, "draws no noise 'z'"),
+        ({"noise.z": np.array(["a", "b"])}, "no numbers"),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else " ".join(value),
+)
+def test_a_golden_file_that_does_not_fit_is_told(bundle, change, message):
+    def changed(arrays: dict[str, Any]) -> None:
+        for name, value in change.items():
+            arrays[name] = value
+            if value is None:
+                del arrays[name]
+
+    with pytest.raises(DataError, match=message):
+        load(rewritten(bundle, changed).path)
+
+
+def test_an_action_of_another_size_is_another_action(bundle):
+    assert relative_error(np.zeros((1, 4)), np.zeros((1, 2))) == np.inf
+
+    def widened(arrays: dict[str, Any]) -> None:
+        arrays["out.y"] = np.zeros((2, 1, 3))
+
+    with pytest.raises(GraphError, match="relative error inf"):
+        load(rewritten(bundle, widened).path)

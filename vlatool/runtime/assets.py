@@ -1,0 +1,43 @@
+"""Files that a spec names (statistics, tokenizers): read from a bundle, verified, or from a folder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from vlatool.bundle import ASSETS, Bundle
+from vlatool.errors import SpecError
+from vlatool.limits import check
+from vlatool.sealed_files import open_regular, read_all
+from vlatool.typed import outside, shown
+
+Assets = Path | Bundle
+"""A folder, or a bundle, of which its ``assets/`` are meant."""
+
+
+def read_asset(assets: Assets, name: str, allowed: str) -> bytes:
+    """Return the content of an asset.
+
+    Args:
+        assets: Where it is.
+        name: Relative path.
+        allowed: Name of the limit on its size.
+
+    Raises:
+        BundleError: when a bundle does not record it, or it is not what the manifest says.
+        SpecError: when it is not inside the folder, or larger than the limit.
+        OSError: when it is not in the folder, or a link.
+    """
+    if isinstance(assets, Bundle):
+        return assets.asset(name, allowed)
+    if reason := outside(name):
+        raise SpecError(f"The spec names the file {shown(name)}: {reason}.")
+    with open_regular(assets, name) as handle:
+        size = os.fstat(handle).st_size
+        check(allowed, size, str(assets / name), SpecError)
+        return read_all(handle, size)
+
+
+def asset_path(assets: Assets, name: str) -> Path:
+    """Return the path of an asset, for messages."""
+    return (assets.path / ASSETS if isinstance(assets, Bundle) else assets) / name

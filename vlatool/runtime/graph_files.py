@@ -1,0 +1,86 @@
+"""A graph of a bundle, opened by an engine as the very bytes that were verified."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle import Bundle
+from vlatool.errors import BundleError
+from vlatool.limits import MIB, check
+from vlatool.manifest import Graph
+from vlatool.runtime.external_data import LOCATION, external_files
+from vlatool.sealed_files import contains, open_inside, read_all
+from vlatool.typed import outside, shown
+
+WHOLE = 64 * MIB
+"""Bytes of a graph up to which the engine gets its content; a larger one would be in the memory twice."""
+
+
+def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None) -> Any:
+    """Return the session of an engine on a graph of a bundle.
+
+    The engine gets the verified content. A graph that is large or has weights beside it is opened by name, in a
+    directory that nothing else can take the place of, and must be the same before and after.
+
+    Args:
+        bundle: Where it is; its files are verified here.
+        graph: Which one.
+        engine: A class of ``vlatool/runtime/engines``.
+        threads: Threads of the engine.
+
+    Raises:
+        BundleError: when a file is not what the manifest says or is changed meanwhile, or the graph keeps weights in a
+            file that the manifest does not record.
+        GraphError: when the engine refuses the graph.
+    """
+    folder, _, name = graph.file.rpartition("/")
+    path = bundle.path / graph.file
+    if _size(bundle, graph.file) <= WHOLE:
+        content = bundle.read(graph.file)
+        if not external_files(content):
+            return engine(path, threads, graph.compute, content)
+        del content
+    with contextlib.ExitStack() as stack:
+        place = stack.enter_context(bundle.held(folder, [graph.file]))
+        beside = _recorded(bundle, graph.file, _beside(place, name))
+        if beside:
+            stack.enter_context(bundle.held(folder, beside))
+        return engine(path, threads, graph.compute, place / name)
+
+
+def _size(bundle: Bundle, file: str) -> int:
+    record = bundle.manifest.files.get(file)
+    return record.bytes if record else 0
+
+
+def _beside(place: Path, name: str) -> set[str]:
+    if not contains(place, name, LOCATION):
+        return set()
+    with open_inside(place, name) as handle:
+        size = os.fstat(handle).st_size
+        check("graph_bytes", size, name, BundleError)
+        return external_files(read_all(handle, size))
+
+
+def _recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
+    """Return the files of a bundle that a graph's locations mean.
+
+    Raises:
+        BundleError: when one is not inside, or not recorded.
+    """
+    folder = file.rpartition("/")[0]
+    found = []
+    for location in sorted(locations):
+        name = f"{folder}/{location}" if folder else location
+        reason = outside(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
+        if reason:
+            raise BundleError(
+                f"The graph {file} of {bundle.path} keeps weights in {shown(location)}: {reason}.",
+                "export the policy again",
+            )
+        found.append(name)
+    return found
