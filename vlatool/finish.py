@@ -100,9 +100,10 @@ def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]
 
 
 def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> None:
-    """Run the first observations and store ``in.NAME``, ``noise.NAME`` and ``out.NAME``, each with a sample axis.
+    """Run the first observations and store ``in.NAME``, ``noise.NAME``, ``out.NAME`` and ``chunk.NAME``.
 
-    They follow each other without a reset between, so that what a program keeps shows in the second.
+    Each has a sample axis. They follow each other without a reset between, so that what a program keeps shows in the
+    second. The chunk is the action in physical units: it shows other statistics, too.
 
     Args:
         draft: The bundle as written so far; its graphs are what runs.
@@ -114,8 +115,9 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     arrays: dict[str, list[Any]] = {}
     for observation in (observations * GOLDEN_COUNT)[:GOLDEN_COUNT]:
         noise = {name: draw(wanted, random) for step in draft.manifest.program for name, wanted in step.noise.items()}
-        outputs = policy.infer(observation, noise=noise).outputs
-        for prefix, values in (("in", observation), ("noise", noise), ("out", outputs)):
+        action = policy.infer(observation, noise=noise)
+        chunk = {draft.manifest.spec.action.name: action.chunk}
+        for prefix, values in (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", chunk)):
             for name, value in values.items():
                 arrays.setdefault(f"{prefix}.{name}", []).append(value)
     (out / GOLDEN).parent.mkdir(exist_ok=True)

@@ -46,7 +46,7 @@ def load(
     from vlatool.bundle import Bundle
 
     bundle = Bundle.described(path)
-    bundle.check_tree()
+    bundle.verify("data/")
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed)
     bundle.verify()
     policy.warm_up(warmup, golden_tolerance)

@@ -14,7 +14,7 @@ from vlatool import registry
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError, GraphError, nearest
 from vlatool.limits import check
-from vlatool.manifest import check_files
+from vlatool.manifest import ProgramStep, check_files
 from vlatool.npz_files import open_npz
 from vlatool.runtime.assets import Assets
 from vlatool.runtime.graph_files import open_graph
@@ -77,6 +77,7 @@ class Policy:
         sessions: dict[str, Session] = {
             name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()
         }
+        _check_names(manifest.program, sessions)
         return cls(bundle, Program(manifest.program, sessions, seed), engine)
 
     def infer(self, observation: Mapping[str, Any], *, noise: Mapping[str, Array] | None = None) -> Action:
@@ -124,13 +125,16 @@ class Policy:
             )
         if not steps or not inferences:
             return
-        errors = []
+        errors: list[float] = []
+        chunks = _golden_chunks(self.bundle, len(steps))
         for number in range(max(inferences, len(steps))):
             observation, noise, expected = steps[number % len(steps)]
             if not number % len(steps):
                 self.reset()
-            got = self.infer(observation, noise=noise).outputs[self.spec.action.name]
-            errors.append(relative_error(got, expected))
+            action = self.infer(observation, noise=noise)
+            errors.append(relative_error(action.outputs[self.spec.action.name], expected))
+            if chunks:
+                errors.append(relative_error(action.chunk, chunks[number % len(steps)]))
         self.reset()
         self.golden_error = next(filter(math.isnan, errors), max(errors))
         if not self.golden_error <= tolerance:
@@ -139,6 +143,17 @@ class Policy:
                 f"allowed {tolerance:g}.",
                 "the engine or processor may lack what this precision needs; run: vlatool doctor",
             )
+
+
+def _check_names(program: tuple[ProgramStep, ...], sessions: Mapping[str, Any]) -> None:
+    """Refuse a program that feeds an input, or takes an output, which its graph does not have."""
+    for number, step in enumerate(program):
+        session = sessions[step.graph]
+        for names, known, what in ((step.feeds, session.inputs, "input"), (step.gives, session.outputs, "output")):
+            for name in names:
+                if name not in known:
+                    told = f"the {what} '{name}', which the graph '{step.graph}' does not have; {nearest(name, known)}"
+                    raise GraphError(f"Step {number} of the program names {told}.")
 
 
 class _Decoder:
@@ -205,6 +220,15 @@ def load_goldens(bundle: Bundle) -> list[Golden]:
         )
         for step in range(counts.pop())
     ]
+
+
+def _golden_chunks(bundle: Bundle, steps: int) -> list[Array]:
+    """Return the recorded actions in physical units; none for indices, and where they were not recorded."""
+    name, action = bundle.manifest.golden, bundle.manifest.spec.action
+    stored = open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=name).get(f"chunk.{action.name}")
+    if stored is None or action.kind == "discrete" or not stored.ndim or stored.dtype.kind not in "fiu":
+        return []
+    return list(stored) if len(stored) == steps else []
 
 
 def relative_error(got: Array, expected: Array) -> float:
