@@ -69,14 +69,17 @@ class Bundle:
         root = Path(path)
         return cls(root, Manifest.from_dict(_read_manifest(root)))
 
-    def verify(self) -> None:
+    def verify(self, prefix: str = "") -> None:
         """Check every file that was not verified by reading it, and that nothing else is there.
+
+        Args:
+            prefix: Check the content only of files whose names start with it.
 
         Raises:
             BundleError: when a file is missing, changed, a link, or not in the manifest.
         """
         self.check_tree()
-        for name in [name for name in self.manifest.files if name not in self._verified]:
+        for name in [name for name in self.manifest.files if name.startswith(prefix) and name not in self._verified]:
             verify_sealed(self.path, name, *self._record(name))
 
     def check_tree(self) -> None:

@@ -16,7 +16,7 @@ from vlatool.bundle import Bundle, restate, seal
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.policy import DEFAULT_ENGINE, Policy, load_golden, relative_error
+from vlatool.runtime.policy import DEFAULT_ENGINE, Action, Policy, load_golden, relative_error
 from vlatool.runtime.program import Program, draw
 
 GOLDEN = "golden/golden.npz"
@@ -72,11 +72,12 @@ def finish(
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
-    difference = write_golden(draft, observations, out)
+    difference, of_chunk = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
     made = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
     limit = _limit(source, made, difference)
-    tolerance = max(LEAST_TOLERANCE, 1.2 * difference, min(2 * difference, ROUNDING))
+    seen = max(difference, of_chunk if draft.manifest.spec.action.kind != "discrete" else 0.0)
+    tolerance = max(LEAST_TOLERANCE, 1.2 * seen, min(2 * seen, ROUNDING))
     found = [] if difference <= limit else [_engine_difference(made, difference, limit)]
     kept = [each for each in source.manifest.findings if each["name"] != ENGINE_DIFFERENCE]
     return restate(made, replace(made.manifest, golden_tolerance=_rounded_up(tolerance), findings=(*kept, *found)))
@@ -143,11 +144,12 @@ def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]
     return seal(out, manifest)
 
 
-def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> float:
-    """Run the first observations and store ``in.NAME``, ``noise.NAME`` and ``out.NAME``, each with a sample axis.
+def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> tuple[float, float]:
+    """Run the first observations and store ``in.NAME``, ``noise.NAME``, ``out.NAME`` and ``chunk.NAME``.
 
-    The outputs are what the graphs say: the engine that the bundle is made for may compute something else. The samples
-    follow each other without a reset between, so that what a program keeps shows in the second.
+    Each has a sample axis. The outputs are what the graphs say: the engine that the bundle is made for may compute
+    something else. The samples follow each other without a reset between, so that what a program keeps shows in the
+    second. The chunk is the action in physical units: it shows other statistics, too.
 
     Args:
         draft: The bundle as written so far; its graphs are what runs.
@@ -155,7 +157,7 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
         out: The bundle's directory.
 
     Returns:
-        The largest relative L2 difference of the engine's actions from those.
+        The largest relative L2 difference of the engine's actions from those, as the graphs give them and as chunks.
     """
     random = np.random.default_rng(SEED)
     steps = draft.manifest.program
@@ -163,23 +165,29 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
         (observation, {name: draw(wanted, random) for step in steps for name, wanted in step.noise.items()})
         for observation in (observations * GOLDEN_COUNT)[:GOLDEN_COUNT]
     ]
+    name = draft.manifest.spec.action.name
     given = [_outputs(Policy.open(draft, threads=1, seed=SEED), samples)]
     given.insert(0, _outputs(reference_policy(draft), samples))
     arrays: dict[str, list[Any]] = {}
-    for (observation, noise), outputs in zip(samples, given[0], strict=True):
-        for prefix, values in (("in", observation), ("noise", noise), ("out", outputs)):
+    for (observation, noise), action in zip(samples, given[0], strict=True):
+        chunk = {name: action.chunk}
+        for prefix, values in (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", chunk)):
             for name, value in values.items():
                 arrays.setdefault(f"{prefix}.{name}", []).append(value)
     (out / GOLDEN).parent.mkdir(exist_ok=True)
     save_npz(out / GOLDEN, {name: np.stack([np.asarray(item) for item in items]) for name, items in arrays.items()})
-    action = draft.manifest.spec.action.name
-    errors = [relative_error(own[action], wanted[action]) for wanted, own in zip(*given, strict=True)]
-    return max(errors, key=lambda error: error if error == error else math.inf, default=0.0)
+    pairs = list(zip(*given, strict=True))
+    raw = [relative_error(own.outputs[name], wanted.outputs[name]) for wanted, own in pairs]
+    return _worst(raw), _worst([relative_error(own.chunk, wanted.chunk) for wanted, own in pairs])
 
 
-def _outputs(policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[Mapping[str, Any]]:
+def _worst(errors: Iterable[float]) -> float:
+    return max((error if error == error else math.inf for error in errors), default=0.0)
+
+
+def _outputs(policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[Action]:
     policy.reset()
-    return [policy.infer(observation, noise=noise).outputs for observation, noise in samples]
+    return [policy.infer(observation, noise=noise) for observation, noise in samples]
 
 
 def reference_policy(bundle: Bundle) -> Policy:

@@ -18,7 +18,7 @@ LITTER = (".DS_Store", "Thumbs.db", "desktop.ini")
 """What desktops leave in every directory that they show."""
 FIX = "copy or export the bundle again"
 BLOCK = 1 << 20
-TICK_NS = 40_000_000
+TICK_NS = 20_000_000
 """Time stamps of files move in ticks of up to 10 ms: what was changed more recently may change again unseen."""
 
 

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -122,6 +123,16 @@ def test_a_golden_file_that_does_not_fit_is_told(bundle, change, message):
 
     with pytest.raises(DataError, match=message):
         load(rewritten(bundle, changed).path)
+
+
+def test_other_statistics_of_the_action_show_in_the_golden_chunk(float_bundle, copied, resealed):
+    bundle = copied(float_bundle)
+    file = bundle.path / "assets/statistics.json"
+    table = json.loads(file.read_text())
+    table["action"]["std"] = [-2 * abs(value) if value < 0 else 2 * value for value in table["action"]["std"]]
+    file.write_text(json.dumps(table))
+    with pytest.raises(GraphError, match="another golden action"):
+        load(resealed(bundle).path)
 
 
 def test_an_action_of_another_size_is_another_action(bundle):

@@ -14,6 +14,7 @@ from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.probe import probe
 from vlatool.spec import TensorSpec
 
+RAISED = ("repeat", "runs", "elements", "state_elements")
 GOLDEN = {"in.x": [[1, 2]], "out.y": [[[1, 2]]]}
 NEG = "g (float[1,2] x) => (float[1,2] y) { y = Neg(x) }"
 BILLION = """g (float[1,2] x) => (float[N,2] y) <int64[2] k = {800000000, 1}, int64[1] two = {2}> {
@@ -41,7 +42,13 @@ def test_a_session_that_was_stopped_runs_again(tmp_path: Path):
     assert policy.infer({"x": [1, 2], "trips": [3]}).chunk.tolist() == [[-1, -2]]
 
 
-def test_a_program_of_many_short_runs_is_stopped_too(tmp_path: Path):
+@pytest.fixture
+def allowed(monkeypatch):
+    """What a manifest may declare is raised, to reach the limits behind it."""
+    monkeypatch.setenv("VLATOOL_LIMITS", ",".join(f"{name}={10**13}" for name in RAISED))
+
+
+def test_a_program_of_many_short_runs_is_stopped_too(tmp_path: Path, allowed):
     program = (ProgramStep("main", {"x": "x"}, {"y": "y"}, repeat=10**9, carry={"y": "x"}),)
     bundle = written(tmp_path, NEG, program=program, golden=GOLDEN)
     with pytest.raises(GraphError, match=r"longer than 0\.3 s"):
@@ -84,7 +91,7 @@ def large(name: str) -> TensorSpec:
     return TensorSpec(name, (1, 800_000_000, 2))
 
 
-def test_an_output_that_is_declared_too_large_is_refused_before_it_runs(tmp_path: Path):
+def test_an_output_that_is_declared_too_large_is_refused_before_it_runs(tmp_path: Path, allowed):
     text = "g (float[1,2] x) => (float[1,800000000,2] y) <int64[3] s = {1, 800000000, 2}> { y = Expand(x, s) }"
     bundle = written(tmp_path, text, outputs=(large("y"),), chunk=800_000_000)
     with pytest.raises(GraphError, match=r"6,400 MB, most of it 'y' .*; allowed: 2,000 MB") as caught:
@@ -93,7 +100,7 @@ def test_an_output_that_is_declared_too_large_is_refused_before_it_runs(tmp_path
 
 
 @pytest.mark.parametrize("word", ["keep", "noise"])
-def test_a_value_that_the_program_makes_too_large_is_refused_before_it_is_made(tmp_path: Path, word):
+def test_a_value_that_the_program_makes_too_large_is_refused_before_it_is_made(tmp_path: Path, word, allowed):
     step = ProgramStep("main", {"x": "x"}, {"y": "y"}, **{word: {"z": {"shape": [1, 10**12]}}})
     with pytest.raises(GraphError, match="4,000,000 MB, most of it 'z'"):
         load(written(tmp_path, NEG, program=(step,)).path)

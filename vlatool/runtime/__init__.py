@@ -64,7 +64,7 @@ def load(
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.described(path)
     refuse_findings(bundle, accept)
-    bundle.check_tree()
+    bundle.verify("data/")
     if probe:
         from vlatool.runtime.probe import probe as tried
 

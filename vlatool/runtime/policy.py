@@ -204,14 +204,17 @@ class Policy:
             )
         if not steps or not inferences:
             return
-        errors = []
+        errors: list[float] = []
+        chunks = _golden_chunks(self.bundle, len(steps))
         for number in range(max(inferences, len(steps))):
             observation, noise, expected = steps[number % len(steps)]
             if not number % len(steps):
                 self.reset()
             with self.stopped_after(first_run_s):
-                got = self.infer(observation, noise=noise).outputs[self.spec.action.name]
-            errors.append(relative_error(got, expected))
+                action = self.infer(observation, noise=noise)
+            errors.append(relative_error(action.outputs[self.spec.action.name], expected))
+            if chunks:
+                errors.append(relative_error(action.chunk, chunks[number % len(steps)]))
         self.reset()
         self.golden_error = next(filter(math.isnan, errors), max(errors))
         if not self.golden_error <= tolerance:
@@ -308,6 +311,15 @@ def load_goldens(bundle: Bundle) -> list[Golden]:
         )
         for step in range(counts.pop())
     ]
+
+
+def _golden_chunks(bundle: Bundle, steps: int) -> list[Array]:
+    """Return the recorded actions in physical units; none for indices, and where they were not recorded."""
+    name, action = bundle.manifest.golden, bundle.manifest.spec.action
+    stored = open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=name).get(f"chunk.{action.name}")
+    if stored is None or action.kind == "discrete" or not stored.ndim or stored.dtype.kind not in "fiu":
+        return []
+    return list(stored) if len(stored) == steps else []
 
 
 def relative_error(got: Array, expected: Array) -> float:
