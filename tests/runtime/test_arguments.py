@@ -76,3 +76,10 @@ def test_a_value_that_gives_no_array_is_told(tmp_path: Path):
     policy = load(written(tmp_path, NEG).path)
     with pytest.raises(DataError, match="is a Tensor, which gives no numpy array"):
         policy.infer({"x": Tensor()})
+
+
+@pytest.mark.parametrize("how", ["warn", "raise"])
+def test_a_number_beyond_float32_is_told_however_numpy_is_set(tmp_path: Path, how: Any):
+    policy = load(written(tmp_path, NEG).path)
+    with np.errstate(over=how), pytest.raises(DataError, match="beyond what its dtype holds"):
+        policy.infer({"x": np.array([1e300, 0.0])})

@@ -148,3 +148,22 @@ def test_ports_fit_where_they_can_be_one_array(one, two, fit):
 def test_an_output_that_may_have_any_length_is_returned():
     values = {"y": np.zeros((1, 9), np.float32)}
     assert Outputs((TensorSpec("y", (1, "n")),))(values) == values
+
+
+def test_a_free_axis_without_an_element_is_no_action(tmp_path: Path):
+    text = "g (float[1,2] x) => (float[1,N] y) { a = NonZero(x)  b = Cast<to = 1>(a)  i = Constant<value_ints = [0]>()"
+    text += "  j = Constant<value_ints = [1]>()  y = Slice(b, i, j, i) }"
+    policy = load(written(tmp_path, text, outputs=(TensorSpec("y", (1, "n")),)).path)
+    assert policy.infer({"x": [1.0, 2.0]}).chunk.shape == (1, 2)
+    with pytest.raises(GraphError, match=r"gives 'y' as float32 \[1, 0\]"):
+        policy.infer({"x": [0.0, 0.0]})
+
+
+def test_an_action_of_float16_reaches_the_controller_as_float32(tmp_path: Path):
+    bundle = written(
+        tmp_path,
+        "g (float[1,2] x) => (float16[1,2] y) { y = Cast<to = 10>(x) }",
+        outputs=(replace(Y, dtype="float16"),),
+    )
+    action = load(bundle.path).infer({"x": [1.0, 2.0]})
+    assert (action.chunk.dtype, action.outputs["y"].dtype) == (np.float32, np.float16)

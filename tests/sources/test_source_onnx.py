@@ -135,3 +135,19 @@ def test_a_file_whose_action_has_a_time_axis_is_a_chunk_of_which_one_action_is_e
     bundle = build(tmp_path / "out", path)
     assert (bundle.manifest.spec.chunk, bundle.manifest.spec.execute) == (8, 1)
     assert load(bundle.path, threads=1).infer({"x": np.ones((8, 7))}).chunk.shape == (8, 7)
+
+
+@pytest.mark.parametrize(
+    ("output", "told"),
+    [
+        ("{name: y, shape: [1, 3], kind: discrete, labels: [a, b, c]}", r"float32 \[1, 3\].*float32 \[1, 2\]"),
+        ("{name: y, shape: [1, 2], dtype: float16}", r"float16 \[1, 2\].*float32 \[1, 2\]"),
+    ],
+    ids=["labels", "dtype"],
+)
+def test_a_description_that_the_file_does_not_fit_is_not_sealed(tmp_path: Path, output, told):
+    (tmp_path / "policy.yaml").write_text(
+        f"name: walker\nspec:\n  inputs: [{{name: x, shape: [1, 3]}}]\n  outputs: [{output}]\n  control_hz: 10\n"
+    )
+    with pytest.raises(GraphError, match=told):
+        build(tmp_path / "out", linear(tmp_path / "walker.onnx"), policy=tmp_path / "policy.yaml")

@@ -32,7 +32,7 @@ class ChunkQueue:
         self.policy = policy
         self.execute = execute or policy.spec.execute or policy.spec.chunk
         self._pending: list[NDArray[Any]] = []
-        self._turn = threading.Lock()
+        self._turn = threading.RLock()  # a signal handler may strike between lock and owner
         self._owner = 0
 
     def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
@@ -47,8 +47,8 @@ class ChunkQueue:
         if self._owner:
             raise UsageError("A control step begins before the last one has ended.", "make one queue for each thread")
         with self._turn:
-            self._owner = threading.get_ident()
             try:
+                self._owner = threading.get_ident()
                 if not self._pending:
                     self._pending = list(self.policy.infer(observation).chunk[: self.execute])
                 return np.asarray(self._pending.pop(0))

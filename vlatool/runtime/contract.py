@@ -227,7 +227,7 @@ def not_finite(name: str, what: str = "output") -> GraphError:
 
 
 def _fits(array: Array, tensor: TensorSpec) -> bool:
-    return Port(array.shape, tensor.dtype).fits(_declared(tensor))
+    return array.size > 0 and Port(array.shape, tensor.dtype).fits(_declared(tensor))
 
 
 def _misfit(array: Array, tensor: TensorSpec, who: str) -> GraphError:

@@ -50,7 +50,12 @@ class ObservationEncoder:
                 value = observation[name]
             except Exception:  # the seam: a mapping says KeyError, anything else what it likes
                 raise self._lacking(observation, name) from None
-            values[name] = encode(value)
+            try:
+                values[name] = encode(value)
+            except (RuntimeWarning, FloatingPointError):  # where the caller lets numpy raise
+                raise DataError(
+                    f"The input '{name}' has values beyond what its dtype holds.", "check the sensor or the recording"
+                ) from None
         return values
 
     def _lacking(self, observation: Any, name: str) -> DataError:

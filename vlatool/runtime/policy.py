@@ -72,7 +72,7 @@ class Policy:
         self._decode = _Decoder(self.spec, bundle)
         self._outputs = Outputs(self.spec.outputs, action=False)
         self._sequence = 0
-        self._turn = threading.Lock()
+        self._turn = threading.RLock()  # a signal handler may strike between lock and owner
         self._owner = 0
         self.golden_error: float | None = None
 
@@ -120,8 +120,8 @@ class Policy:
         if self._owner:
             self._check_overlap()
         with self._turn:
-            self._owner = threading.get_ident()
             try:
+                self._owner = threading.get_ident()
                 outputs, chunk, labels = self.program.run(self.encode(observation), noise, self._answer)
                 sequence = self._sequence
                 self._sequence += 1
@@ -251,13 +251,14 @@ class _Decoder:
         self.tensor: TensorSpec = spec.action
         self.normaliser: Normaliser | None = load_normaliser(spec.action, assets)
         self._floating = np.dtype(spec.action.dtype).kind == "f"
+        self._half = spec.action.dtype == "float16"
 
     def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
         tensor = self.tensor
-        physical = raw
+        physical = raw.astype(np.float32) if self._half else raw
         if self.normaliser is not None:
             try:
-                physical = self.normaliser.inverse(raw)
+                physical = self.normaliser.inverse(physical)
             except (RuntimeWarning, FloatingPointError):  # an overflow, where the caller lets numpy raise
                 raise not_finite(tensor.name) from None
         if self._floating and not all_finite(physical):
