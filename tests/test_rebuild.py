@@ -225,13 +225,15 @@ def test_the_source_is_found_where_it_was(policy_dir, float_bundle, again, tmp_p
         again(float_bundle, cache=cache)
 
 
-def test_the_source_is_found_in_the_command_of_the_report(dynamic_bundle, onnx_policy, again, copied):
+def test_the_command_of_the_report_names_no_source(dynamic_bundle, onnx_policy, again, copied):
     bundle = copied(dynamic_bundle)
     (bundle.path / "reports").mkdir()
     command = f"vlatool optimize --profile {onnx_policy}/policy.py {onnx_policy}/tiny.onnx -o {bundle.path}"
     report = Report("optimize", "tiny", "pass", command=command)
     (bundle.path / "reports/report.json").write_text(report.to_json())
-    assert again(bundle).source == f"{onnx_policy}/tiny.onnx"
+    with pytest.raises(SourceError, match="does not say where its source is"):
+        again(bundle)
+    assert again(bundle, f"{onnx_policy}/tiny.onnx").source == f"{onnx_policy}/tiny.onnx"
     (bundle.path / "reports/report.json").write_text("{")
     with pytest.raises(SourceError, match="does not say where its source is"):
         again(bundle)
