@@ -26,6 +26,7 @@ from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
 from vlatool.cli.telemetry import telemetry
 from vlatool.errors import VlatoolError
+from vlatool.printable import printable
 
 INTERRUPTED = 130
 OUR_BUG = 70
@@ -111,9 +112,9 @@ def main(arguments: list[str] | None = None) -> None:
         error.show()
         sys.exit(error.exit_code)
     except VlatoolError as error:
-        typer.echo(f"error: {error.message}", err=True)
+        typer.echo(f"error: {printable(error.message)}", err=True)
         if error.fix:
-            typer.echo(f"  fix: {error.fix}", err=True)
+            typer.echo(f"  fix: {printable(error.fix)}", err=True)
         sys.exit(error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         kept = "; finished stages are kept" if KEEPING.intersection((arguments or sys.argv[1:])[:1]) else ""

@@ -9,6 +9,7 @@ import typer
 
 from vlatool.bundle import Bundle, manifest_bytes
 from vlatool.manifest import Manifest
+from vlatool.printable import printable
 from vlatool.spec import TensorSpec
 
 
@@ -22,7 +23,7 @@ def inspect(
         typer.echo(manifest_bytes(opened.manifest).decode(), nl=False)
         return
     for line in describe(opened):
-        typer.echo(line)
+        typer.echo(printable(line))
 
 
 def describe(bundle: Bundle) -> list[str]:
