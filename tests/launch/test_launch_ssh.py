@@ -731,3 +731,129 @@ def test_a_target_that_is_no_machine(there, bundle, name):
 
 def test_the_back_end_is_the_one_that_is_there():
     assert BACK_END in ("sshd", "asyncssh")
+
+
+EVIL = """
+import json, os, re, sys, time
+seen = b""
+while not (found := re.search(rb"vlatool-[0-9a-f]{16}:", seen)):
+    seen += os.read(0, 1 << 16)
+marker = found[0].decode()
+
+
+def say(text):
+    sys.stdout.write("\\n" + marker + text + "\\n")
+    sys.stdout.flush()
+
+
+def python(**changed):
+    facts = {"command": "python3", "version": [3, 11, 0], "packages": {"numpy": "2", "onnxruntime": "1"}, "errors": {},
+             "architecture": "x86_64", "kernel": "6", "free": 10**12}
+    say(json.dumps({"python": {**facts, **changed}}))
+
+
+def until_measuring():
+    say('{"shell": true}')
+    python()
+    say('{"ready": "/tmp/there"}')
+    os.set_blocking(0, False)
+    quiet = time.monotonic()
+    while time.monotonic() - quiet < 1:
+        try:
+            quiet = time.monotonic() if os.read(0, 1 << 16) else quiet
+        except BlockingIOError:
+            time.sleep(0.05)
+    say('{"received": true}')
+
+
+"""
+
+
+@pytest.fixture
+def evil(there: Target, tmp_path: Path) -> Callable[[str], None]:
+    """A target on which a program of somebody else's answers."""
+
+    def put(program: str) -> None:
+        file = tmp_path / "evil.py"
+        file.write_text(EVIL + textwrap.dedent(program))
+        there.prepare(f"exec {sys.executable} {file}\n")
+
+    return put
+
+
+@pytest.mark.parametrize(
+    "flood",
+    [
+        "timeout 5 cat /dev/zero", "timeout 5 yes", "timeout 5 cat /dev/zero >&2", "timeout 5 yes >&2",
+    ],
+)  # fmt: skip
+def test_a_target_that_floods_is_cut_off(there, bundle, monkeypatch, flood):
+    monkeypatch.setenv("VLATOOL_LIMITS", "target_bytes=2e7")
+    there.prepare(flood + "\n")
+    before = psutil.Process().memory_info().rss
+    with pytest.raises(TargetError, match="the limit 'target_bytes' allows 20000000") as caught:
+        there.measure(bundle)
+    assert psutil.Process().memory_info().rss - before < 60e6
+    assert "VLATOOL_LIMITS=target_bytes=" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("program", "message"),
+    [
+        ("say('x' * 3_000_000)", "target_message_bytes"),
+        ("sys.stdout.write(marker + 'x' * 3_000_000); sys.stdout.flush(); time.sleep(2)", "target_message_bytes"),
+        ("say('[]')", "a message is a list"),
+        ("say('{')", "makes no sense"),
+        ("say('[' * 100_000)", "makes no sense"),
+        ("""say('{"a": ' * 40 + '1' + '}' * 40)""", "more than 32 levels"),
+        ("""say('{"python": {"version": [3, 11, NaN]}}')""", "NaN is no number"),
+        ("""say('{"python": {"version": [3, 11, 1e999]}}')""", "a number is too large"),
+        ("say('{\"python\": ' + '9' * 5000 + '}')", "makes no sense"),
+        ("say('{}'); say('{\"python\": {}}')", "'command' of a Python is None"),
+        ("say('{}'); python(version='3')", "'version' of a Python is '3'"),
+        ("say('{}'); python(version=[3, 11])", "version of a Python is"),
+        ("say('{}'); python(free='much')", "'free' of a Python is 'much'"),
+        ("say('{}'); python(packages={'numpy': 1})", "a package of a Python is no text"),
+        ("[python(packages={}) for _ in range(70)]; time.sleep(2)", "more than 64 Pythons"),
+        ("say('{}'); python(); say('{\"ready\": 1}'); time.sleep(2)", "'ready' is 1, no text"),
+        ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"x\"}'); time.sleep(2)", "makes no sense"),
+        ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"{}\"}'); time.sleep(2)", "'need' is None"),
+        ("until_measuring(); say('{\"ended\": 1}')", "how it ended is no mapping"),
+        ("until_measuring(); say('{\"ended\": {\"code\": \"0\", \"log\": \"\"}}')", "'code' is '0'"),
+        ("until_measuring(); say('{\"ended\": {\"code\": 0, \"log\": 3}}')", "'log' is 3, no text"),
+        ("until_measuring(); say('{\"agent\": 3}'); time.sleep(2)", "'agent' is 3, no text"),
+        ("""until_measuring(); say(json.dumps({"agent": '{"result": {"p50": 1e999}}'})); time.sleep(2)""",
+         "a number is too large"),
+    ],
+)  # fmt: skip
+def test_a_target_that_answers_nonsense(there, bundle, evil, monkeypatch, program, message):
+    monkeypatch.setenv("VLATOOL_LIMITS", "target_message_bytes=1e6")
+    evil(program)
+    with pytest.raises(TargetError, match=message):
+        there.measure(bundle)
+
+
+def test_a_target_that_never_ends_is_cut_off(there, bundle, evil, monkeypatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "target_seconds=3")
+    evil("""
+    until_measuring()
+    for _ in range(60):
+        say('{"agent": "{}"}')
+        time.sleep(0.1)
+    """)
+    with pytest.raises(TargetError, match="is not done after 3 s, while it measured"):
+        there.measure(bundle)
+
+
+def test_nothing_of_a_target_reaches_the_terminal_raw(there, bundle, evil):
+    evil(r"""
+    until_measuring()
+    say(json.dumps({"agent": json.dumps({"progress": ["\x1b]0;owned\x07 half\nway", 0.5]})}))
+    raised = {"vlatool error": "GraphError", "message": "\x1b[2Jgone", "fix": "\u202etxt"}
+    say(json.dumps({"agent": json.dumps(raised)}))
+    say(json.dumps({"ended": {"code": 0, "log": ""}}))
+    """)
+    with pytest.raises(GraphError) as caught:
+        there.measure(bundle)
+    assert str(caught.value) == "\\x1b[2Jgone\n  fix: \\u202etxt"
+    assert r"\x1b]0;owned\x07 half way" in [what for what, _ in there.told]

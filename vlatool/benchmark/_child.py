@@ -74,7 +74,7 @@ def message(text: str) -> dict[str, Any]:
     """Return a line of JSON; nothing for what an engine prints, and for a line that its process did not live to end."""
     try:
         found = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}
 

@@ -17,10 +17,11 @@ from vlatool.benchmark._job import Job, Limits
 from vlatool.benchmark._rows import measurements, raw, samples_of, sustained, tables
 from vlatool.benchmark._trust import findings, validity
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.errors import BundleError, GraphError, MissingExtra, UsageError
+from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.host import fingerprint
 from vlatool.hwselect._measured import WORK, whole_work
 from vlatool.hwselect._workload import workload
+from vlatool.printable import one_line
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.stage import Context, Measure
 
@@ -136,7 +137,15 @@ class Latency(Measure):
             if elsewhere is None
             else elsewhere(job.to_dict(), [bundle.path for bundle in bundles], context.tell)
         )
-        return self._report(bundles, found, remote=elsewhere is not None)
+        try:
+            return self._report(bundles, found, remote=elsewhere is not None)
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+            if elsewhere is None:
+                raise
+            raise TargetError(
+                f"What the target measured makes no sense ({type(error).__name__}: {one_line(str(error), 120)}).",
+                "look at that machine: whether it is the one that you mean, and what runs there",
+            ) from error
 
     def _job(self, bundles: Sequence[Bundle]) -> Job:
         return Job(

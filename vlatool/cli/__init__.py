@@ -28,6 +28,7 @@ from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
 from vlatool.cli.telemetry import telemetry
 from vlatool.errors import VlatoolError
+from vlatool.printable import printable
 
 INTERRUPTED = 130
 OUR_BUG = 70
@@ -121,7 +122,7 @@ def _flushed() -> None:
 def _say(text: str, fix: str = "") -> None:
     """Say something on stderr, where somebody reads it."""
     with contextlib.suppress(OSError, ValueError):
-        typer.echo(f"{text}\n  fix: {fix}" if fix else text, err=True)
+        typer.echo(f"{printable(text)}\n  fix: {printable(fix)}" if fix else printable(text), err=True)
 
 
 def _with_trust_first(arguments: list[str]) -> list[str]:

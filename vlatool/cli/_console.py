@@ -9,7 +9,7 @@ import shlex
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,34 @@ import typer
 from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.host import cache_directory
 from vlatool.outputs import refuse_inputs, refuse_replacing
+from vlatool.printable import one_line, printable
 from vlatool.report import Report
 from vlatool.stage import Context, Tell
 from vlatool.writing import writing
 
+PLACES = ("-o", "--output", "--cache", "--junit")
+"""Options that name a place to write to: where it is on this machine is nobody's business."""
+
 
 def command_line() -> str:
-    """Return the command as a person would type it."""
-    return shlex.join(["vlatool", *sys.argv[1:]])
+    """Return the command as a person would type it elsewhere: outputs and caches without folders of this machine."""
+    words, told = sys.argv[1:], ["vlatool"]
+    for before, word in zip(["", *words], words, strict=False):
+        name, sign, value = word.partition("=")
+        if before in PLACES:
+            told.append(_neutral(word))
+        elif sign and name in PLACES:
+            told.append(f"{name}={_neutral(value)}")
+        elif word.startswith("-o") and not word.startswith("--"):
+            told.append(f"-o{_neutral(word[2:])}" if word[2:] else word)
+        else:
+            told.append(word)
+    return shlex.join(told)
+
+
+def _neutral(path: str) -> str:
+    """Return the last part of an absolute path, or of one that leaves the current directory."""
+    return Path(path).name or path if os.path.isabs(path) or path.startswith(("..", "~")) else path
 
 
 def default_workers() -> int:
@@ -41,6 +61,7 @@ def progress(workers: int = 1) -> Iterator[Context]:
         yield Context(_plain_lines(), workers, command_line())
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (
@@ -54,7 +75,8 @@ def progress(workers: int = 1) -> Iterator[Context]:
         task = bar.add_task("starting", total=None)
 
         def tell(what: str, share: float | None) -> None:
-            bar.update(task, description=what, total=None if share is None else 1.0, completed=share or 0.0)
+            told, whole = escape(one_line(what)), None if share is None else 1.0
+            bar.update(task, description=told, total=whole, completed=share or 0.0)
 
         yield Context(tell, workers, command_line())
 
@@ -67,7 +89,7 @@ def _plain_lines() -> Tell:
         if kind != last[0]:
             last[0] = kind
             with contextlib.suppress(OSError):  # nobody reads it any more: no reason to stop
-                typer.echo(f"... {what}", err=True)
+                typer.echo(f"... {one_line(what)}", err=True)
 
     return tell
 
@@ -84,7 +106,7 @@ def plain_warnings() -> Iterator[None]:
         elif str(message) not in shown:
             shown.add(str(message))
             with contextlib.suppress(OSError, ValueError):
-                typer.echo(f"warning: {message}", err=True)
+                typer.echo(f"warning: {printable(str(message))}", err=True)
 
     warnings.showwarning = show
     try:
@@ -169,7 +191,21 @@ def terminal_text(report: Report, *, brief: bool = False) -> str:
 
     color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     width = min(shutil.get_terminal_size((80, 24)).columns, 120)
-    return TerminalRenderer(width, color, brief).render(report)
+    return TerminalRenderer(width, color, brief).render(_printable(report))
+
+
+def _printable(value: Any) -> Any:
+    """Return a report whose texts may stand on a terminal."""
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, (tuple, list)):
+        return type(value)(_printable(each) for each in value)
+    if isinstance(value, dict):
+        return {_printable(name): _printable(each) for name, each in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        given = {each.name: getattr(value, each.name) for each in fields(value) if each.init}
+        return replace(value, **_printable(given))
+    return value
 
 
 def leave(report: Report) -> None:

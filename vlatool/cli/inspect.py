@@ -9,6 +9,7 @@ import typer
 
 from vlatool.bundle import Bundle, manifest_bytes
 from vlatool.manifest import Manifest
+from vlatool.printable import printable
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.spec import TensorSpec
@@ -35,7 +36,7 @@ def inspect(
         typer.echo(manifest_bytes(opened.manifest).decode(), nl=False)
         return
     for line in describe(opened):
-        typer.echo(line)
+        typer.echo(printable(line))
     if tried is not None:
         error = "no golden action" if tried["golden_error"] is None else f"golden error {tried['golden_error']:.2g}"
         used = f"{tried['peak_rss_mb']:,.0f} MB resident, {tried['memory_mb']:,.0f} MB allowed"

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import secrets
 import select
 import subprocess
-import tempfile
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import IO, Any, BinaryIO, cast
+from typing import IO, Any, cast
 
 from vlatool.errors import MissingExtra, TargetError
+from vlatool.launch._heard import parsed
+from vlatool.limits import check, limit
+from vlatool.printable import one_line, printable
 
 ALIVE_S = 5
 """Seconds between signs of life to the target."""
@@ -25,6 +28,8 @@ CLEANING_S = 20
 """Seconds that the target has to clean up before ssh is ended here; it goes on there."""
 BLOCK = 1 << 16
 NOISE = 1 << 20
+SAID = 1 << 16
+"""Bytes of ssh's standard error that are kept, the last ones."""
 
 AGAIN = "run it again; the target removes what was sent when the connection ends"
 REFUSALS = (
@@ -84,10 +89,13 @@ class Connection:
         self.doing = "before anything ran there"
         self._target = target
         self._answered = False
+        self._closing = self._flooded = False
         self._due = 0.0
         self._buffer = b""
         self._messages: deque[dict[str, Any]] = deque()
-        self._said: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115
+        self._said = b""
+        self._came = 0
+        self._until = time.monotonic() + limit("target_seconds")
         own = {
             "BatchMode": "yes",
             "ConnectTimeout": str(max(1, round(connect_timeout_s))),
@@ -100,16 +108,22 @@ class Connection:
         try:
             self._ssh = subprocess.Popen(
                 ["ssh", "-T", *options, *settings, "--", target, "sh"],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said, bufsize=0, start_new_session=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0,
+                start_new_session=True,
             )  # fmt: skip
         except FileNotFoundError as error:
-            self._said.close()
             raise MissingExtra(
                 "A benchmark on another machine needs the program ssh, which is not on this one.",
                 "install the OpenSSH client, for example: apt install openssh-client",
             ) from error
         self._in, self._out = cast(IO[bytes], self._ssh.stdin), cast(IO[bytes], self._ssh.stdout)
-        os.set_blocking(self._in.fileno(), False)
+        self._err = cast(IO[bytes], self._ssh.stderr)
+        for stream in (self._in, self._err):
+            os.set_blocking(stream.fileno(), False)
+
+    def allow(self, seconds: float) -> None:
+        """Let the run take so many seconds more than the limit ``target_seconds``."""
+        self._until += seconds
 
     def send(self, data: bytes) -> bool:
         """Write bytes; False when the target had something to say before they were through.
@@ -117,25 +131,23 @@ class Connection:
         Raises:
             TargetError: when the connection ends or nothing moves.
         """
-        rest = memoryview(data)
+        rest, moved = memoryview(data), time.monotonic()
         while rest:
-            poll = select.poll()
-            poll.register(self._out, select.POLLIN)
-            poll.register(self._in, select.POLLOUT)
-            ready = dict(poll.poll(STALLED_S * 1000))
-            if not ready:
-                raise TargetError(f"{self._target} took nothing for {STALLED_S} s {self.doing}.", AGAIN)
-            if self._out.fileno() in ready and not self._take():
+            ready = self._ready(STALLED_S * 1000, self._in)
+            if self._out in ready and not self._take():
                 raise self.ended()
             if self._messages:
                 return False
-            if self._in.fileno() in ready:
+            if self._in in ready:
                 try:
                     rest = rest[os.write(self._in.fileno(), rest[:BLOCK]) :]
+                    moved = time.monotonic()
                 except BlockingIOError:
                     continue
                 except BrokenPipeError:
                     return self._last_words()
+            if time.monotonic() - moved > STALLED_S:
+                raise TargetError(f"{self._target} took nothing for {STALLED_S} s {self.doing}.", AGAIN)
         return True
 
     def tell(self, message: dict[str, Any]) -> bool:
@@ -156,10 +168,7 @@ class Connection:
                     os.write(self._in.fileno(), b"\n")
             if self._messages:
                 return self._messages.popleft()
-            poll = select.poll()
-            poll.register(self._out, select.POLLIN)
-            ready = poll.poll(500)
-            if ready and not self._take():
+            if self._out in self._ready(500) and not self._take():
                 raise self.ended()
             if timeout_s is not None and time.monotonic() - start > timeout_s and not self._messages:
                 raise TargetError(f"{self._target} said nothing for {timeout_s:g} s {self.doing}.", self._try())
@@ -167,9 +176,8 @@ class Connection:
     def ended(self) -> TargetError:
         """Return the error for a connection that is no more: what ssh said, and what it means."""
         code = self.close()
-        self._said.seek(0)
-        text = self._said.read().decode("utf-8", "replace")
-        last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), f"exit code {code}")
+        text = printable(self._said.decode("utf-8", "replace"))
+        last = one_line(next((line for line in reversed(text.splitlines()) if line.strip()), f"exit code {code}"))
         if self._answered:
             return TargetError(f"The connection to {self._target} ended {self.doing}: {last}", AGAIN)
         for pattern, meaning, fix in REFUSALS:
@@ -179,20 +187,20 @@ class Connection:
 
     def close(self) -> int:
         """End it: the target sees the end of its input and cleans up; return ssh's exit code."""
+        self._closing = True
         with contextlib.suppress(OSError):
             self._in.close()
-        until = time.monotonic() + CLEANING_S
+        until = time.monotonic() + (0 if self._flooded else CLEANING_S)
         try:
             while self._ssh.poll() is None and time.monotonic() < until:
-                poll = select.poll()
-                poll.register(self._out, select.POLLIN)
-                if poll.poll(50) and not os.read(self._out.fileno(), BLOCK):
+                if self._out in self._ready(50) and not os.read(self._out.fileno(), BLOCK):
                     self._ssh.wait(max(0.1, until - time.monotonic()))
         except subprocess.TimeoutExpired:
             pass
         finally:
             if self._ssh.poll() is None:
                 self._ssh.kill()
+            self._hear()
         return self._ssh.wait()
 
     def dispose(self) -> None:
@@ -201,7 +209,45 @@ class Connection:
             self.close()
         finally:
             self._out.close()
-            self._said.close()
+            self._err.close()
+
+    def _ready(self, milliseconds: float, *more: IO[bytes]) -> list[IO[bytes]]:
+        """Wait until something can be read, or written to one of ``more``; what ssh says is taken in at once.
+
+        Raises:
+            TargetError: when the run takes longer than the limit.
+        """
+        poll = select.poll()
+        for stream in (self._out, *(() if self._err.closed else (self._err,))):
+            poll.register(stream, select.POLLIN)
+        for stream in more:
+            poll.register(stream, select.POLLOUT)
+        ready = {handle for handle, _ in poll.poll(milliseconds)}
+        if not self._err.closed and self._err.fileno() in ready:
+            self._hear()
+        if time.monotonic() > self._until:
+            self._until = math.inf
+            raise TargetError(
+                f"{self._target} is not done after {limit('target_seconds')} s, {self.doing}.",
+                "if it is right, raise the limit: VLATOOL_LIMITS=target_seconds=SECONDS",
+            )
+        return [stream for stream in (self._out, *more) if stream.fileno() in ready]
+
+    def _hear(self) -> None:
+        """Take what ssh and the target's standard error say; its end is kept."""
+        with contextlib.suppress(BlockingIOError, ValueError):
+            found = os.read(self._err.fileno(), BLOCK)
+            self._said = (self._said + found)[-SAID:]
+            self._count(len(found))
+            if not found:
+                self._err.close()
+
+    def _count(self, count: int) -> None:
+        """Refuse a target that never stops talking."""
+        self._came += count
+        if not self._closing:
+            self._flooded = self._came > limit("target_bytes")
+            check("target_bytes", self._came, f"What {self._target} sends", TargetError)
 
     def _try(self) -> str:
         return f"see what happens with: ssh {self._target} sh -c true"
@@ -216,6 +262,7 @@ class Connection:
     def _take(self) -> bool:
         """Take what has come; False at the end."""
         found = os.read(self._out.fileno(), BLOCK)
+        self._count(len(found))
         self._buffer += found
         mark = self.marker.encode()
         if b"\n" in found:
@@ -224,8 +271,10 @@ class Connection:
                 _, marked, rest = line.partition(mark)
                 if marked:
                     self._answered = True
-                    with contextlib.suppress(ValueError):
-                        self._messages.append(json.loads(rest))
-        elif len(self._buffer) > NOISE and mark not in self._buffer:
+                    check("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
+                    self._messages.append(parsed(rest, self._target))
+        elif mark in self._buffer:
+            check("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
+        elif len(self._buffer) > NOISE:
             self._buffer = self._buffer[-len(mark) :]
         return bool(found)

@@ -19,6 +19,8 @@ from vlatool.bundle import Bundle
 from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.launch import _probe, _push
 from vlatool.launch._connection import AGAIN, Connection
+from vlatool.launch._heard import facts_of, nonsense, number_of, parsed, sane, text_of
+from vlatool.printable import one_line
 from vlatool.stage import Tell
 
 AGENT = "vlatool.benchmark._agent"
@@ -31,6 +33,7 @@ PROBE_S = 120
 """Seconds for a Python to import numpy and an engine."""
 PLACE_S = 60
 LOG_CHARACTERS = 300
+MOST_PYTHONS = 64
 
 
 def measure_on(
@@ -72,6 +75,7 @@ def measure_on(
     load = _push.load_of(opened, PACKAGE, FURTHER)
     tell(f"connecting to {target}", None)
     connection = Connection(target, ssh_options, connect_timeout_s)
+    connection.allow(float(job.get("duration") or 0))
     try:
         connection.send(_probe.script(connection.marker, python, packages))
         facts = _find_python(connection, target, python, packages, connect_timeout_s)
@@ -109,7 +113,13 @@ def _find_python(
         told.append(heard := connection.receive(PROBE_S))
         if "none" in heard:
             raise _probe.refusal(target, python, told, packages)
-        facts: dict[str, Any] = heard.get("python", {})
+        if len(told) > MOST_PYTHONS:
+            raise nonsense(target, f"it has more than {MOST_PYTHONS} Pythons")
+        facts = facts_of(heard, target)
+        if facts:
+            told[-1] = {"python": facts}
+        elif "broken" in heard:
+            told[-1] = {"broken": number_of(heard, "broken", target)}
         if facts and set(packages) == set(facts["packages"]):
             return facts
 
@@ -137,27 +147,29 @@ def _send(connection: Connection, target: str, load: _push.Load, tell: Tell) -> 
             raise _refused(target, connection.receive())
         sent += size
     tell(f"sent {load.size / 1e6:.1f} MB to {target}", 1.0)
-    return str(answer["ready"])
+    return text_of(answer, "ready", target)
 
 
 def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:
     """Return the error for what the target could not do."""
-    word, text = answer.get("refused", ""), str(answer.get("text", ""))
+    word, text = answer.get("refused", ""), one_line(str(answer.get("text", "")))
     if word == "no place":
         return OutputError(
             f"{target} has no directory to write to: {text}.", "set TMPDIR or XDG_CACHE_HOME there to one that has room"
         )
     if word == "no room":
-        found = json.loads(text)
-        numbers = f"{found['need'] / 1e6:.1f} MB are needed, {found['free'] / 1e6:.1f} MB are free"
+        found = parsed(str(answer["text"]), target)
+        need, free = (number_of(found, name, target) for name in ("need", "free"))
+        numbers = f"{need / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free"
         return OutputError(
-            f"The disk of {target} is too full: {numbers} below {found['path']}.", "free some space there"
+            f"The disk of {target} is too full: {numbers} below {one_line(str(found.get('path')))}.",
+            "free some space there",
         )
     if word == "full":
         return OutputError(f"The disk of {target} became full: {text}.", "free some space there")
     if word == "corrupt":
         return TargetError(f"What was sent to {target} did not arrive whole: {text}.", "run it again")
-    return TargetError(f"{target} could not run the benchmark: {text or answer}.", AGAIN)
+    return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", AGAIN)
 
 
 def _follow(connection: Connection, target: str, there: Mapping[str, str], tell: Tell) -> dict[str, Any]:
@@ -166,39 +178,40 @@ def _follow(connection: Connection, target: str, there: Mapping[str, str], tell:
     while True:
         heard = connection.receive(alive=True)
         if "agent" in heard:
-            said = _said(str(heard["agent"]), there)
+            said = _said(text_of(heard, "agent", target), there, target)
             if "progress" in said:
                 _pass_on(said["progress"], tell)
             elif "result" in said or SAID in said:
                 answer = said
         elif "ended" in heard or "refused" in heard:
             if heard.get("left"):
-                tell(f"{target} could not remove {heard['left']}", None)
+                tell(f"{target} could not remove {one_line(str(heard['left']))}", None)
             if "refused" in heard:
                 raise _refused(target, heard)
-            return _result(target, answer, heard["ended"])
+            return _result(target, answer, sane(heard["ended"], target))
 
 
-def _said(line: str, there: Mapping[str, str]) -> dict[str, Any]:
+def _said(line: str, there: Mapping[str, str], target: str) -> dict[str, Any]:
     """Return a line of the agent, with the bundles under their local names; empty for anything else."""
     for remote, local in there.items():
         line = line.replace(json.dumps(remote)[1:-1], json.dumps(local)[1:-1])
-    return message(line)
+    found: dict[str, Any] = sane(message(line), target)
+    return found
 
 
 def _pass_on(progress: Any, tell: Tell) -> None:
     match progress:
         case [str(what), (int() | float() | None) as share]:
-            tell(what, share)
+            tell(one_line(what), share)
 
 
 def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) -> dict[str, Any]:
     """Return the agent's result, or raise what it raised or why there is none."""
     raise_said(answer, otherwise=TargetError)
-    code = int(ended["code"])
-    last = next(
-        (line.strip() for line in reversed(str(ended["log"]).splitlines()) if line.strip()), "it logged nothing"
-    )
+    if not isinstance(ended, Mapping):
+        raise nonsense(target, "how it ended is no mapping")
+    code, log = number_of(ended, "code", target), text_of(ended, "log", target)
+    last = next((line.strip() for line in reversed(log.splitlines()) if line.strip()), "it logged nothing")
     last = last[-LOG_CHARACTERS:]
     if code == -signal.SIGKILL:
         raise TargetError(
@@ -212,4 +225,4 @@ def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) ->
             f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}"
         )
     result = dict(answer["result"])
-    return {**result, "log": f"{ended['log']}{result.get('log', '')}"}
+    return {**result, "log": f"{log}{result.get('log', '')}"}

@@ -1,0 +1,32 @@
+"""Text from elsewhere, such as names in a manifest or what a target says, as it may stand on a terminal."""
+
+from __future__ import annotations
+
+import unicodedata
+
+HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
+"""Unicode categories that move the cursor, change colours or the order of letters, or cannot be encoded."""
+KEPT = "\n\t\u200d\u00ad"
+
+
+def printable(text: str) -> str:
+    r"""Return a text in which control characters are written out.
+
+    Example:
+        >>> printable("a\x1b[2Jb")
+        'a\\x1b[2Jb'
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(_written(each) for each in text)
+
+
+def one_line(text: str, longest: int = 400) -> str:
+    """Return a text as one printable line of a bounded length."""
+    return " ".join(printable(text[: 4 * longest]).split())[:longest]
+
+
+def _written(character: str) -> str:
+    if character in KEPT or unicodedata.category(character) not in HIDDEN:
+        return character
+    return character.encode("unicode_escape", "surrogatepass").decode("ascii")
