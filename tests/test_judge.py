@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from vlatool.judge import Judged, choose, judge
+from vlatool.choice import choose
+from vlatool.judge import Judged, judge
 from vlatool.profile import load_profile
 from vlatool.recipe import Limits
 from vlatool.report import Measurement, Row
@@ -17,7 +18,7 @@ FLOAT = Row("float32", "baseline", measurements=(Measurement("latency_p50", 10.0
 def row(name: str, p50: float = 5.0, *found: Measurement) -> Row:
     own = (
         Measurement("latency_p50", p50, "ms", samples=20),
-        Measurement("speedup", 10 / p50, "x", samples=20),
+        Measurement("speedup", 10 / p50, "x", samples=20, low=9.9 / p50, high=10.1 / p50),
         Measurement("size", 1.0, "MB"),
     )
     return Row(name, measurements=(*own, *found))

@@ -10,15 +10,17 @@ from typing import Any
 
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle import Bundle, writing
+from vlatool.choice import choose
+from vlatool.credibility import Credibility, credibility
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
-from vlatool.evaluate._paired import compare_success
+from vlatool.evaluate._paired import compare_success, with_chance
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
 from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
 from vlatool.host import fingerprint, matches
-from vlatool.judge import Judged, budget_of, choose, judge
+from vlatool.judge import Judged, budget_of, judge
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.predict import predictions
 from vlatool.profile import Profile
@@ -145,7 +147,8 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
     Finished stages are kept in the cache, so that an interrupted run continues where it was.
 
     Returns:
-        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept).
+        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept), ``inconclusive``
+        when float32 does no better than actions that do not look at the observation.
     """
     with writing(out, force=force) as draft:
         source = cached_transform(plan.source, None, plan.cache, context)
@@ -158,11 +161,13 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
         small = plan.recipe.limits.max_memory_mb is not None
         judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+        trust = credibility(rows[BASELINE], BASELINE)
+        judged = [_with_tables(item, _trust_table(trust)) if item is judged[0] else item for item in judged]
         tables = {**searched, **_explained(judged, bundles, baseline, context)}
         judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
         chosen = next(item.row for item in judged if item.row.role == "chosen")
         chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
-        report = _report(plan, baseline, judged, failures, warnings, context)
+        report = _report(plan, baseline, judged, failures, warnings, trust, context)
         report = replace(report, summary=(*report.summary, *_needs(chosen_bundle)))
         _write_bundle(plan, chosen, chosen_bundle, draft)
         write_reports(report, draft / "reports")
@@ -196,6 +201,10 @@ def _with_tables(item: Judged, tables: dict[str, list[dict[str, Any]]]) -> Judge
     return replace(item, row=replace(item.row, details={**item.row.details, **tables}))
 
 
+def _trust_table(trust: Credibility) -> dict[str, list[dict[str, Any]]]:
+    return {"Whether the reference does its task": list(trust.table)} if trust.table else {}
+
+
 def _explained(
     judged: list[Judged], bundles: dict[str, Bundle], baseline: Bundle, context: Context
 ) -> dict[str, list[dict[str, Any]]]:
@@ -225,7 +234,8 @@ def _limits(limits: Limits) -> list[str]:
     told = [f"{limits.metric} <= {limits.max_metric:g}" if limits.metric else drop]
     told += [f"{limits.hz:g} Hz"] if limits.hz else []
     told += [f"latency <= {limits.max_latency_ms:g} ms"] if limits.max_latency_ms else []
-    return told + ([f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else [])
+    told += [f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else []
+    return told + ([] if limits.metric else [f"distance from float32 <= {100 * limits.max_distance:g} %"])
 
 
 def _transforms(stages: Any) -> tuple[Transform, ...]:
@@ -277,12 +287,24 @@ def _measure(
         row = rows[name]
         if loop is not None:
             success[name] = cached_measure(loop, bundle, plan.cache, context).rows[-1]
-            paired = success[name] if name == BASELINE else compare_success(success[BASELINE], success[name])
+            reference = name == BASELINE
+            paired = _with_controls(plan, loop, bundle, success[name], context) if reference else (
+                compare_success(success[BASELINE], success[name]))  # fmt: skip
             found += paired.measurements
             row = replace(row, raw={**row.raw, **paired.raw}, details={**row.details, **paired.details})
         found += predictions(plan.profile, bundle) if plan.profile else []
         rows[name] = replace(row, measurements=(*row.measurements, *found))
     return rows, warnings
+
+
+def _with_controls(plan: Plan, loop: ClosedLoop, baseline: Bundle, row: Row, context: Context) -> Row:
+    """Play what does not look, and add how often that succeeds to the row of float32."""
+    rows = []
+    for control in loop.controls():
+        context.tell(f"episodes of the control: {control.control} actions", None)
+        played = cached_measure(control, baseline, plan.cache, context).rows[-1]
+        rows.append(replace(played, name=control.control))
+    return with_chance(row, rows)
 
 
 def _latency_rows(
@@ -313,6 +335,7 @@ def _report(
     judged: list[Judged],
     failures: list[Row],
     notes: tuple[str, ...],
+    trust: Credibility,
     context: Context,
 ) -> Report:
     rows = tuple(item.row for item in judged) + tuple(failures)
@@ -323,12 +346,15 @@ def _report(
     if wanted.metric:
         limits = {wanted.metric: wanted.max_metric, "hz": wanted.hz, "profile": plan.board}
     limits |= {"max_latency_ms": wanted.max_latency_ms, "max_memory_mb": wanted.max_memory_mb}
-    warnings = tuple(dict.fromkeys([*notes, *(warning for item in judged for warning in item.warnings)]))
+    limits |= {} if wanted.metric else {"max_distance_percent": 100 * wanted.max_distance}
+    warnings = tuple(
+        dict.fromkeys([*notes, *trust.warnings, *(warning for item in judged for warning in item.warnings)])
+    )
     return Report(
         "optimize",
         f"{baseline.manifest.name} for {plan.board}",
-        "pass" if chosen.within else "fail",
-        summary=chosen.sentences,
+        "inconclusive" if trust.fails else "pass" if chosen.within else "fail",
+        summary=(*trust.sentences, *chosen.sentences),
         rows=rows,
         limits={key: value for key, value in limits.items() if value is not None},
         command=context.command,

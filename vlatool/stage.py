@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
-RECORD = 1
-"""Version of the build record, part of the cache key: an output without a record is not taken for one with it."""
+RECORD = 2
+"""Version of what stages write beside their result, part of the cache key: an output without it is not
+taken for one with it."""
 
 
 def _silent(_what: str, _share: float | None) -> None:

@@ -105,7 +105,7 @@ def test_data_without_expert_actions_or_episodes_is_still_run(float_bundle, poli
     with np.load(policy_template / "evaluation.npz") as data:
         np.savez(tmp_path / "bare.npz", **{name: data[name] for name in ("image", "proprio", "instruction")})
     _, row = Recorded(data=tmp_path / "bare.npz", baseline=float_bundle.path).run(float_bundle, Context()).rows
-    wanted = {"error_baseline", "error_baseline.dx", "error_baseline.dy", "relative_error"}
+    wanted = {"error_baseline", "error_baseline.dx", "error_baseline.dy", "relative_error", "variation"}
     assert {each.name for each in row.measurements} == wanted
 
 

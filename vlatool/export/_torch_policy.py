@@ -79,11 +79,16 @@ def _check_code(origin: Mapping[str, Any], folder: Path) -> None:
             raise SourceError(f"{file} has changed since the source bundle was made.", "start again from the source")
 
 
-def torch_policy(source: Bundle) -> Policy:
-    """Open a source bundle in eager torch behind the interface of the runtime's policy."""
+def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
+    """Open a source bundle in eager torch behind the interface of the runtime's policy.
+
+    Args:
+        source: Of a torch policy.
+        seed: Of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
+    """
     modules = load_modules(source)
     sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
-    return Policy(source, Program(source.manifest.program, sessions), "torch eager")
+    return Policy(source, Program(source.manifest.program, sessions, seed), "torch eager")
 
 
 class TorchSession:
