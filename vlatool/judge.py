@@ -197,7 +197,7 @@ def _distance_words(found: Measurement) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
+    return f"{100 * share:,.0f} %" if share >= 10 else f"{100 * share:.3g} %"
 
 
 def _with_drop(row: Row, baseline: Row) -> Row:

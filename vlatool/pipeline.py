@@ -13,9 +13,9 @@ from vlatool.bundle import Bundle, writing
 from vlatool.choice import choose
 from vlatool.credibility import Credibility, credibility
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
-from vlatool.evaluate._paired import compare_success, with_chance
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
+from vlatool.evidence import with_accuracy
 from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
@@ -26,7 +26,7 @@ from vlatool.predict import predictions
 from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import Report, Row
 from vlatool.runtime.policy import DEFAULT_ENGINE
 from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
@@ -157,12 +157,7 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         plan, searched = _searched(plan, baseline, context)
         bundles, failures = _candidates(plan, baseline, context)
         rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
-        on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
-        judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
-        small = plan.recipe.limits.max_memory_mb is not None
-        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
-        trust = credibility(rows[BASELINE], BASELINE)
-        judged = [_with_tables(item, _trust_table(trust)) if item is judged[0] else item for item in judged]
+        judged, trust = judged_rows(plan, rows)
         tables = {**searched, **_explained(judged, bundles, baseline, context)}
         judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
         chosen = next(item.row for item in judged if item.row.role == "chosen")
@@ -172,6 +167,29 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         _write_bundle(plan, chosen, chosen_bundle, draft)
         write_reports(report, draft / "reports")
     return report
+
+
+def judged_rows(plan: Plan, rows: dict[str, Row]) -> tuple[list[Judged], Credibility]:
+    """Hold every row against the limits of the plan, choose one, and say whether float32 does its task.
+
+    Args:
+        plan: With limits and board.
+        rows: Name -> row with everything that was measured and predicted, float32 first.
+    """
+    on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
+    judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
+    small = plan.recipe.limits.max_memory_mb is not None
+    judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+    trust = credibility(rows[BASELINE], BASELINE)
+    if trust.table:
+        judged[0] = _with_tables(judged[0], {"Whether the reference does its task": list(trust.table)})
+    return judged, trust
+
+
+def verdict_of(judged: list[Judged], trust: Credibility) -> str:
+    """Return ``pass``, ``fail``, or ``inconclusive`` where nothing can be held against the reference."""
+    chosen = next(item for item in judged if item.row.role == "chosen")
+    return "inconclusive" if trust.fails else "pass" if chosen.within else "fail"
 
 
 def _needs(bundle: Bundle) -> tuple[str, ...]:
@@ -199,10 +217,6 @@ def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
 
 def _with_tables(item: Judged, tables: dict[str, list[dict[str, Any]]]) -> Judged:
     return replace(item, row=replace(item.row, details={**item.row.details, **tables}))
-
-
-def _trust_table(trust: Credibility) -> dict[str, list[dict[str, Any]]]:
-    return {"Whether the reference does its task": list(trust.table)} if trust.table else {}
 
 
 def _explained(
@@ -277,34 +291,11 @@ def _measure(
 ) -> tuple[dict[str, Row], tuple[str, ...]]:
     """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
     rows, warnings = _latency_rows(plan, source, bundles, context)
-    loop = plan.closed_loop
-    success: dict[str, Row] = {}
-    for name, bundle in bundles.items():
-        found: list[Measurement] = []
-        if EVALUATION in bundle.manifest.files:
-            recorded = Recorded(baseline=None if name == BASELINE else bundles[BASELINE].path)
-            found += cached_measure(recorded, bundle, plan.cache, context).rows[-1].measurements
-        row = rows[name]
-        if loop is not None:
-            success[name] = cached_measure(loop, bundle, plan.cache, context).rows[-1]
-            reference = name == BASELINE
-            paired = _with_controls(plan, loop, bundle, success[name], context) if reference else (
-                compare_success(success[BASELINE], success[name]))  # fmt: skip
-            found += paired.measurements
-            row = replace(row, raw={**row.raw, **paired.raw}, details={**row.details, **paired.details})
-        found += predictions(plan.profile, bundle) if plan.profile else []
-        rows[name] = replace(row, measurements=(*row.measurements, *found))
+    rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
+    if plan.profile:
+        foretold = {name: predictions(plan.profile, bundle) for name, bundle in bundles.items()}
+        rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}
     return rows, warnings
-
-
-def _with_controls(plan: Plan, loop: ClosedLoop, baseline: Bundle, row: Row, context: Context) -> Row:
-    """Play what does not look, and add how often that succeeds to the row of float32."""
-    rows = []
-    for control in loop.controls():
-        context.tell(f"episodes of the control: {control.control} actions", None)
-        played = cached_measure(control, baseline, plan.cache, context).rows[-1]
-        rows.append(replace(played, name=control.control))
-    return with_chance(row, rows)
 
 
 def _latency_rows(
@@ -353,7 +344,7 @@ def _report(
     return Report(
         "optimize",
         f"{baseline.manifest.name} for {plan.board}",
-        "inconclusive" if trust.fails else "pass" if chosen.within else "fail",
+        verdict_of(judged, trust),
         summary=(*trust.sentences, *chosen.sentences),
         rows=rows,
         limits={key: value for key, value in limits.items() if value is not None},
