@@ -36,12 +36,14 @@ class Credibility:
         sentences: When it fails: what was found and what to look at.
         warnings: What a reader should know although it does not decide.
         table: What was compared with which floor.
+        floor: The same in a sentence, when it is credible.
     """
 
     verdict: str
     sentences: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     table: tuple[dict[str, Any], ...] = ()
+    floor: str = ""
 
     @property
     def fails(self) -> bool:
@@ -68,9 +70,9 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
     table = tuple(line for each in found for line in each.table)
     if played.verdict != "unknown":
         warnings = tuple(told for told in recorded.sentences[:1] if not played.fails)
-        return Credibility(played.verdict, played.sentences, (*played.warnings, *warnings), table)
+        return Credibility(played.verdict, played.sentences, (*played.warnings, *warnings), table, played.floor)
     warnings = (UNKNOWN,) if recorded.verdict == "unknown" else recorded.warnings
-    return Credibility(recorded.verdict, recorded.sentences, (*played.warnings, *warnings), table)
+    return Credibility(recorded.verdict, recorded.sentences, (*played.warnings, *warnings), table, recorded.floor)
 
 
 def _failing(reason: str, look_at: str, table: tuple[dict[str, Any], ...] = ()) -> Credibility:
@@ -92,7 +94,11 @@ def _played(row: Row, name: str) -> Credibility:
         "floor": "the difference is above 0 with 95 % confidence", "found": f"at least {gain:+.1%}",
     }  # fmt: skip
     if gain > 0:
-        return Credibility("credible", table=(line,))
+        floor = (
+            f"{name} succeeds in {own.value:.1%} of {own.samples} episodes; actions that do not look at the "
+            f"observation in {chance.value:.1%} of {chance.samples}."
+        )
+        return Credibility("credible", table=(line,), floor=floor)
     told = (
         f"{name} succeeds in {own.value:.1%} of {own.samples} closed-loop episodes, and actions that do not look at "
         f"the observation in {chance.value:.1%} of {chance.samples}, which cannot tell them apart"
@@ -131,7 +137,8 @@ def _recorded(row: Row, name: str) -> Credibility:
         if varied.value < VARIATION:
             told = f"the actions of {name} hardly vary: {varied.value:.1%} of the expert's standard deviation"
             return _failing(f"{told} on {varied.samples} recorded observations", LOOK_AT, table)
-    return Credibility("credible", table=table)
+    floor = f"{name} makes {1 - skill.value:.1%} of the error of the best constant action on {skill.samples} recorded "
+    return Credibility("credible", table=table, floor=f"{floor}observations.")
 
 
 def _line(measure: str, found: Measurement, floor: str) -> dict[str, Any]:

@@ -345,7 +345,7 @@ def _report(
         "optimize",
         f"{baseline.manifest.name} for {plan.board}",
         verdict_of(judged, trust),
-        summary=(*trust.sentences, *chosen.sentences),
+        summary=(*trust.sentences, *chosen.sentences, *filter(None, [trust.floor])),
         rows=rows,
         limits={key: value for key, value in limits.items() if value is not None},
         command=context.command,

@@ -33,6 +33,9 @@ def skill(action: TensorSpec, got: Array, expert: Array, episodes: Array | None 
         got, expert: (N, T, A) in physical units, or (N, T) indices.
         episodes: (N,) episode of each sample.
     """
+    if action.kind != "discrete":
+        steps = min(got.shape[1], expert.shape[1])
+        got, expert = got[:, :steps], expert[:, :steps]
     constant = best_constant(action, expert)
     idle, own = losses(action, constant, expert), losses(action, got, expert)
     floor = float(idle.mean())

@@ -11,10 +11,10 @@ from broken_policies import judge_case, rightly
 NAMES = (
     "wrapper forgot two layers", "cameras swapped", "collapsed policy, recordings alone", "always one label",
     "expert shuffled", "expert constant", "expert in degrees", "labels permuted", "images recorded BGR",
-    "success under another key", "success told when it happens alone", "success is never true", "success is always true",
-    "episodes end at once, as successes", "success by the dice", "int8 scales corrupted",
-    "honest", "honest, recordings alone", "honest, world alone, is_success", "honest, success told before the end alone",
-    "honest, final_info", "honest, discrete",
+    "success under another key", "success told when it happens alone", "success is never true",
+    "success is always true",    "episodes end at once, as successes", "success by the dice", "int8 scales corrupted",
+    "honest", "honest, recordings alone", "honest, world alone, is_success",
+    "honest, success told before the end alone",    "honest, final_info", "honest, discrete",
 )  # fmt: skip
 FAST = [case for case in CASES if case.name in NAMES]
 
