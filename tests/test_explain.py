@@ -149,7 +149,7 @@ def test_the_suggested_plan_repairs_the_bundle(report, fragile, made):
     assert len(chosen) == 1
     assert FRAGILE in chosen[0].reason
     now = next(row for row in report.rows if row.name == "static_int8")
-    assert chosen[0].value("error_baseline") < 0.3 * now.value("error_baseline")
+    assert chosen[0].value("raw_relative_error") < 0.3 * now.value("raw_relative_error")
     assert report.summary[1].startswith("Do this: vlatool quantize static-int8")
     again = explain(made(StaticInt8(samples=16, exclude=(f"{FRAGILE}.*",))), Options(fragile.path, None, 8), Context())
     assert all(not row["layer"].startswith(FRAGILE) for row in details(again, "Layers that cost"))
@@ -274,7 +274,7 @@ def test_a_phase_in_bfloat16_is_found_and_measured(fragile, made, tmp_path):
     text = next(text for text in good.summary if "stay in float32, in the graph main_phases" in text)
     assert "it would be" in text
     errors = [
-        next(row for row in each.rows if row.name == "bfloat16").value("error_baseline") for each in (report, good)
+        next(row for row in each.rows if row.name == "bfloat16").value("raw_relative_error") for each in (report, good)
     ]
     assert errors[1] < 0.3 * errors[0]
 

@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from vlatool.judge import Judged, choose, judge
+from vlatool.choice import choose
+from vlatool.judge import Judged, judge
 from vlatool.profile import load_profile
 from vlatool.recipe import Limits
 from vlatool.report import Measurement, Row
@@ -17,7 +18,7 @@ FLOAT = Row("float32", "baseline", measurements=(Measurement("latency_p50", 10.0
 def row(name: str, p50: float = 5.0, *found: Measurement) -> Row:
     own = (
         Measurement("latency_p50", p50, "ms", samples=20),
-        Measurement("speedup", 10 / p50, "x", samples=20),
+        Measurement("speedup", 10 / p50, "x", samples=20, low=9.9 / p50, high=10.1 / p50),
         Measurement("size", 1.0, "MB"),
     )
     return Row(name, measurements=(*own, *found))
@@ -241,6 +242,96 @@ def test_for_another_engine_predictions_rank_where_every_row_has_one():
 def test_for_another_engine_one_missing_prediction_leaves_the_choice_to_the_measurements():
     judged = [held(each) for each in (FLOAT, row("a", 4.0, drop(0.0), predicted(1.0)), row("b", 3.0, drop(0.0)))]
     assert next(item for item in choose(judged, "tensorrt") if item.row.role == "chosen").row.name == "b"
+
+
+def unproven(name: str, p50: float, low: float | None, high: float | None) -> Row:
+    speedup = Measurement("speedup", 10 / p50, "x", samples=20, low=low, high=high)
+    found = Measurement("latency_p50", p50, "ms", samples=20), speedup, Measurement("size", 1.0, "MB")
+    return Row(name, measurements=(*found, drop(0.0)))
+
+
+@pytest.mark.parametrize(
+    ("p50", "low", "high"),
+    [(10.1, 0.95, 1.02), (9.93, 0.98, 1.06), (9.1, 0.64, 1.88), (9.96, 1.001, 1.01), (5.0, None, None)],
+)
+def test_a_speed_up_that_the_interval_does_not_show_is_none(p50, low, high):
+    found = chosen(unproven("int8", p50, low, high))
+    told = " ".join(found.sentences)
+    assert found.row.name == "float32"
+    assert "as fast as float32 (" not in told
+    assert "int8 is not shown to be faster than float32" in told
+    assert f"{p50:.4g} ms instead of 10 ms" in told
+
+
+def test_the_ratio_that_is_told_is_that_of_the_times_that_are_told():
+    speedup = Measurement("speedup", 9.0, "x", samples=20, low=8.0, high=10.0)
+    latency, size = Measurement("latency_p50", 4.0, "ms", samples=20), Measurement("size", 1.0, "MB")
+    found = chosen(Row("int8", measurements=(latency, speedup, size, drop(0.0))))
+    assert "2.50x as fast as float32 (4 ms instead of 10 ms" in found.sentences[0]
+
+
+def test_a_candidate_that_is_not_faster_is_no_rival_of_one_that_is():
+    found = chosen(unproven("maybe", 3.9, 0.6, 5.0), row("sure", 4.0, drop(0.005)))
+    assert found.row.name == "sure"
+
+
+def test_what_is_chosen_for_its_memory_alone_is_said_to_be():
+    judged = [held(each) for each in (FLOAT, row("small", 20, drop(0.0)))]
+    found = next(item for item in choose(judged, small=True) if item.row.role == "chosen")
+    assert "though not faster than float32: memory was asked for" in found.row.reason
+    assert "small is not shown to be faster than float32 (0.5x; 0.49 to 0.51; 20 ms instead of" in found.sentences[0]
+    assert "It was chosen because memory was asked for." in found.sentences[0]
+
+
+def test_what_is_chosen_since_float32_is_outside_is_said_to_be():
+    late = Row("float32", "baseline", measurements=(*FLOAT.measurements, predicted(90.0, 70.0, 99.0)))
+    found = chosen(row("int8", 12.0, drop(0.0), predicted(20.0, 15.0, 30.0)), baseline=late, hz=20)
+    assert "not shown to be faster than float32" in found.sentences[0]
+    assert "It was chosen because float32 is outside: predicted 90 ms" in found.sentences[0]
+
+
+def test_predictions_that_overlap_are_said_to():
+    base = Row("float32", "baseline", measurements=(*FLOAT.measurements, predicted(30.0, 15.0, 60.0)))
+    judged = [held(each, base) for each in (base, row("int8", 9.0, drop(0.0), predicted(20.0, 10.0, 40.0)))]
+    found = next(item for item in choose(judged, "tensorrt") if item.row.role == "chosen")
+    assert "1.50x as fast as float32 (whose range, 15 to 60 ms, overlaps); not measured there" in found.sentences[0]
+    same = [held(each, base) for each in (base, row("int8", 9.0, drop(0.0), predicted(30.0, 10.0, 40.0)))]
+    kept = next(item for item in choose(same, "tensorrt") if item.row.role == "chosen")
+    assert kept.row.name == "float32"
+    assert "no candidate inside the limits is predicted to be faster" in kept.sentences[0]
+
+
+# ---- distance from float32
+
+
+@pytest.mark.parametrize("decisive", [drop(0.0), recorded("error_expert", 0.3)])
+@pytest.mark.parametrize(
+    ("value", "within"), [(0.04, True), (0.25, True), (0.26, False), (11.0, False), (math.nan, False)]
+)
+def test_what_is_far_from_float32_is_outside_whatever_the_drop_says(decisive, value, within):
+    base = Row("float32", "baseline", measurements=(*FLOAT.measurements, recorded("error_expert", 0.3)))
+    found = held(row("int8", 5.0, decisive, recorded("error_baseline", value)), base)
+    assert found.within is within
+    if value == 11.0:
+        assert "differs from float32's by 1,100 % of its standard deviation, allowed 25 %" in found.row.reason
+
+
+def test_the_distance_may_be_set():
+    assert held(row("int8", 5.0, drop(0.0), recorded("error_baseline", 0.5)), max_distance=0.5).within
+    assert not held(row("int8", 5.0, drop(0.0), recorded("error_baseline", 0.02)), max_distance=0.01).within
+
+
+def test_of_discrete_actions_the_share_of_other_answers_counts():
+    assert held(row("int8", 5.0, drop(0.0), recorded("agreement_baseline", 0.8))).within
+    found = held(row("int8", 5.0, drop(0.0), recorded("agreement_baseline", 0.7)))
+    assert "30 % of the answers are not those of float32, allowed 25 %" in found.row.reason
+
+
+def test_a_limit_on_a_distance_of_the_users_own_stands_in_its_place():
+    far = recorded("error_baseline", 0.5)
+    limits = {"metric": "relative_error", "max_metric": 0.4}
+    assert held(row("int8", 5.0, far, recorded("relative_error", 0.3)), **limits).within
+    assert held(row("int8", 5.0, far), max_drop=0.6).within, "no expert: the drop is the distance"
 
 
 # ---- budgets in other measures, latency, memory

@@ -157,6 +157,8 @@ def test_every_candidate_has_a_row_with_what_was_measured_and_predicted(from_tor
     assert set(names[3:]) <= {"static_int8_mse"}
     assert [row.role for row in report.rows].count("chosen") == 1
     assert report.verdict == "pass"
+    assert "float32 succeeds in 80.0% of 10 episodes; actions that do not look" in report.summary[-1]
+    assert "Whether the reference does its task" in report.rows[0].details
     assert report.limits["profile"] == "raspberry-pi-5"
     assert report.command.startswith("vlatool")
     assert report.created
@@ -302,6 +304,31 @@ def test_a_candidate_outside_the_budget_is_kept_as_the_nearest_with_exit_status_
     assert "No candidate keeps to the limits; the nearest, bad, was kept." in made.report.summary
     assert "error: No candidate keeps to the limits" in made.stderr
     assert Bundle.open(made.out).manifest.made_by["candidate"] == "bad"
+
+
+def test_a_reference_that_does_not_do_its_task_is_inconclusive(run, recipe, model):
+    """Success unchanged at 0 % is no pass; nor is an agreement with an expert that a constant reaches."""
+    with np.load(model.parent / "evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files}
+    np.savez(model.parent / "evaluation.npz", **data | {"action": data["action"][::-1]})
+    wrong = run("--max-drop", "100%", *recipe(DYNAMIC))
+    assert wrong.code == 5
+    assert wrong.report.verdict == "inconclusive"
+    assert wrong.report.summary[0].startswith("The reference fails, so that nothing can be held against it: float32")
+    world = model.parent / "environment.py"
+    world.write_text(world.read_text().replace('"success": done and good', '"is_success": False'))
+    none = run("--max-drop", "100%", "--episodes", "4", *recipe(DYNAMIC))
+    assert none.code == 5
+    assert "float32 succeeds in none of 4 closed-loop episodes" in none.report.summary[0]
+    assert "PASS" not in none.stdout
+
+
+def test_a_distance_that_is_not_allowed_is_outside(run, recipe):
+    made = run("--max-drop", "100%", "--max-distance", "0.0001%", *recipe(DYNAMIC))
+    assert made.code == 1
+    assert "of its standard deviation, allowed 0.0001 % (--max-distance)" in made.row("mine").reason
+    assert made.report.limits["max_distance_percent"] == pytest.approx(0.0001)
+    assert run("--max-distance", "far").code == 2
 
 
 def test_without_any_accuracy_nothing_is_inside(run, recipe, model):

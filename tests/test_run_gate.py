@@ -86,7 +86,9 @@ def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
     gate = Gate(latency=LatencyClaim(looks=(10,), pairs=30, margin=1.0), memory=GrowthClaim(margin=1.0))
     report = run_gate(float_bundle, float_bundle, gate, Context())
     measured = {each.name: each for each in report.rows[1].measurements}
-    assert {each.name for each in report.rows[0].measurements} == {"latency_p50", "peak_rss", "size"}
+    assert {each.name for each in report.rows[0].measurements} == {
+        "latency_p50", "peak_rss", "size", "skill_expert", "variation",
+    }  # fmt: skip
     assert set(measured) == {"latency_p50", "peak_rss", "size", "recorded_drop", "latency_ratio"}
     assert measured["latency_ratio"].low <= measured["latency_ratio"].value <= measured["latency_ratio"].high
     assert report.verdict in ("pass", "inconclusive", "fail")

@@ -1,4 +1,4 @@
-"""Which candidate keeps to the limits, which is chosen, and why: in words."""
+"""Which candidate keeps to the limits, and by how much each other misses them: in words."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from vlatool.spec import PolicySpec
 
 TOLERANCE = 1e-12
-TIE = 1.05
 AGAINST_FLOAT32 = "against float32"
-MEASURED_ENGINES = ("ort_cpu", "openvino")
 PROXY = 0.05
 """Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
+FROM_FLOAT32 = ("relative_error", "disagreement", "error_baseline", "gripper_flips_baseline")
+"""Beginnings of the measurements that are distances from float32 themselves."""
 DROPS = ("success_drop", "agreement_drop", "error_increase")
 """Which accuracy decides: the closed loop where there is one, else recorded observations."""
 
@@ -76,7 +76,15 @@ def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
     if limits.metric:
         return Budget(limits.metric, limits.max_metric or 0.0)
     name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
-    return Budget(name, max(PROXY, limits.max_drop) if proxy else limits.max_drop)
+    return Budget(name, min(max(PROXY, limits.max_drop), limits.max_distance) if proxy else limits.max_drop)
+
+
+def distance_of(row: Row) -> Measurement | None:
+    """Return how far a row's actions are from float32's own, None when that is not measured.
+
+    Continuous: the mean |difference| by float32's standard deviation; discrete: the share of other answers.
+    """
+    return Budget("disagreement", 0.0).of(row) or row.get("error_baseline")
 
 
 @dataclass(frozen=True)
@@ -122,7 +130,7 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
     if is_baseline:
         reason = "; ".join(rate.reasons) or "the reference"
         return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
-    accuracy = _judge_accuracy(row, decisive, limits)
+    accuracy = _both(_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits))
     reasons = (*accuracy.reasons, *rate.reasons)
     kept = f"{_drop_words(decisive)}, within {_allowed(limits, decisive)}" if decisive else ""
     row = replace(row, role="outside" if reasons else "within", reason="; ".join(reasons) or kept)
@@ -164,88 +172,32 @@ def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verd
     )
 
 
-def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False) -> list[Judged]:
-    """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside.
-
-    Of rows within ``TIE`` of the fastest, which timing noise cannot tell apart, the most accurate is chosen, and of
-    equally accurate ones the first, so that a repeated run chooses the same.
-
-    Args:
-        judged: The baseline first.
-        small: Whether memory was asked for: float32 is then no answer while a smaller plan keeps to the limits.
-        engine: The engine of the board. When it is not the one that was measured here, predictions for the board rank
-            the candidates, where every candidate has one.
-    """
-    origin = "measured"
-    if engine not in MEASURED_ENGINES and all(_p50(item.row, "predicted") < math.inf for item in judged):
-        origin = "predicted"
-    quantized = [item for item in judged if item.row.role != "baseline"]
-    inside = [item for item in quantized if item.within]
-    if not inside:
-        best = min(quantized, key=lambda item: (item.miss, _p50(item.row, origin)))
-        reason = f"kept as the nearest, though outside the limits: {best.row.reason}"
-        sentences = (
-            f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept.",
-            *(f"{item.row.name}: {item.row.reason}." for item in quantized),
-        )
-    else:
-        baseline = [item for item in judged if item.row.role == "baseline" and item.within and not small]
-        best = _fastest([*inside, *baseline], origin)
-        first = min(_p50(item.row, origin) for item in [*inside, *baseline])
-        tied = f"within {TIE - 1:.0%} of the fastest inside the limits and the most accurate of those"
-        place = "the fastest inside the limits" if _p50(best.row, origin) == first else tied
-        reason = f"{place} ({origin}); {best.row.reason}"
-        sentences = _praise(best, judged) if origin == "measured" else _foretell(best, judged)
-    chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
-    return [chosen if item is best else item for item in judged]
+def _judge_distance(row: Row, decisive: Measurement | None, limits: Limits) -> _Verdict:
+    """Judge the distance from float32's own actions, which a drop against the expert or of success does not show."""
+    found = distance_of(row)
+    if found is None or (decisive is not None and _is_distance(decisive)):
+        return _Verdict()
+    if not found.known:
+        return _Verdict((f"its distance from float32 is unknown: {found.note}",), math.inf)
+    if found.value <= limits.max_distance:
+        return _Verdict()
+    told = f"{_distance_words(found)}, allowed {_percent(limits.max_distance)} (--max-distance)"
+    return _Verdict((told,), found.value / max(limits.max_distance, 1e-9) - 1)
 
 
-def _fastest(items: list[Judged], origin: str) -> Judged:
-    least = min(_p50(item.row, origin) for item in items)
-    tied = [item for item in items if _p50(item.row, origin) <= TIE * least] or items
-    return min(tied, key=lambda item: item.drop)
+def _is_distance(decisive: Measurement) -> bool:
+    """Say whether what decides is a distance from float32 itself, so that the limit on it is the user's."""
+    return decisive.note == AGAINST_FLOAT32 or decisive.name.startswith(FROM_FLOAT32)
 
 
-def _praise(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
-    row, base = best.row, judged[0].row
-    if best is judged[0]:
-        return _float32_kept(judged)
-    speed = f"{row.value('speedup'):.2f}x as fast as {base.name}"
-    times = f"{row.value('latency_p50'):.3g} ms instead of {base.value('latency_p50'):.3g} ms, measured on this host"
-    size = f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
-    accuracy = row.get("success")
-    success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
-    return (f"{row.name} is {speed} ({times}); {size}.{success}", f"{row.reason[:1].upper()}{row.reason[1:]}.")
+def _distance_words(found: Measurement) -> str:
+    if found.name == "disagreement":
+        return f"{_percent(found.value)} of the answers are not those of float32"
+    return f"the action differs from float32's by {_percent(found.value)} of its standard deviation"
 
 
-def _float32_kept(judged: list[Judged]) -> tuple[str, ...]:
-    base = judged[0].row
-    faster = [item for item in judged[1:] if not item.within and _p50(item.row) < _p50(base)]
-    if faster:
-        return (
-            f"{base.name} was kept: the candidates inside the limits are slower than it on this host.",
-            *(f"{item.row.name} is faster, but outside: {item.row.reason}." for item in faster),
-        )
-    return (
-        f"{base.name} was kept: no quantized candidate is faster on this host.",
-        "In a graph this small the quantize and dequantize steps can cost more than int8 arithmetic saves.",
-    )
-
-
-def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
-    """Say what was chosen by prediction, since this host cannot run the board's engine."""
-    row, base = best.row, judged[0].row
-    own, reference = row.get("latency_p50", "predicted"), base.get("latency_p50", "predicted")
-    if own is None or reference is None:
-        return (f"{row.name} was chosen.",)
-    low, high = own.low or own.value, own.high or own.value
-    ratio = reference.value / own.value
-    return (
-        f"{row.name} is predicted to need {own.value:.3g} ms ({low:.3g} to {high:.3g}) on {own.where}, "
-        f"{ratio:.2f}x as fast as {base.name}; not measured there.",
-        f"{row.reason[:1].upper()}{row.reason[1:]}.",
-        "The board's engine does not run on this host: the latencies measured here are ONNX Runtime's on this CPU.",
-    )
+def _percent(share: float) -> str:
+    return f"{100 * share:,.0f} %" if share >= 10 else f"{100 * share:.3g} %"
 
 
 def _with_drop(row: Row, baseline: Row) -> Row:
@@ -334,8 +286,8 @@ def _drop_words(drop: Measurement) -> str:
         "error_increase": "action error",
     }
     name = subject[drop.name]
-    if drop.name == "error_increase" and drop.note == AGAINST_FLOAT32:
-        return f"the action differs from float32's by {100 * drop.value:.3g} % of its standard deviation"
+    if drop.note == AGAINST_FLOAT32:
+        return _distance_words(drop if drop.name == "error_increase" else replace(drop, name="disagreement"))
     if drop.name == "error_increase":
         return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
     verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")
@@ -348,6 +300,7 @@ def _points(share: float) -> str:
     return f"{points} point" + ("" if points == "1" else "s")
 
 
-def _p50(row: Row, origin: str = "measured") -> float:
+def p50(row: Row, origin: str = "measured") -> float:
+    """Return the median latency of a row in ms, infinite when it is not known."""
     found = row.get("latency_p50", origin)
     return found.value if found is not None and found.known else math.inf

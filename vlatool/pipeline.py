@@ -10,21 +10,23 @@ from typing import Any
 
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle import Bundle
+from vlatool.choice import choose
+from vlatool.credibility import Credibility, credibility
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
-from vlatool.evaluate._paired import compare_success
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
+from vlatool.evidence import with_accuracy
 from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
 from vlatool.host import fingerprint, matches
-from vlatool.judge import Judged, budget_of, choose, judge
+from vlatool.judge import Judged, budget_of, judge
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.predict import predictions
 from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import Report, Row
 from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
 from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
@@ -151,7 +153,8 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
     Finished stages are kept in the cache, so that an interrupted run continues where it was.
 
     Returns:
-        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept).
+        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept), ``inconclusive``
+        when float32 does no better than actions that do not look at the observation.
     """
     with writing(out, force=force) as draft:
         source = cached_transform(plan.source, None, plan.cache, context)
@@ -160,19 +163,39 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         plan, searched = _searched(plan, baseline, context)
         bundles, failures = _candidates(plan, baseline, context)
         rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
-        on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
-        judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
-        small = plan.recipe.limits.max_memory_mb is not None
-        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+        judged, trust = judged_rows(plan, rows)
         tables = {**searched, **_explained(judged, bundles, baseline, context)}
         judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
         chosen = next(item.row for item in judged if item.row.role == "chosen")
         chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
-        report = _report(plan, baseline, judged, failures, warnings, context)
+        report = _report(plan, baseline, judged, failures, warnings, trust, context)
         report = replace(report, summary=(*report.summary, *_needs(chosen_bundle)))
         _write_bundle(plan, chosen, chosen_bundle, draft)
         write_reports(report, draft / "reports")
     return report
+
+
+def judged_rows(plan: Plan, rows: dict[str, Row]) -> tuple[list[Judged], Credibility]:
+    """Hold every row against the limits of the plan, choose one, and say whether float32 does its task.
+
+    Args:
+        plan: With limits and board.
+        rows: Name -> row with everything that was measured and predicted, float32 first.
+    """
+    on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
+    judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
+    small = plan.recipe.limits.max_memory_mb is not None
+    judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+    trust = credibility(rows[BASELINE], BASELINE)
+    if trust.table:
+        judged[0] = _with_tables(judged[0], {"Whether the reference does its task": list(trust.table)})
+    return judged, trust
+
+
+def verdict_of(judged: list[Judged], trust: Credibility) -> str:
+    """Return ``pass``, ``fail``, or ``inconclusive`` where nothing can be held against the reference."""
+    chosen = next(item for item in judged if item.row.role == "chosen")
+    return "inconclusive" if trust.fails else "pass" if chosen.within else "fail"
 
 
 def _needs(bundle: Bundle) -> tuple[str, ...]:
@@ -231,7 +254,8 @@ def _limits(limits: Limits) -> list[str]:
     told = [f"{limits.metric} <= {limits.max_metric:g}" if limits.metric else drop]
     told += [f"{limits.hz:g} Hz"] if limits.hz else []
     told += [f"latency <= {limits.max_latency_ms:g} ms"] if limits.max_latency_ms else []
-    return told + ([f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else [])
+    told += [f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else []
+    return told + ([] if limits.metric else [f"distance from float32 <= {100 * limits.max_distance:g} %"])
 
 
 def _transforms(stages: Any) -> tuple[Transform, ...]:
@@ -276,21 +300,10 @@ def _measure(
 ) -> tuple[dict[str, Row], tuple[str, ...]]:
     """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
     rows, warnings = _latency_rows(plan, source, bundles, context)
-    loop = plan.closed_loop
-    success: dict[str, Row] = {}
-    for name, bundle in bundles.items():
-        found: list[Measurement] = []
-        if EVALUATION in bundle.manifest.files:
-            recorded = Recorded(baseline=None if name == BASELINE else bundles[BASELINE].path)
-            found += cached_measure(recorded, bundle, plan.cache, context).rows[-1].measurements
-        row = rows[name]
-        if loop is not None:
-            success[name] = cached_measure(loop, bundle, plan.cache, context).rows[-1]
-            paired = success[name] if name == BASELINE else compare_success(success[BASELINE], success[name])
-            found += paired.measurements
-            row = replace(row, raw={**row.raw, **paired.raw}, details={**row.details, **paired.details})
-        found += predictions(plan.profile, bundle) if plan.profile else []
-        rows[name] = replace(row, measurements=(*row.measurements, *found))
+    rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
+    if plan.profile:
+        foretold = {name: predictions(plan.profile, bundle) for name, bundle in bundles.items()}
+        rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}
     return rows, warnings
 
 
@@ -322,6 +335,7 @@ def _report(
     judged: list[Judged],
     failures: list[Row],
     notes: tuple[str, ...],
+    trust: Credibility,
     context: Context,
 ) -> Report:
     rows = tuple(item.row for item in judged) + tuple(failures)
@@ -332,12 +346,15 @@ def _report(
     if wanted.metric:
         limits = {wanted.metric: wanted.max_metric, "hz": wanted.hz, "profile": plan.board}
     limits |= {"max_latency_ms": wanted.max_latency_ms, "max_memory_mb": wanted.max_memory_mb}
-    warnings = tuple(dict.fromkeys([*notes, *(warning for item in judged for warning in item.warnings)]))
+    limits |= {} if wanted.metric else {"max_distance_percent": 100 * wanted.max_distance}
+    warnings = tuple(
+        dict.fromkeys([*notes, *trust.warnings, *(warning for item in judged for warning in item.warnings)])
+    )
     return Report(
         "optimize",
         f"{baseline.manifest.name} for {plan.board}",
-        "pass" if chosen.within else "fail",
-        summary=chosen.sentences,
+        verdict_of(judged, trust),
+        summary=(*trust.sentences, *chosen.sentences, *filter(None, [trust.floor])),
         rows=rows,
         limits={key: value for key, value in limits.items() if value is not None},
         command=context.command,

@@ -20,6 +20,12 @@ class Limits(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_drop: float = Field(0.01, ge=0, le=1, description="largest drop against float32, a share (0.01 = 1 point)")
+    max_distance: float = Field(
+        0.25,
+        ge=0,
+        description="largest distance from float32's own actions: mean |difference| / standard deviation, "
+        "or the share of other answers",
+    )
     metric: str = Field("", description="a measurement that decides instead, such as relative_error, or unit:m")
     max_metric: float | None = Field(None, ge=0, description="largest value of that measurement")
     hz: float | None = Field(None, gt=0, description="inferences per second")

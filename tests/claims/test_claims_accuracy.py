@@ -50,6 +50,26 @@ def test_without_an_expert_the_baselines_actions_are_right(
     assert examine(float_bundle, float_bundle, claim, Context()).measurements[0].value == 0
 
 
+def test_a_baseline_that_does_not_do_its_task_decides_nothing(float_bundle: Bundle, tmp_path: Path) -> None:
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files}
+    np.savez(tmp_path / "other.npz", **data | {"action": data["action"][::-1]})
+    claim = AccuracyClaim(max_drop=1.0, data=tmp_path / "other.npz")
+    found = examine(float_bundle, float_bundle, claim, Context())
+    assert found.verdict == "inconclusive"
+    assert found.sentence.startswith("The reference fails, so that nothing can be held against it: the baseline makes")
+    assert {each.name for each in found.baseline} == {"skill_expert", "variation"}
+
+
+def test_a_world_that_everybody_succeeds_in_decides_nothing(float_bundle: Bundle, policy_dir: Path) -> None:
+    world = policy_dir / "environment.py"
+    world.write_text(world.read_text().replace('{"success": done and good}', '{"is_success": True}'))
+    claim = AccuracyClaim(max_drop=0.5, episodes=8, policy=policy_dir)
+    found = examine(float_bundle, float_bundle, claim, Context())
+    assert found.verdict == "inconclusive"
+    assert "100.0% of 8 closed-loop episodes, and actions that do not look" in found.sentence
+
+
 def test_episodes_are_paired(float_bundle: Bundle, int8_bundle: Bundle, policy_dir: Path) -> None:
     claim = AccuracyClaim(max_drop=0.5, episodes=8, policy=policy_dir)
     found = examine(int8_bundle, float_bundle, claim, Context())

@@ -88,6 +88,33 @@ def test_a_baseline_plays_the_same_seeds_and_is_paired(paired):
     assert "80.0% of 20 episodes succeed" in paired.summary[0]
 
 
+def test_the_baseline_must_succeed_more_often_than_who_does_not_look(paired, float_bundle, world):
+    chance = paired.rows[0].get("success_chance")
+    assert (chance.samples, chance.value < 0.4) == (20, True)
+    assert "the better of random and constant" in chance.note
+    assert paired.verdict == "info"
+    ends = "return self.reset()[0], 0.0, True, False, {'is_success': True}"
+    easy = ClosedLoop(environment=world(ends), tasks=("reach",), episodes=4, baseline=float_bundle.path)
+    report = easy.run(float_bundle, Context())
+    assert report.verdict == "inconclusive"
+    assert "100.0% of 4 closed-loop episodes, and actions that do not look" in report.summary[0]
+
+
+@pytest.mark.parametrize("control", ["random", "constant"])
+def test_a_control_acts_without_looking(int8_bundle, policy_template, control):
+    one, two = (evaluated(int8_bundle, policy_template, control=control) for _ in range(2))
+    assert one.rows == two.rows
+    assert one.rows[0].value("success") < 0.4
+    assert f"with {control} actions in the place of the policy's" in one.summary[0]
+
+
+def test_an_environment_that_never_tells_success_is_an_error(int8_bundle, world):
+    ends = "return self.reset()[0], 0.0, True, False, {'reached': True}"
+    stage = ClosedLoop(environment=world(ends), tasks=("reach",), episodes=2, first_seed=3)
+    with pytest.raises(DataError, match="never told whether the episode of seed 3 succeeded"):
+        stage.run(int8_bundle, Context())
+
+
 def test_two_workers_give_what_one_gives(paired, float_bundle, int8_bundle, policy_template):
     again = evaluated(int8_bundle, policy_template, workers=2, baseline=float_bundle.path)
     assert again.rows == paired.rows

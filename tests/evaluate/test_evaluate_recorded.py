@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -105,7 +106,7 @@ def test_data_without_expert_actions_or_episodes_is_still_run(float_bundle, poli
     with np.load(policy_template / "evaluation.npz") as data:
         np.savez(tmp_path / "bare.npz", **{name: data[name] for name in ("image", "proprio", "instruction")})
     _, row = Recorded(data=tmp_path / "bare.npz", baseline=float_bundle.path).run(float_bundle, Context()).rows
-    wanted = {"error_baseline", "error_baseline.dx", "error_baseline.dy", "relative_error"}
+    wanted = {"error_baseline", "error_baseline.dx", "error_baseline.dy", "relative_error", "variation"}
     assert {each.name for each in row.measurements} == wanted
 
 
@@ -141,7 +142,38 @@ def test_an_element_that_never_moves_does_not_divide_by_zero():
     wanted = np.zeros((3, 1, 2))
     found = by_name(compare(ARM, wanted + 1.0, wanted, "expert"))
     assert math.isnan(found["error_expert"].value)
+    assert found["error_expert"].note == "the expert's action never varies, so no error relative to its spread"
     assert found["error_expert.dx"].value == 1.0
+
+
+def with_action(float_bundle, copied, change):
+    """A copy of the bundle whose expert acts otherwise."""
+    bundle = copied(float_bundle)
+    with np.load(bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files}
+    np.savez(bundle.path / "data/evaluation.npz", **data | {"action": change(data["action"])})
+    return seal(bundle.path, bundle.manifest)
+
+
+def test_a_constant_expert_is_told_in_words_and_never_as_nan(float_bundle, copied):
+    bundle = with_action(float_bundle, copied, lambda action: action * 0 + np.float32(0.1))
+    report = Recorded(baseline=float_bundle.path, data=bundle.path / "data/evaluation.npz").run(bundle, Context())
+    told = " ".join((*report.summary, *report.warnings))
+    assert "nan" not in told
+    assert "the expert's action never varies" in told
+    assert re.search(r"d[xy] is off by 0\.\d+ m on average", told)
+    assert "NaN" not in report.to_json()
+    assert report.verdict == "inconclusive"
+
+
+def test_a_baseline_that_does_no_better_than_a_constant_action_is_said(float_bundle, copied):
+    assert Recorded(baseline=float_bundle.path).run(float_bundle, Context()).verdict == "info"
+    bundle = with_action(float_bundle, copied, lambda action: action[::-1])
+    data = bundle.path / "data/evaluation.npz"
+    report = Recorded(baseline=float_bundle.path, data=data).run(float_bundle, Context())
+    assert report.verdict == "inconclusive"
+    assert report.summary[0].startswith("The reference fails, so that nothing can be held against it")
+    assert Recorded(data=data).run(float_bundle, Context()).verdict == "info", "alone, nothing is held against it"
 
 
 def test_chunks_of_unequal_length_are_compared_as_far_as_both_go():

@@ -5,6 +5,8 @@ import numpy as np
 import onnx
 import pytest
 
+from vlatool.benchmark._job import Job
+from vlatool.benchmark._worker import measure, opened
 from vlatool.bundle import Bundle, hash_file
 from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
@@ -155,6 +157,19 @@ def test_a_program_of_two_graphs_with_repeat_carry_schedule_and_noise(source, tm
     seeded = [load(made.path, threads=1, seed=4).infer(observation).chunk for _ in range(2)]
     np.testing.assert_array_equal(*seeded)
     assert not np.allclose(seeded[0], wanted)
+
+
+def test_eager_torch_and_the_graphs_draw_the_same_noise(source, tmp_path: Path):
+    """A false alarm otherwise: two passes of a policy with noise answer alike, in torch as in the engine."""
+    bundle = source(FLOW_PY, FLOW_YAML)
+    made = export(bundle, tmp_path / "out")
+    observation = {"state": np.array([0.1, -0.5, 2.0], np.float32)}
+    job = Job((str(made.path), str(bundle.path)), iterations=40, warmup=1)
+    contestants = [opened(path, job) for path in job.bundles]
+    graphs, eager = (each.policy.infer(observation).chunk for each in contestants)
+    np.testing.assert_allclose(graphs, eager, rtol=1e-4, atol=1e-6)
+    found = measure(contestants, job, lambda what, share: None)
+    assert [each["answers"]["strays"] for each in found["policies"]] == [0, 0]
 
 
 def test_progress_is_told(plain, tmp_path: Path):

@@ -150,7 +150,7 @@ def opened(path: str, job: Job) -> Contestant:
     elif "factory" in manifest.source:
         from vlatool.export._torch_policy import torch_policy
 
-        policy = torch_policy(bundle)
+        policy = torch_policy(bundle, seed=0)
         _set_torch_threads(job.threads)
     else:
         raise BundleError(f"{bundle.path} has nothing to run.")

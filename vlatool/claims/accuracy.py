@@ -10,13 +10,14 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.claims._found import CONFIDENCE, Found, worst
+from vlatool.credibility import DECIDE, credibility
 from vlatool.data import read_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._losses import drop, losses
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.evaluate.recorded import EVALUATION, run_recorded
+from vlatool.evaluate.recorded import EVALUATION, alone, run_recorded
 from vlatool.gate import AccuracyClaim
-from vlatool.report import Measurement
+from vlatool.report import Measurement, Row
 from vlatool.stage import Context
 from vlatool.statistics import paired_drop
 
@@ -31,6 +32,7 @@ class _Drop:
     low: float
     high: float
     samples: int
+    baseline: tuple[Measurement, ...] = ()
 
     def verdict(self, allowed: float) -> str:
         return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
@@ -66,7 +68,11 @@ def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: 
                     confidence=CONFIDENCE, note=each.words)
         for each in drops
     )  # fmt: skip
-    return Found("accuracy", worst(each.verdict(claim.max_drop) for each in drops), "; ".join(said), measured)
+    baselines = tuple(found for each in drops for found in each.baseline if found.name in DECIDE)
+    trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
+    verdict = "inconclusive" if trust.fails else worst(each.verdict(claim.max_drop) for each in drops)
+    told = [sentence.rstrip(".") for sentence in trust.sentences]
+    return Found("accuracy", verdict, "; ".join([*told, *said, *trust.warnings]), measured, baselines)
 
 
 def finite(bound: float) -> float | None:
@@ -92,11 +98,12 @@ def data_of(candidate: Bundle, claim: AccuracyClaim) -> Path | None:
 def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context) -> _Drop:
     stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy)
     stage.check(candidate, None)
-    before, after = (row.raw["success"] for row in stage.run(candidate, context).rows)
+    rows = stage.run(candidate, context).rows
+    before, after = (row.raw["success"] for row in rows)
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
     value, low, high = paired_drop(lost, won, len(before), CONFIDENCE)
-    return _Drop("success_drop", "more failed episodes:", value, low, high, len(before))
+    return _Drop("success_drop", "more failed episodes:", value, low, high, len(before), rows[0].measurements)
 
 
 def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context) -> _Drop:
@@ -105,13 +112,13 @@ def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context)
     action = candidate.manifest.spec.action
     mine, theirs = (run_recorded(bundle, recording, indices, "", context) for bundle in (candidate, baseline))
     episodes = None if recording.episodes is None else recording.episodes[indices]
-    if recording.actions is None:  # nobody says what is right: the baseline's own actions are
+    expert = None if recording.actions is None else recording.actions[indices]
+    baselines = tuple(alone(action, theirs, expert, episodes))
+    if expert is None:  # nobody says what is right: the baseline's own actions are
         off, before = losses(action, mine, theirs), np.zeros(len(indices))
         words = "distance from the baseline's actions:"
     else:
-        expert = recording.actions[indices]
         off, before = losses(action, mine, expert), losses(action, theirs, expert)
         words = "more distance from the expert's actions than the baseline has:"
-    return _Drop(
-        "recorded_drop", words, *drop(off, before, episodes, CONFIDENCE, action.kind == "discrete"), len(indices)
-    )
+    lost = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
+    return _Drop("recorded_drop", words, *lost, len(indices), baselines)

@@ -22,6 +22,9 @@ def optimize(
     max_drop: Annotated[
         str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")
     ] = None,
+    max_distance: Annotated[
+        str | None, typer.Option(help="largest distance from float32's own actions, by their spread (25%)")
+    ] = None,
     hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
     max_latency_ms: Annotated[float | None, typer.Option(min=0.001, help="largest latency of one inference")] = None,
     max_memory_mb: Annotated[float | None, typer.Option(min=1, help="largest memory of the process")] = None,
@@ -44,7 +47,8 @@ def optimize(
 ) -> None:
     """Export a policy, quantize it in several ways, measure and evaluate each, and keep the fastest inside the budget.
 
-    Exits 0 when a candidate keeps to the limits, 1 when none does (the nearest one is kept).
+    Exits 0 when a candidate keeps to the limits, 1 when none does (the nearest one is kept), and 5 when float32 does no
+    better than actions that do not look at the observation, so that nothing can be held against it.
     """
     from vlatool import pipeline
     from vlatool.launch import cache_directory
@@ -57,6 +61,7 @@ def optimize(
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}
     asked: dict[str, Any] = {} if max_drop is None else budget(max_drop)
+    asked |= {} if max_distance is None else {"max_distance": share(max_distance, "--max-distance")}
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
     for name, value in limits.items():
         if value is not None and not math.isfinite(value):
@@ -100,7 +105,7 @@ def budget(text: str) -> dict[str, Any]:
     return {"max_drop": share(text), "metric": "", "max_metric": None}
 
 
-def share(text: str) -> float:
+def share(text: str, option: str = "--max-drop") -> float:
     """Read ``1%`` or ``0.01`` as a share.
 
     Raises:
@@ -109,8 +114,9 @@ def share(text: str) -> float:
     match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(%?)\s*", text)
     value = float(match[1]) / (100 if match[2] else 1) if match else -1.0
     if not 0 <= value <= 1:
+        more = ", METRIC=VALUE such as relative_error=0.04, or an action error such as 0.002m"
         raise UsageError(
-            f"--max-drop is '{text}'; allowed: a percentage such as 1%, a share from 0 to 1 such as 0.01, "
-            "METRIC=VALUE such as relative_error=0.04, or an action error such as 0.002m."
+            f"{option} is '{text}'; allowed: a percentage such as 1%, a share from 0 to 1 such as 0.01"
+            f"{more if option == '--max-drop' else ''}."
         )
     return value

@@ -15,6 +15,8 @@ from typing import Any
 from vlatool.apart import spread
 from vlatool.bundle import Bundle
 from vlatool.errors import DataError, VlatoolError
+from vlatool.evaluate._controls import Array, Blind, answers_of
+from vlatool.evaluate._success import Success
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import Policy
 from vlatool.sources._factory import call_factory, exits_told
@@ -33,6 +35,7 @@ class Job:
     task: str
     seeds: tuple[int, ...]
     instruction: str = "right"
+    control: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ class Worker:
 
     def __init__(self, path: str, engine: str) -> None:
         self.queue = ChunkQueue(Policy.open(Bundle.open(Path(path)), engine=engine, threads=1, seed=0))
+        self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
         self._environment: Any = None
 
@@ -100,7 +104,15 @@ class Worker:
     def play(self, job: Job, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
         environment = self.environment(job)
-        return [_episode(environment, self.queue, job.task, seed, limit) for seed in job.seeds]
+        return [_episode(environment, self._actor(job.control, seed), job.task, seed, limit) for seed in job.seeds]
+
+    def _actor(self, control: str, seed: int) -> ChunkQueue | Blind:
+        """Return who acts: the policy, or a control that does not look."""
+        if not control:
+            return self.queue
+        if self._answers is None:
+            self._answers = answers_of(self.queue.policy)
+        return Blind(control, self.queue.policy.spec.action, self._answers, seed)
 
     def close(self) -> None:
         """Close the open environment; one that fails to close has done its work all the same."""
@@ -130,18 +142,20 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
     _worker = None
 
 
-def _episode(environment: Any, queue: ChunkQueue, task: str, seed: int, limit: int) -> Outcome:
+def _episode(environment: Any, queue: ChunkQueue | Blind, task: str, seed: int, limit: int) -> Outcome:
     try:
         with exits_told(f"the environment of task '{task}', at seed {seed},"):
             observation, _ = environment.reset(seed=seed)
             queue.reset()
+            told = Success()
             for step in range(1, limit):
                 action = queue.act(observation)
                 observation, _, terminated, truncated, info = environment.step(
                     action.item() if action.ndim == 0 else action
                 )
+                told.look(info)
                 if terminated or truncated:
-                    return Outcome(task, seed, bool(info.get("success", False)), step)
+                    return Outcome(task, seed, told.at_the_end(task, seed), step)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: a user's environment may raise anything

@@ -12,6 +12,8 @@ from vlatool.statistics import paired_drop, student
 
 Array = NDArray[Any]
 DRAWS = 4000
+ROUNDING = 1e-6
+"""Share of the largest value below which a standard deviation is that of rounding."""
 
 
 def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
@@ -25,11 +27,18 @@ def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
         return np.asarray((got.reshape(count, -1) != wanted.reshape(count, -1)).mean(axis=1), np.float64)
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
-    spread = wanted.std(axis=(0, 1))
+    spread = spread_of(wanted)
     varied = spread > 0
     if not varied.any():
         return np.asarray(np.abs(got - wanted).mean(axis=(1, 2)))
     return np.asarray((np.abs(got - wanted)[..., varied] / spread[varied]).mean(axis=(1, 2)))
+
+
+def spread_of(actions: Array) -> Array:
+    """Return the standard deviation of each element of (N, T, A) actions, (A,); 0 where it is that of rounding."""
+    wide = actions.astype(np.float64)
+    spread = wide.std(axis=(0, 1))
+    return np.where(spread > ROUNDING * np.abs(wide).max(axis=(0, 1)), spread, 0.0)
 
 
 def drop(

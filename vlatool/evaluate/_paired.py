@@ -38,6 +38,15 @@ def _by_task(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     return table
 
 
+def with_chance(row: Row, controls: Sequence[Row]) -> Row:
+    """Return the row with ``success_chance``: how often the better control succeeds, with its Wilson interval."""
+    rates = [(each.name, found) for each in controls if (found := each.get("success")) is not None]
+    name, best = max(rates, key=lambda pair: pair[1].value)
+    note = f"{name} actions, the better of {' and '.join(name for name, _ in rates)}"
+    chance = replace(best, name="success_chance", note=note)
+    return replace(row, measurements=(*row.measurements, chance))
+
+
 def compare_success(baseline: Row, row: Row) -> Row:
     """Return the row with ``success_drop`` and McNemar's exact test, episode by episode.
 

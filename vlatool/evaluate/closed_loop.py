@@ -9,9 +9,11 @@ from pydantic import Field
 
 from vlatool import trust
 from vlatool.bundle import MANIFEST, Bundle
+from vlatool.credibility import Credibility, credibility
 from vlatool.errors import DataError, SourceError, UsageError, nearest
+from vlatool.evaluate._controls import CONTROLS
 from vlatool.evaluate._episodes import Job, run_jobs
-from vlatool.evaluate._paired import compare_success, success_row
+from vlatool.evaluate._paired import compare_success, success_row, with_chance
 from vlatool.host import fingerprint
 from vlatool.report import Report, Row
 from vlatool.sources._description import read_description
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 FIRST_SEED = 5_000_000
+CONTROL_EPISODES = 20
+"""Episodes of each control, or a tenth of the policy's where that is more."""
 SLICE = 10
 """Episodes of one task that a worker runs at a time."""
 
@@ -29,6 +33,7 @@ SLICE = 10
 class ClosedLoop(Measure):
     """Run episodes in a gymnasium environment: success rate with Wilson interval, and McNemar's exact test when paired.
 
+    With a baseline, actions that do not look at the observation are played, too: it must succeed more often than they.
     Episode ``k`` of a task has the seed ``first_seed + k`` for every bundle, so that outcomes are paired.
     """
 
@@ -38,6 +43,9 @@ class ClosedLoop(Measure):
     episodes: int = Field(200, ge=1, description="episodes over all tasks, spread evenly")
     first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode of every task")
     baseline: Path | None = Field(None, description="bundle to pair with, usually float32")
+    control: Literal["", "random", "constant"] = Field(
+        "", description="actions that do not look, in the place of the policy's: what succeeds by chance"
+    )
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
 
@@ -59,18 +67,38 @@ class ClosedLoop(Measure):
         jobs = self._jobs(source)
         self._may_run(jobs[0])
         rows: list[Row] = []
+        believed = Credibility("unknown")
         if self.baseline:
-            rows.append(
-                success_row("baseline", "baseline", run_jobs(Bundle.open(self.baseline), jobs, self.engine, context))
-            )
+            rows.append(self._reference(Bundle.open(self.baseline), jobs, context))
+            believed = credibility(rows[0]) if self.instruction == "right" else believed
         row = success_row(source.manifest.name, "subject", run_jobs(source, jobs, self.engine, context))
         rows.append(compare_success(rows[0], row) if rows else row)
         success = rows[-1].get("success")
         count = success.samples if success else 0
         told = "" if self.instruction == "right" else " told the wrong instruction"
         title = f"{source.manifest.name}{told} in {count} closed-loop episodes"
+        told = f" with {self.control} actions in the place of the policy's" if self.control else told
         text = f"{row.value('success'):.1%} of {count} episodes succeed{told and ',' + told}."
-        return Report("evaluate", title, summary=(text,), rows=tuple(rows), environment=fingerprint())
+        verdict = "inconclusive" if believed.fails else "info"
+        return Report(
+            "evaluate", title, verdict, (*believed.sentences, text), tuple(rows), environment=fingerprint(),
+            warnings=believed.warnings,
+        )  # fmt: skip
+
+    def _reference(self, baseline: Bundle, jobs: list[Job], context: Context) -> Row:
+        """Play the baseline, and the controls that show what succeeds by chance."""
+        row = success_row("baseline", "baseline", run_jobs(baseline, jobs, self.engine, context))
+        if self.instruction != "right":
+            return row
+        return with_chance(
+            row, [success_row(each.control, "subject", run_jobs(baseline, each._jobs(baseline), self.engine, context))
+                  for each in self.controls()]
+        )  # fmt: skip
+
+    def controls(self) -> list[ClosedLoop]:
+        """Return the evaluations that show what succeeds by chance, on the first of the same seeds."""
+        episodes = min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))
+        return [self.model_copy(update={"control": each, "episodes": episodes, "baseline": None}) for each in CONTROLS]
 
     def _may_run(self, job: Job) -> None:
         """Let the environment's code run where it was named in the options; what a bundle names must be trusted.
@@ -113,4 +141,6 @@ class ClosedLoop(Measure):
         each = -(-self.episodes // len(tasks))
         seeds = range(self.first_seed, self.first_seed + each)
         slices = [tuple(seeds[start : start + SLICE]) for start in range(0, each, SLICE)]
-        return [Job(where, str(folder), task, part, self.instruction) for task in tasks for part in slices]
+        return [
+            Job(where, str(folder), task, part, self.instruction, self.control) for task in tasks for part in slices
+        ]

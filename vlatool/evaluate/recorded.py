@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from vlatool.bundle import MANIFEST, Bundle
+from vlatool.credibility import Credibility, credibility
 from vlatool.data import Recording, read_recording
 from vlatool.errors import DataError
+from vlatool.evaluate._losses import spread_of
+from vlatool.evaluate._skill import skill, variation
 from vlatool.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import Policy
@@ -28,6 +31,11 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 EVALUATION = "data/evaluation.npz"
 KEPT = 4
+NEVER_VARIES = {
+    "expert": "the expert's action never varies, so no error relative to its spread",
+    "baseline": "the baseline's action never varies, so no error relative to its spread",
+}
+"""Why an error against the expert or the baseline is unknown."""
 REFERENCES: dict[tuple[Any, ...], Array] = {}
 """What baselines gave, of the last ``KEPT``."""
 
@@ -55,19 +63,24 @@ class Recorded(Measure):
         indices = recording.spread(self.samples)
         action = source.manifest.spec.action
         expert = None if recording.actions is None else recording.actions[indices]
+        episodes = None if recording.episodes is None else recording.episodes[indices]
         reference: Array | None = None
         rows = []
         if self.baseline:
             reference = self._reference(Bundle.open(self.baseline), source, recording, indices, context)
-            rows.append(Row("baseline", "baseline", measurements=tuple(compare(action, reference, expert, "expert"))))
+            own = alone(action, reference, expert, episodes)
+            rows.append(Row("baseline", "baseline", measurements=tuple(own)))
         got = run_recorded(source, recording, indices, self.engine, context)
-        measurements = compare(action, got, expert, "expert")
+        measurements = alone(action, got, expert, episodes)
         if reference is not None:
             measurements += compare(action, got, reference, "baseline")
         rows.append(Row(source.manifest.name, measurements=tuple(measurements)))
         title = f"{source.manifest.name} on {len(indices)} recorded observations"
+        trust = credibility(rows[0]) if self.baseline else Credibility("unknown")
         text = f"{title}: {_summary(rows[-1])}."
-        return Report("evaluate", title, summary=(text,), rows=tuple(rows), environment=fingerprint())
+        verdict = "inconclusive" if trust.fails else "info"
+        said = (*trust.sentences, text)
+        return Report("evaluate", title, verdict, said, tuple(rows), environment=fingerprint(), warnings=trust.warnings)
 
     def _reference(
         self, baseline: Bundle, source: Bundle, recording: Recording, indices: Sequence[int], context: Context
@@ -99,9 +112,26 @@ def _summary(row: Row) -> str:
         agreement, error = row.get(f"agreement_{whose}"), row.get(f"error_{whose}")
         if agreement is not None:
             told.append(f"{agreement.value:.1%} of the actions are those of {words}")
-        elif error is not None:
+        elif error is not None and error.known:
             told.append(f"actions differ from {words}'s by {error.value:.1%} of their standard deviation")
+        elif error is not None:
+            told.append(f"{error.note}; {_worst(row, f'error_{whose}.')}")
     return "; ".join(told) or "nothing to compare with"
+
+
+def _worst(row: Row, start: str) -> str:
+    """Return the largest error of an element, in its unit."""
+    worst = max((each for each in row.measurements if each.name.startswith(start)), key=lambda each: each.value)
+    unit = "" if worst.unit == "1" else f" {worst.unit}"
+    return f"{worst.name.removeprefix(start)} is off by {worst.value:.3g}{unit} on average"
+
+
+def alone(action: TensorSpec, got: Array, expert: Array | None, episodes: Array | None) -> list[Measurement]:
+    """Return what the actions of one policy say without another one: against the expert's, and how much they vary."""
+    found = compare(action, got, expert, "expert")
+    if expert is not None:
+        found.append(skill(action, got, expert, episodes))
+    return [*found, *variation(action, got, expert)]
 
 
 def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], engine: str, context: Context) -> Array:
@@ -139,11 +169,13 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     labels = action.labels or tuple(str(index) for index in range(action.width))
     errors = np.abs(got - wanted)
     mean, count = errors.mean(axis=(0, 1)), len(got)
-    spread = wanted.std(axis=(0, 1))
-    relative = float(np.mean(mean[spread > 0] / spread[spread > 0])) if np.any(spread > 0) else math.nan
+    spread = spread_of(wanted)
+    varied = spread > 0
+    relative = float(np.mean(mean[varied] / spread[varied])) if varied.any() else math.nan
+    note = "mean |error| / standard deviation" if varied.any() else NEVER_VARIES[whose]
     norms = np.linalg.norm(wanted.reshape(count, -1), axis=1)
     distances = np.linalg.norm((got - wanted).reshape(count, -1), axis=1) / np.where(norms > 0, norms, 1.0)
-    found = [Measurement(f"error_{whose}", relative, "1", samples=count, note="mean |error| / standard deviation")]
+    found = [Measurement(f"error_{whose}", relative, "1", samples=count, note=note)]
     if whose == "baseline":
         note = "mean over samples of |difference|2 / |action|2"
         found.append(Measurement("relative_error", float(distances.mean()), "1", samples=count, note=note))

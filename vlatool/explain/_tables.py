@@ -189,9 +189,9 @@ def candidate_row(each: Candidate, contest: Contest, where: Mapping[str, Any], s
         if each is not reference:
             measurements.append(speedup(each.contestant, reference.contestant))
     if not math.isnan(each.error) and each is not contest.baseline:
-        note = "relative L2 error of the raw action to float32"
+        note = "mean over observations of |difference|2 / |raw action|2, to float32"
         count = len(each.contestant.observations) if each.contestant else 0
-        measurements.append(Measurement("error_baseline", each.error, "1", samples=count, note=note))
+        measurements.append(Measurement("raw_relative_error", each.error, "1", samples=count, note=note))
     role, reason = "subject", ""
     if each is contest.baseline:
         role = "baseline"

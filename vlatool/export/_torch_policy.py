@@ -68,11 +68,16 @@ def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> 
     module.load_state_dict(found)
 
 
-def torch_policy(source: Bundle) -> Policy:
-    """Open a source bundle in eager torch behind the interface of the runtime's policy."""
+def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
+    """Open a source bundle in eager torch behind the interface of the runtime's policy.
+
+    Args:
+        source: Of a torch policy.
+        seed: Of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
+    """
     modules = load_modules(source)
     sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
-    return Policy(source, Program(source.manifest.program, sessions), "torch eager")
+    return Policy(source, Program(source.manifest.program, sessions, seed), "torch eager")
 
 
 class TorchSession:

@@ -30,13 +30,18 @@ LABELS = {
     "wakeup_p99": "wake-up delay p99",
     "mcnemar_p": "McNemar p",
     "success_drop": "success drop",
+    "success_chance": "success by chance",
+    "skill_expert": "skill against a constant action",
+    "variation": "variation of the actions",
+    "relative_error": "relative error (L2)",
+    "raw_relative_error": "relative error (L2) of the raw action",
 }
 LIMIT_UNITS = {
     "ms": "ms", "s": "s", "mb": "MB", "gb": "GB", "hz": "Hz", "w": "W", "mj": "mJ", "j": "J", "m": "m", "rad": "rad",
     "points": "points", "percent": "%",
 }  # fmt: skip
 POINTS = ("_drop", "_points", "_difference")
-NOT_SHARES = re.compile(r"^error|(^|_)p(_?value)?$|ratio")
+NOT_SHARES = re.compile(r"^error|^skill|^variation|(^|_)p(_?value)?$|ratio")
 
 
 def plain(text: object) -> str:

@@ -1,0 +1,80 @@
+"""Whether an episode succeeded, as the info of its steps tells it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlatool.errors import DataError
+
+KEYS = ("success", "is_success")
+"""Where success may stand in the info of a step; the first that is there counts."""
+FIX = (
+    "let every episode tell it, also when it fails: info['success'] (or info['is_success']) is True or False in the "
+    "last step, or in an earlier one"
+)
+
+
+class Success:
+    """Listens to the info of every step of one episode: what was told last counts."""
+
+    def __init__(self) -> None:
+        self._said: bool | None = None
+
+    def look(self, info: Any) -> None:
+        """Read the info of a step.
+
+        Raises:
+            DataError: when one of the keys is there with something else than true or false.
+        """
+        said = told(info)
+        self._said = self._said if said is None else said
+
+    def at_the_end(self, task: str, seed: int) -> bool:
+        """Return whether the episode succeeded.
+
+        Raises:
+            DataError: when no step of the episode told it.
+        """
+        if self._said is None:
+            raise DataError(
+                f"The environment of task '{task}' never told whether the episode of seed {seed} succeeded: the info "
+                "of no step has 'success' or 'is_success'.",
+                FIX,
+            )
+        return self._said
+
+
+def told(info: Any) -> bool | None:
+    """Return what the info of a step says of success, None when it says nothing.
+
+    A vector environment of one keeps what belongs to the end in ``final_info``.
+
+    Raises:
+        DataError: when one of the keys is there with something else than true or false.
+    """
+    if not isinstance(info, Mapping):
+        return None
+    for key in KEYS:
+        if (value := _only(info.get(key))) is not None:
+            return _truth(key, value)
+    return told(_only(info.get("final_info")))
+
+
+def _only(value: Any) -> Any:
+    """Return the one element of an array or a list of one; everything else as it is."""
+    if isinstance(value, np.ndarray | list | tuple) and np.size(np.asarray(value, dtype=object)) == 1:
+        return np.asarray(value, dtype=object).reshape(-1)[0]
+    return value
+
+
+def _truth(key: str, value: Any) -> bool:
+    number = None
+    with contextlib.suppress(TypeError, ValueError):
+        number = None if isinstance(value, str | bytes) else float(value)
+    if number not in (0.0, 1.0):
+        raise DataError(f"info['{key}'] is {value!r:.60}; allowed: true or false (or 1 or 0).", FIX)
+    return bool(number)
