@@ -112,7 +112,9 @@ def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row
         measured += [each for claim in found for each in claim.baseline]
         return Row(name, "baseline", reason, tuple(measured), raw)
     measured += [each for claim in found for each in claim.measurements]
-    raw |= {"log_ratio": [pairs.log_ratio for pairs in timed.pairs]} if calls else {}
+    if calls:
+        raw["log_ratio"] = [pairs.log_ratio for pairs in timed.pairs]
+        raw["log_mean_ratio"] = [pairs.mean_log_ratio for pairs in timed.pairs]
     claims = [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]
     return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
 

@@ -2,7 +2,8 @@
 
 ``python -m vlatool.benchmark._agreement`` reads one line of JSON (the fields of ``_pairs.Job``) and prints one (those
 of ``Agreement``). Both are loaded as a robot loads them: every file is hashed, and the golden action must be computed.
-Each observation is answered twice, once right after ``reset`` and once in another order without it.
+Each observation is answered twice, once right after ``reset`` and once in another order without it; where values are
+kept by design, the second time is a row of inferences in which both answer the same.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import random
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ FEWEST = 24
 """Observations that are answered however long that takes."""
 STILL = 1e-6
 """Spread of an element, as a share of its size, up to which it is said not to vary."""
+SEQUENCE = "consecutive"
+"""Kind of the observations that policies which keep values answer in a row."""
 CLOSE = 0.25
 """Largest relative difference of outputs that do not vary (as of the golden action)."""
 
@@ -99,6 +102,10 @@ def run_agreement(job: Job) -> Agreement:
     ]
     pool = pool_of(job, baseline) if job.pairs else []
     asked, skipped = _asked(policies, pool, job)
+    if any(step.keep for step in baseline.manifest.program):
+        for policy in policies:
+            policy.reset()
+        asked += _asked(policies, [replace(each, kind=SEQUENCE) for each in pool], job, afresh=False)[0]
     strays = [_strays(policy, asked, which, job.seed) for which, policy in enumerate(policies)]
     kinds = dict.fromkeys(each.kind for each in asked)
     followed = [one for kind in kinds for one in _followed(policies, [each for each in asked if each.kind == kind])]
@@ -115,8 +122,8 @@ class _Asked:
     outputs: tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
-def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job) -> tuple[list[_Asked], int]:
-    """Ask both for every observation, some bits of which are new, right after a reset."""
+def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job, afresh: bool = True) -> tuple[list[_Asked], int]:
+    """Ask both for every observation, some bits of which are new, right after a reset (``afresh``) or in a row."""
     from vlatool.benchmark._answers import varied
     from vlatool.errors import GraphError
     from vlatool.runtime.program import draw
@@ -132,16 +139,21 @@ def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job) -> tuple[list
         observation = varied(drawn.observation, spec, numbers)
         noise = {name: draw(wanted, numbers) for step in steps for name, wanted in step.noise.items()} or None
         try:
-            theirs = _outputs(policies[0], observation, noise)
+            theirs = _outputs(policies[0], observation, noise, afresh)
         except GraphError:
             skipped += 1
             continue
-        found.append(_Asked(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise))))
+        found.append(
+            _Asked(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise, afresh)))
+        )
     return found, skipped
 
 
-def _outputs(policy: Any, observation: Mapping[str, Any], noise: Mapping[str, Any] | None) -> dict[str, Array]:
-    policy.reset()
+def _outputs(
+    policy: Any, observation: Mapping[str, Any], noise: Mapping[str, Any] | None, afresh: bool
+) -> dict[str, Array]:
+    if afresh:
+        policy.reset()
     return {name: np.array(value) for name, value in policy.infer(observation, noise=noise).outputs.items()}
 
 

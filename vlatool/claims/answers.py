@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vlatool.benchmark._agreement import Agreement, Followed
+from vlatool.benchmark._agreement import SEQUENCE, Agreement, Followed
 from vlatool.claims._found import Found, worst
 from vlatool.claims._timed import Timed
-from vlatool.data import DRAWN
+from vlatool.data import DRAWN, OTHER, RECORDED
 from vlatool.gate import AnswersClaim
 from vlatool.report import Measurement
+
+KINDS = {
+    RECORDED: "recorded observations with other bits",
+    OTHER: "recorded observations under another instruction",
+    DRAWN: "drawn observations",
+    SEQUENCE: "observations in a row",
+}
 
 
 def examine(agreement: Agreement, timed: Timed, claim: AnswersClaim) -> Found:
@@ -18,7 +25,7 @@ def examine(agreement: Agreement, timed: Timed, claim: AnswersClaim) -> Found:
     told = sorted(parts, key=lambda part: ("fail", "inconclusive", "pass").index(part[0]))
     measured = [
         Measurement("follows", each.correlation, "1", samples=each.samples,
-                    note=f"least correlation with the baseline's answers: {each.output}, {each.kind} observations")
+                    note=f"least correlation with the baseline's answers: {each.output}, {KINDS[each.kind]}")
         for each in _least(agreement.followed)
     ]  # fmt: skip
     return Found("answers", worst(verdict for verdict, _ in parts), "; ".join(words for _, words in told),
@@ -44,8 +51,8 @@ def _follows(agreement: Agreement, least: float) -> tuple[str, str]:
     if not judged:
         return "inconclusive", "the baseline answers none of the observations that were drawn for it"
     (lowest,) = judged
-    words = f"where nothing was recorded, its {lowest.output} follows the baseline's with a correlation of "
-    words += f"{lowest.correlation:.2f} ({lowest.samples} {lowest.kind} observations; allowed: from {least:.2f})"
+    words = f"on observations that nobody could know, its {lowest.output} follows the baseline's with a correlation of "
+    words += f"{lowest.correlation:.2f} ({lowest.samples} {KINDS[lowest.kind]}; allowed: from {least:.2f})"
     kept = lowest.correlation >= least
     return ("pass", words) if kept else ("fail", f"{words}; a policy that was trained anew may need another limit, or "
                                                  "none: answers: {follows: null}")  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vlatool.data._doubts import doubts
-from vlatool.data._drawn import DRAWN, RECORDED, Drawer, Drawn, read_drawn, save_drawn
+from vlatool.data._drawn import DRAWN, OTHER, RECORDED, Drawer, Drawn, read_drawn, save_drawn
 from vlatool.data._observations import (
     CALIBRATION,
     EVALUATION,
@@ -18,6 +18,7 @@ __all__ = [
     "CALIBRATION",
     "DRAWN",
     "EVALUATION",
+    "OTHER",
     "RECORDED",
     "Drawer",
     "Drawn",

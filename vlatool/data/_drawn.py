@@ -114,6 +114,8 @@ def words_of(path: Path) -> list[str]:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(f"The vocabulary {path} cannot be read: {error}.") from error
+    if not isinstance(data, dict) or not isinstance(data.get("model", {}), dict):
+        raise DataError(f"The vocabulary {path} is no mapping of words or tokens.")
     found = data.get("words") if data.get("kind") == "words" else data.get("model", {}).get("vocab", ())
     tokens = [item[0] if isinstance(item, list) else item for item in found or ()]
     if data.get("kind") == "words":

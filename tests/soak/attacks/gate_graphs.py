@@ -48,8 +48,9 @@ def own_output(model: onnx.ModelProto) -> str:
     """Rename what gives the first output, so that something else can give it; return the new name."""
     result = model.graph.output[0].name
     node = next(each for each in model.graph.node if result in each.output)
-    node.output[list(node.output).index(result)] = "own_result"
-    return "own_result"
+    own = f"own_result_of_{len(model.graph.node)}"
+    node.output[list(node.output).index(result)] = own
+    return own
 
 
 def above(value: str, limit: float) -> Change:
