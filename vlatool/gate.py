@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -26,7 +27,10 @@ class LatencyClaim(_Claim):
     warmup: int = Field(20, ge=1, description="calls of each bundle before the first that counts")
     seconds: float = Field(10.0, gt=0, description="after which a process begins no further pair (at least 30 of them)")
     worst: float = Field(0.5, ge=0, le=100, description="largest slowdown on any one observation, seen again and again")
-    threads: int = Field(1, ge=1, description="intra-op threads, of every claim; state those that the robot runs with")
+    threads: int = Field(1, ge=1, description="intra-op threads, for every claim; state those of the robot")
+    also_threads: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        (), description="further numbers of threads, for each of which the same is claimed of the latency"
+    )
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     timeout: float = Field(1800.0, gt=0, description="seconds after which a process that hangs ends, and the gate so")
 

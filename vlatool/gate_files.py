@@ -19,6 +19,7 @@ latency:
   looks: [10, 20, 40]  # processes after which it is judged; most changes are decided at the first
   pairs: 150           # calls of each bundle in a process
   threads: 1           # those that the robot runs with
+  # also_threads: [4]  # the same is claimed of the latency with so many threads
 
 accuracy:
   max_drop: 0.01       # one point, on the same samples (and episodes) as the baseline

@@ -62,7 +62,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
         found.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine))
     with Recorder(open_all(), PERIOD_S) as board:
         if gate.latency:
-            found.append(latency.examine(timed, gate.latency))
+            found += latency.examine_all(timed, gate.latency)
         if gate.deadline:
             found.append(deadline.examine(timed, gate.deadline))
     if gate.answers:
@@ -91,7 +91,7 @@ def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
 def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dict[str, Any]]:
     """Return what a reader needs to judge, or repeat, the gate: a row for each thing."""
     how = gate.latency or LatencyClaim()
-    found: dict[str, Any] = {"seed": inputs.seed, "threads": how.threads}
+    found: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
     found |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
     found |= {
         f"recording {path.path.name}": f"sha256:{hash_file(path.path)}"

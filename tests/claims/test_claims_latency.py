@@ -7,7 +7,7 @@ import pytest
 
 from vlatool.benchmark._pairs import Pairs
 from vlatool.claims import _timed
-from vlatool.claims.latency import change, examine, slower, told
+from vlatool.claims.latency import change, examine, examine_all, slower, told
 from vlatool.gate import LatencyClaim
 from vlatool.regression import Decision
 
@@ -54,6 +54,22 @@ def test_one_observation_that_is_slow_each_time_fails(timed, monkeypatch, slow: 
     assert ("1 of 10 processes found an observation that is slower by more than 50% each time: recorded: 3x"
             in found.sentence) == (verdict == "fail")  # fmt: skip
     assert examine(processes, LatencyClaim(worst=2.5)).verdict == "pass"
+
+
+@pytest.mark.parametrize(("slow", "verdicts"), [(4, ["pass", "fail"]), (1, ["fail", "pass"])])
+def test_each_number_of_threads_is_a_claim_of_its_own(timed, monkeypatch, slow: int, verdicts: list[str]) -> None:
+    """As fast as the baseline with one thread, slower with four: and the other way round."""
+
+    def measured(job, timeout):
+        base = 5 * np.exp(0.02 * np.random.default_rng(job.seed).normal(size=60))
+        return Pairs(tuple(base), tuple(base * (1.3 if job.threads == slow else 1.0)))
+
+    processes = timed()
+    monkeypatch.setattr(_timed, "measure_pairs", measured)
+    found = examine_all(processes, LatencyClaim(also_threads=(4,)))
+    assert [each.verdict for each in found] == verdicts
+    assert [each.claim for each in found] == ["latency", "latency, 4 threads"]
+    assert len({each.name for part in found for each in part.measurements}) == 4
 
 
 def test_a_process_that_was_measured_is_not_measured_again(timed) -> None:

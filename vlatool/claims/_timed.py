@@ -48,6 +48,10 @@ class Timed:
         with self.inputs.file(wanted(job.pairs), TIMING, number) as path:
             return measure_pairs(replace(job, observations=str(path)), self.timeout)
 
+    def at_threads(self, threads: int) -> Timed:
+        """Return the same with another number of threads, and nothing measured yet."""
+        return replace(self, job=replace(self.job, threads=threads), pairs=[])
+
     def processes(self) -> list[int]:
         """Return the process of each call."""
         return [number for number, pairs in enumerate(self.pairs) for _ in pairs.candidate_ms]

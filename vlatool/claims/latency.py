@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from vlatool.benchmark._turns import CONFIRM
 from vlatool.claims._found import CONFIDENCE, Found, worst
@@ -15,6 +16,16 @@ STATISTICS = ("median", "mean")
 """Of the calls; of the observations, each the median of its calls."""
 AGREE = CONFIRM - 1
 """Pairs of ``CONFIRM`` that must be slow: between equal bundles, 19 of 20 are so once in 50,000 times."""
+
+
+def examine_all(timed: Timed, claim: LatencyClaim) -> list[Found]:
+    """Examine the slowdown at the number of threads of ``timed``, and at each further one that the claim names."""
+    found = [examine(timed, claim)]
+    for threads in claim.also_threads:
+        part = examine(timed.at_threads(threads), claim)
+        measured = tuple(replace(each, name=f"{each.name}_{threads}_threads") for each in part.measurements)
+        found.append(replace(part, claim=f"{part.claim}, {threads} threads", measurements=measured))
+    return found
 
 
 def examine(timed: Timed, claim: LatencyClaim) -> Found:
