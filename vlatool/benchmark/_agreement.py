@@ -92,14 +92,11 @@ def measure_agreement(job: Job, timeout: float | None = None) -> Agreement:
 
 def run_agreement(job: Job) -> Agreement:
     """Measure in this process; ``job.seconds`` ends it early, once ``FEWEST`` observations are answered."""
-    from vlatool.benchmark._turns import pool_of
+    from vlatool.benchmark._turns import loaded, pool_of
     from vlatool.bundle import Bundle
-    from vlatool.runtime import load
 
     baseline = Bundle.open(job.baseline)
-    policies = [
-        load(path, engine=job.engine, threads=job.threads, seed=job.seed) for path in (job.baseline, job.candidate)
-    ]
+    policies = [loaded(path, job) for path in (job.baseline, job.candidate)]
     pool = pool_of(job, baseline) if job.pairs else []
     asked, skipped = _asked(policies, pool, job)
     if any(step.keep for step in baseline.manifest.program):

@@ -24,7 +24,7 @@ from vlatool.benchmark._answers import Answers, varied
 from vlatool.benchmark._pairs import FEWEST, Job, Pairs, medians
 from vlatool.bundle import Bundle
 from vlatool.data import DRAWN, RECORDED, Drawer, Drawn, read_drawn
-from vlatool.errors import GraphError
+from vlatool.errors import GraphError, VlatoolError
 from vlatool.runtime import Policy, load
 from vlatool.runtime.program import draw
 
@@ -91,7 +91,7 @@ class Turns:
 
     def _load(self, which: int) -> Policy:
         path = (self.job.baseline, self.job.candidate)[which]
-        return load(path, engine=self.job.engine, threads=self.job.threads, seed=self.job.seed)
+        return loaded(path, self.job)
 
     def _warm_up(self, policy: Policy) -> None:
         begun, number = time.monotonic(), 0
@@ -197,6 +197,20 @@ class Turns:
                 policy.reset()
             answers.look(place, policy.infer(call.observation, noise=call.noise).outputs)
         return answers.looked, answers.strays
+
+
+def loaded(path: str, job: Job) -> Policy:
+    """Load a bundle as a robot does: every file is hashed, and the golden action is computed.
+
+    Raises:
+        VlatoolError: what ``load`` raises, with the bundle's path.
+    """
+    try:
+        return load(path, engine=job.engine, threads=job.threads, seed=job.seed)
+    except VlatoolError as error:
+        if path in error.message:
+            raise
+        raise type(error)(f"{path}: {error.message}", error.fix) from error
 
 
 def pool_of(job: Job, baseline: Bundle) -> list[Drawn]:
