@@ -68,7 +68,7 @@ def gate_page() -> str:
         f"`{name}`" for name, field in gate.Gate.model_fields.items() if field.default is None and name != "baseline"
     ]
     parts = [f"# gate.yaml\n\n{top}\none that is null is not examined. Null when nothing is said: {', '.join(off)}.\n"]
-    for claim in (gate.LatencyClaim, gate.AccuracyClaim, gate.GrowthClaim, gate.DeadlineClaim):
+    for claim in (gate.LatencyClaim, gate.AccuracyClaim, gate.AnswersClaim, gate.GrowthClaim, gate.DeadlineClaim):
         names = [name for name, field in gate.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
         parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")
     return "\n".join(parts)

@@ -301,7 +301,11 @@ def _cache_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 @pytest.fixture(scope="session")
 def policy_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the tiny policy; read only."""
-    folder = tmp_path_factory.mktemp("template") / "tiny"
+    return write_policy(tmp_path_factory.mktemp("template") / "tiny")
+
+
+def write_policy(folder: Path) -> Path:
+    """Write the tiny policy into a new folder."""
     folder.mkdir()
     (folder / "policy.yaml").write_text(POLICY_YAML)
     (folder / "policy.py").write_text(POLICY_PY)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vlatool.regression import LOOKS, Decision, judged, sequential
+from vlatool.regression import LOOKS, Decision, jointly, judged, sequential
 
 Source = Callable[[int], float]
 
@@ -97,3 +97,38 @@ def test_looks_that_decide_nothing_are_refused(looks: tuple[int, ...]) -> None:
 def test_a_margin_that_is_none_is_refused(margin: float) -> None:
     with pytest.raises(ValueError, match="the margin is"):
         judged([0.0] * 10, margin)
+
+
+def test_one_statistic_that_fails_ends_it_and_all_must_pass() -> None:
+    slower, same = noisy(0.3, 1), noisy(0.0, 2)
+    decisions, found = jointly(lambda number: (same(number), slower(number)), 2, 0.05)
+    assert [decision.verdict for decision in decisions] == ["pass", "fail"]
+    assert len(found) == 10
+    decisions, _ = jointly(lambda number: (same(number), same(number)), 2, 0.05)
+    assert {decision.verdict for decision in decisions} == {"pass"}
+    at = noisy(math.log(1.05), 5)
+    open_, _ = jointly(lambda number: (at(number), same(number)), 2, 0.05)
+    assert open_[0].verdict == "inconclusive"
+
+
+def test_statistics_share_the_error_of_a_failure_alone() -> None:
+    alone, shared = (judged([0.01 * number for number in range(10)], 0.05, sharing=sharing) for sharing in (1, 2))
+    assert shared.low < alone.low
+    assert (shared.high, shared.ratio) == (alone.high, alone.ratio)
+    with pytest.raises(ValueError, match="ascending numbers from 10"):
+        jointly(lambda _: (0.0, 0.0), 2, 0.05, (9, 20, 40))
+
+
+@pytest.mark.parametrize("tail", ["normal", "stalls"])
+def test_equal_bundles_fail_in_fewer_than_one_in_a_hundred_gates(tail: str) -> None:
+    """Median and mean of equal bundles, correlated as they are, in 300 gates."""
+    random = np.random.default_rng(3)
+
+    def measure(_: int) -> tuple[float, float]:
+        one, two = random.normal(size=2) * 0.05
+        if tail == "stalls" and random.random() < 0.2:
+            two += random.choice([-1, 1]) * random.exponential(0.5)
+        return float(one), float(0.8 * one + 0.6 * two)
+
+    verdicts = [{each.verdict for each in jointly(measure, 2, 0.05)[0]} for _ in range(300)]
+    assert sum("fail" in each for each in verdicts) <= 3

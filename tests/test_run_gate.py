@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from vlatool import run_gate as run_gate_module
+from vlatool.benchmark._agreement import run_agreement
 from vlatool.benchmark._pairs import Job, Pairs
 from vlatool.bundle import DIGEST, Bundle, digest_of
 from vlatool.claims import _timed
@@ -34,6 +35,7 @@ def as_fast(monkeypatch: pytest.MonkeyPatch):
             return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80)
 
         monkeypatch.setattr(_timed, "measure_pairs", measured)
+        monkeypatch.setattr(run_gate_module, "measure_agreement", lambda job, timeout: run_agreement(job))
         return jobs
 
     return make
@@ -45,7 +47,7 @@ def test_the_worst_claim_decides(float_bundle: Bundle, as_fast, slowdown: float,
     report = run_gate(float_bundle, float_bundle, QUICK, Context(command="vlatool gate x"))
     assert (report.kind, report.verdict) == ("gate", verdict)
     claims = {each["claim"]: each["verdict"] for each in report.rows[1].details["claims"]}
-    assert claims == {"size": "pass", "accuracy": "pass", "latency": verdict}
+    assert claims == {"size": "pass", "accuracy": "pass", "answers": "pass", "latency": verdict}
     assert [row.name for row in report.rows] == ["baseline", "candidate"]
     assert len(report.rows[1].raw["log_ratio"]) == 10
     assert len(report.rows[0].raw["latency_ms"]) == 800
@@ -58,9 +60,12 @@ def test_the_summary_begins_with_what_failed(float_bundle: Bundle, int8_bundle: 
     gate = QUICK.model_copy(update={"size": GrowthClaim(margin=0), "accuracy": None, "memory": GrowthClaim(margin=9)})
     report = run_gate(float_bundle, int8_bundle, gate, Context())
     assert report.summary[0] == "tiny does not keep to: size, latency."
-    assert [line.split(":")[:2] for line in report.summary[1:]] == [
-        ["size", " fail"], ["latency", " fail"], ["memory", " pass"],
+    assert [line.split(":")[:2] for line in report.summary[1:-1]] == [
+        ["size", " fail"], ["latency", " fail"], ["memory", " pass"], ["answers", " pass"],
     ]  # fmt: skip
+    assert report.summary[-1].startswith(
+        "observations are drawn from 40 recorded ones and the vocabulary with the seed "
+    )
 
 
 def test_every_process_has_its_own_seed_and_both_bundles(float_bundle: Bundle, int8_bundle: Bundle, as_fast) -> None:
@@ -89,7 +94,9 @@ def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
     assert {each.name for each in report.rows[0].measurements} == {
         "latency_p50", "peak_rss", "size", "skill_expert", "variation",
     }  # fmt: skip
-    assert set(measured) == {"latency_p50", "peak_rss", "size", "recorded_drop", "latency_ratio"}
+    assert set(measured) == {
+        "latency_p50", "peak_rss", "size", "recorded_drop", "latency_ratio", "latency_mean_ratio", "follows"
+    }  # fmt: skip
     assert measured["latency_ratio"].low <= measured["latency_ratio"].value <= measured["latency_ratio"].high
     assert report.verdict in ("pass", "inconclusive", "fail")
     json.loads(report.to_json())
@@ -146,7 +153,7 @@ def test_what_cannot_be_examined_is_said_before_anything_is_measured(
     bare = Bundle.open(shutil.copytree(float_bundle.path, tmp_path / "bare"))
     shutil.rmtree(bare.path / "data")
     with pytest.raises(DataError, match="Accuracy is claimed"):
-        run_gate(resealed(bare), float_bundle, QUICK, Context())
+        run_gate(float_bundle, resealed(bare), QUICK, Context())
     assert jobs == []
 
 

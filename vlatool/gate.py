@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -20,18 +21,22 @@ class _Claim(BaseModel):
 class LatencyClaim(_Claim):
     """The candidate is not slower than the baseline by more than a margin; both run side by side in fresh processes."""
 
-    margin: float = Field(0.05, ge=0, le=10, description="largest slowdown of the median, a share (0.05 = 5 %)")
+    margin: float = Field(0.05, ge=0, le=10, description="largest slowdown of median and mean, a share (0.05 = 5 %)")
     looks: tuple[int, ...] = Field(LOOKS, description="processes after which it is judged; the last one ends it")
     pairs: int = Field(150, ge=30, description="calls of each bundle in a process")
     warmup: int = Field(20, ge=1, description="calls of each bundle before the first that counts")
     seconds: float = Field(10.0, gt=0, description="after which a process begins no further pair (at least 30 of them)")
-    threads: int = Field(1, ge=1, description="intra-op threads")
+    worst: float = Field(0.5, ge=0, le=100, description="largest slowdown on any one observation, seen again and again")
+    threads: int = Field(1, ge=1, description="intra-op threads, for every claim; state those of the robot")
+    also_threads: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        (), description="further numbers of threads, for each of which the same is claimed of the latency"
+    )
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
     timeout: float = Field(1800.0, gt=0, description="seconds after which a process that hangs ends, and the gate so")
 
     @model_validator(mode="after")
     def _looks_can_decide(self) -> LatencyClaim:
-        least = fewest(ALPHA / len(self.looks)) if self.looks else 1
+        least = fewest(ALPHA / 2 / len(self.looks)) if self.looks else 1  # the median and the mean share it
         if not self.looks or list(self.looks) != sorted(set(self.looks)) or self.looks[0] < least:
             raise ValueError(f"looks must ascend and begin at {least} or later, or none of them can decide")
         return self
@@ -41,9 +46,19 @@ class AccuracyClaim(_Claim):
     """The candidate is not worse than the baseline by more than a drop, on the same data or the same episodes."""
 
     max_drop: float = Field(0.01, ge=0, le=1, description="largest drop, a share (0.01 = 1 point)")
-    data: Path | None = Field(None, description="recorded observations and actions; the candidate's own when not given")
+    data: Path | None = Field(None, description="recorded observations and actions; the baseline's own when not given")
     episodes: int = Field(0, ge=0, description="closed-loop episodes over all tasks; 0 for recorded observations alone")
     policy: Path | None = Field(None, description="directory of the policy.yaml that names environment and tasks")
+
+
+class AnswersClaim(_Claim):
+    """The candidate answers when timed as it does otherwise, and follows the baseline where nothing is recorded."""
+
+    follows: float | None = Field(
+        0.5, ge=-1, le=1, description="least correlation with the baseline's answers; null for a policy trained anew"
+    )
+    observations: int = Field(96, ge=24, description="observations that both answer, drawn for the purpose")
+    seconds: float = Field(60.0, gt=0, description="after which no further one is answered (at least 24 of them)")
 
 
 class GrowthClaim(_Claim):
@@ -74,6 +89,7 @@ class Gate(BaseModel):
     baseline: Path | None = Field(None, description="bundle to compare with; --baseline goes before it")
     latency: LatencyClaim | None = LatencyClaim()
     accuracy: AccuracyClaim | None = AccuracyClaim()
+    answers: AnswersClaim | None = AnswersClaim()
     memory: GrowthClaim | None = GrowthClaim(margin=0.1)
     size: GrowthClaim | None = GrowthClaim(margin=0.1)
     deadline: DeadlineClaim | None = None
@@ -81,7 +97,7 @@ class Gate(BaseModel):
 
     @model_validator(mode="after")
     def _something_is_claimed(self) -> Gate:
-        if not any((self.latency, self.accuracy, self.memory, self.size, self.deadline)):
+        if not any((self.latency, self.accuracy, self.answers, self.memory, self.size, self.deadline)):
             raise ValueError("every claim is null, so there is nothing to examine")
         return self
 

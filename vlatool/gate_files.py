@@ -14,22 +14,27 @@ schema: 1
 baseline: {baseline}    # a bundle, kept in the repository or fetched before the gate runs
 
 latency:
-  margin: 0.05         # the median may be 5 % slower, no more
+  margin: 0.05         # median and mean may be 5 % slower, no more
+  worst: 0.5           # and no single observation by more than 50 %
   looks: [10, 20, 40]  # processes after which it is judged; most changes are decided at the first
   pairs: 150           # calls of each bundle in a process
-  threads: 1
+  threads: 1           # those that the robot runs with
+  # also_threads: [4]  # the same is claimed of the latency with so many threads
 
 accuracy:
   max_drop: 0.01       # one point, on the same samples (and episodes) as the baseline
-  # data: data/evaluation.npz   # recorded observations and actions; the candidate's own when not given
+  # data: data/evaluation.npz   # recorded observations and actions; the baseline's own when not given
   # episodes: 200               # also closed-loop episodes, on paired seeds
   # policy: policy              # directory of the policy.yaml that names environment and tasks
+
+answers:
+  follows: 0.5         # least correlation with the baseline where nothing is recorded; null: trained anew
 
 memory:
   margin: 0.10         # peak memory of a fresh process
 
 size:
-  margin: 0.10         # graphs on disk
+  margin: 0.10         # graphs and assets on disk
 
 deadline: null
 # deadline:            # a percentile below a deadline, with 99 % confidence, on the machine that runs the gate

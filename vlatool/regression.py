@@ -4,6 +4,9 @@ Each process gives one log ratio. Two questions are asked of their Hodges-Lehman
 bound exceed the margin (then the candidate is slower: fail), does its upper bound stay below it (pass)? Neither: more
 processes. The error probability is shared out over the looks (Bonferroni), and the bounds are those of the exact
 signed-rank distribution, so the stated error holds for any symmetric noise however few processes there are.
+
+Several statistics of the same processes (``jointly``) fail when one of them does and pass when all do. Between equal
+bundles each is symmetric, whatever it is: swapping the two turns its sign.
 """
 
 from __future__ import annotations
@@ -81,26 +84,28 @@ def reach(processes: int, alpha: float) -> float:
     return float(np.quantile([-lower_bound(each, alpha) for each in noise], POWER))
 
 
-def judged(log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(LOOKS)) -> Decision:
+def judged(log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(LOOKS), sharing: int = 1) -> Decision:
     """Judge the processes that there are.
 
     Args:
         log_ratios: Of each process, natural logarithm of candidate over baseline.
         margin: The largest slowdown that passes, a share above -1.
         alpha: Chance of a false verdict of this look, on either side.
+        sharing: Statistics of which one alone makes a gate fail, while all of them must pass: they share the error of a
+            failure, and each may keep that of a pass.
 
     Raises:
         ValueError: when there is no ratio or one is not finite, or the margin is none.
     """
     if not margin > -1:
         raise ValueError(f"the margin is {margin}; allowed: above -1")
-    low, high = lower_bound(log_ratios, alpha), upper_bound(log_ratios, alpha)
+    low, high = lower_bound(log_ratios, alpha / sharing), upper_bound(log_ratios, alpha)
     limit = math.log1p(margin)
     verdict = "fail" if low > limit else "pass" if high < limit else "inconclusive"
     count = len(log_ratios)
     spread = float(np.std(log_ratios, ddof=1)) if count > 1 else math.nan
     centre = hodges_lehmann(log_ratios)
-    return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread, alpha)
+    return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread, alpha / sharing)
 
 
 def sequential(
@@ -120,14 +125,39 @@ def sequential(
     Raises:
         ValueError: when the looks do not ascend, or the first is too early to decide anything.
     """
-    least = fewest(alpha / len(looks)) if looks else 1
+    decisions, found = jointly(lambda number: (measure(number),), 1, margin, looks, alpha)
+    return decisions[0], [ratios[0] for ratios in found]
+
+
+def jointly(
+    measure: Callable[[int], Sequence[float]],
+    statistics: int,
+    margin: float,
+    looks: Sequence[int] = LOOKS,
+    alpha: float = ALPHA,
+) -> tuple[list[Decision], list[Sequence[float]]]:
+    """Judge several statistics of the same processes: it ends when one fails, or when all pass.
+
+    Args:
+        measure: As in ``sequential``, but returns a log ratio for each statistic.
+        statistics: How many.
+        margin, looks, alpha: As in ``sequential``.
+
+    Returns:
+        A decision for each statistic, and the log ratios of every process.
+
+    Raises:
+        ValueError: as ``sequential``.
+    """
+    least = fewest(alpha / statistics / len(looks)) if looks else 1
     if not looks or list(looks) != sorted(set(looks)) or looks[0] < least:
         raise ValueError(f"the looks are {tuple(looks)}; allowed: ascending numbers from {least}")
-    found: list[float] = []
+    found: list[Sequence[float]] = []
     for look in looks:
         while len(found) < look:
             found.append(measure(len(found)))
-        decision = judged(found, margin, alpha / len(looks))
-        if decision.verdict != "inconclusive":
+        decisions = [judged(ratios, margin, alpha / len(looks), statistics) for ratios in zip(*found, strict=True)]
+        verdicts = {decision.verdict for decision in decisions}
+        if "fail" in verdicts or "inconclusive" not in verdicts:
             break
-    return decision, found
+    return decisions, found

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Sequence
 from dataclasses import replace
 from statistics import median
+from typing import Any
 
+from vlatool.benchmark._agreement import Agreement, measure_agreement
 from vlatool.benchmark._pairs import Job
 from vlatool.benchmark._trust import busy, throttled, validity
-from vlatool.bundle import Bundle
-from vlatool.claims import accuracy, deadline, growth, latency
+from vlatool.bundle import Bundle, hash_file
+from vlatool.claims import accuracy, answers, deadline, growth, latency
 from vlatool.claims._found import Found, worst
+from vlatool.claims._inputs import AGREEMENT, Inputs
+from vlatool.claims._same import check
 from vlatool.claims._timed import Timed
-from vlatool.errors import BundleError
 from vlatool.gate import Gate, LatencyClaim
 from vlatool.host import before_run
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
-from vlatool.spec import TensorSpec
 from vlatool.stage import Context
 from vlatool.telemetry import Recorder, open_all
 
@@ -26,73 +29,81 @@ PERIOD_S = 1.0
 """Seconds between two looks at the board."""
 
 
-def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, seed: int = 0) -> Report:
+def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, seed: int | None = None) -> Report:
     """Examine every claim of a gate; what is cheap first.
 
     Args:
         candidate, baseline: Bundles with graphs, of one spec.
         gate: What is claimed.
         context: Progress and workers.
-        seed: Of the order in which bundles are loaded and called.
+        seed: Of everything that is drawn: observations, noise, the order in which bundles are loaded and called. Fresh
+            entropy when None, so that nobody can know it before; the report says it.
 
     Raises:
-        BundleError: when a bundle has no graph, or the two have other inputs or outputs.
+        BundleError: when a bundle has no graph, the two have other inputs or outputs, or a file was changed.
         DataError: when accuracy is claimed and there is nothing to measure it on.
-        GraphError: when a bundle cannot be run, or hangs.
+        GraphError: when a bundle cannot be run, hangs, or computes another golden action than its own.
     """
-    _check(candidate, baseline, gate)
+    check(candidate, baseline, gate)
+    for bundle in (candidate, baseline):
+        refuse_findings(bundle, gate.accept)
     host = before_run()
     how = gate.latency or LatencyClaim()
-    paths = (str(baseline.path), str(candidate.path))
-    timed = Timed(Job(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed), context, how.timeout)
+    seed = secrets.randbits(32) if seed is None else seed
+    inputs = Inputs(baseline, gate.accuracy.data if gate.accuracy else None, seed)
+    job = Job(
+        str(baseline.path), str(candidate.path), how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed
+    )
+    timed = Timed(job, context, how.timeout, inputs)
+    agreement = _agreement(timed, gate, inputs)
     found: list[Found] = []
     if gate.size:
         found.append(growth.examine_size(candidate, baseline, gate.size))
     if gate.memory:
-        found.append(growth.examine_memory(candidate, baseline, gate.memory, how, context))
+        found.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
     if gate.accuracy:
-        found.append(accuracy.examine(candidate, baseline, gate.accuracy, context))
+        found.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine))
     with Recorder(open_all(), PERIOD_S) as board:
         if gate.latency:
-            found.append(latency.examine(timed, gate.latency))
+            found += latency.examine_all(timed, gate.latency)
         if gate.deadline:
             found.append(deadline.examine(timed, gate.deadline))
+    if gate.answers:
+        found.append(answers.examine(agreement, timed, gate.answers))
     seen = (*throttled(board.recorded.throttling), *(replace(each, effect="note") for each in busy(host)))
     name = candidate.manifest.name
-    rows = (_row("baseline", baseline, timed, found), _row("candidate", candidate, timed, found))
-    return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found), _summary(name, found), rows,
+    row = _row("candidate", candidate, timed, found)
+    row = replace(row, details={**row.details, "measured with": _measured_with(gate, inputs, agreement)})
+    rows = (_row("baseline", baseline, timed, found), row)
+    return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found),
+                  (*_summary(name, found), f"{inputs.told()}."), rows,
                   command=context.command, environment=host, validity=validity(seen), findings=seen)  # fmt: skip
 
 
-def _check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
-    for bundle in (candidate, baseline):
-        if not bundle.manifest.graphs:
-            raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
-        refuse_findings(bundle, gate.accept)
-    for kind in ("inputs", "outputs"):
-        mine, theirs = (
-            {each.name: each for each in getattr(bundle.manifest.spec, kind)} for bundle in (candidate, baseline)
-        )
-        for name in {**theirs, **mine}:
-            if differs := _differs(mine.get(name), theirs.get(name)):
-                both = f"{candidate.path} and {baseline.path} are no versions of one policy"
-                raise BundleError(f"{both}: {kind[:-1]} {name}: {differs}.")
-    if gate.accuracy:
-        accuracy.data_of(candidate, gate.accuracy)
+def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
+    """Load both bundles as a robot does, golden action and all, and ask both where answers are claimed."""
+    claim = gate.answers
+    timed.context.tell("both bundles, on observations that are not recorded", None)
+    job = replace(timed.job, pairs=claim.observations if claim else 0, seconds=claim.seconds if claim else 0.0)
+    if claim is None:
+        return measure_agreement(job, timed.timeout)
+    with inputs.file(claim.observations, AGREEMENT) as path:
+        return measure_agreement(replace(job, observations=str(path)), timed.timeout)
 
 
-MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode")
-"""What a robot relies on; files of statistics and tokenizers may differ."""
-
-
-def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
-    """Return in words how an input or output of the candidate differs from the baseline's; nothing when it does not."""
-    if mine is None or theirs is None:
-        return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
-    pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
-    return "; ".join(f"{name} {list(one) if isinstance(one, tuple) else one!r} in the candidate, "
-                     f"{list(two) if isinstance(two, tuple) else two!r} in the baseline"
-                     for name, one, two in pairs if one != two)  # fmt: skip
+def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dict[str, Any]]:
+    """Return what a reader needs to judge, or repeat, the gate: a row for each thing."""
+    how = gate.latency or LatencyClaim()
+    found: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
+    found |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
+    found |= {
+        f"recording {path.path.name}": f"sha256:{hash_file(path.path)}"
+        for path in inputs.recordings
+        if path.path.is_file()
+    }
+    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.is_file():
+        found["evaluation data"] = f"sha256:{hash_file(data)}"
+    return [{"what": what, "value": value} for what, value in found.items()]
 
 
 def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row:
@@ -104,7 +115,9 @@ def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row
         measured += [each for claim in found for each in claim.baseline]
         return Row(name, "baseline", reason, tuple(measured), raw)
     measured += [each for claim in found for each in claim.measurements]
-    raw |= {"log_ratio": [pairs.log_ratio for pairs in timed.pairs]} if calls else {}
+    if calls:
+        raw["log_ratio"] = [pairs.log_ratio for pairs in timed.pairs]
+        raw["log_mean_ratio"] = [pairs.mean_log_ratio for pairs in timed.pairs]
     claims = [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]
     return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
 

@@ -1,40 +1,74 @@
-"""What a process measures is counted and ordered; no test asserts a time."""
+"""What a process measures is counted, ordered and compared; no test asserts a time."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
+from _policies import Garbage, Memoising, Wrapped
 
-from vlatool.benchmark import _pairs
+from vlatool.benchmark import _turns
 from vlatool.benchmark._pairs import FEWEST, Job, Pairs, measure_pairs, run_job
-from vlatool.bundle import Bundle
+from vlatool.benchmark._turns import CONFIRM, Turns, sequence, wanted
+from vlatool.bundle import Bundle, seal
+from vlatool.data import Drawer, read_recording, save_drawn
 from vlatool.errors import BundleError, GraphError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "soak/attacks"))
 
 
 @pytest.fixture
 def job(float_bundle: Bundle, int8_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> Job:
-    monkeypatch.setattr(_pairs, "WARMUP_MS", 0.0)
-    monkeypatch.setattr(_pairs.gc, "freeze", lambda: None)
-    monkeypatch.setattr(_pairs.gc, "disable", lambda: None)
+    monkeypatch.setattr(_turns, "WARMUP_MS", 0.0)
+    monkeypatch.setattr(_turns.gc, "freeze", lambda: None)
     return Job(str(float_bundle.path), str(int8_bundle.path), warmup=1, pairs=40)
+
+
+@pytest.fixture
+def wrapped(monkeypatch: pytest.MonkeyPatch):
+    """A function that puts a policy around each one that a process loads, or around the candidate alone."""
+
+    def wrap(around, only=""):
+        real = _turns.load
+        made = []
+
+        def load(path, **more):
+            policy = real(path, **more)
+            if only in str(path):
+                policy = around(policy)
+                made.append(policy)
+            return policy
+
+        monkeypatch.setattr(_turns, "load", load)
+        return made
+
+    return wrap
 
 
 def test_every_call_of_both_is_kept(job: Job) -> None:
     found = run_job(job)
-    assert len(found.baseline_ms) == len(found.candidate_ms) == 40
+    assert len(found.baseline_ms) == len(found.candidate_ms) == len(found.places) == 40
     assert min(found.baseline_ms + found.candidate_ms) > 0
+    assert len(set(found.places)) == wanted(40) == 14
+    assert (found.strays, found.unsteady) == (0, 0)
+    assert found.looked > 5
 
 
 def test_a_slow_policy_is_called_less_often_but_often_enough(job: Job) -> None:
     found = run_job(Job(**{**vars(job), "seconds": 1e-9}))
     assert len(found.baseline_ms) == len(found.candidate_ms) == FEWEST
+    assert sorted(map(found.places.count, set(found.places))) == [3] * 10, "each observation three times"
 
 
 def test_a_fresh_process_measures_the_same(job: Job) -> None:
     found = measure_pairs(job)
     assert len(found.baseline_ms) == len(found.candidate_ms) == 40
-    assert math.isfinite(found.log_ratio)
+    assert math.isfinite(found.log_ratio + found.mean_log_ratio)
 
 
 def test_the_log_ratio_is_of_medians_and_positive_is_slower() -> None:
@@ -42,28 +76,144 @@ def test_the_log_ratio_is_of_medians_and_positive_is_slower() -> None:
     assert Pairs((2.0,), (1.0,)).log_ratio < 0
 
 
-def test_the_order_of_calls_is_drawn(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither bundle is always the first of a pair, nor loaded first in every process."""
+def test_the_mean_is_of_medians_of_observations() -> None:
+    pairs = Pairs((1.0, 1.0, 1.0, 1.0, 1.0, 50.0), (3.0, 3.0, 1.0, 1.0, 99.0, 1.0), (7, 7, 8, 8, 7, 8))
+    assert pairs.medians(pairs.candidate_ms) == {7: 3.0, 8: 1.0}
+    assert pairs.mean_log_ratio == pytest.approx(math.log(2))
+    assert Pairs((1.0, 1.0), (1.0, 2.0)).mean_log_ratio == pytest.approx(math.log(1.5))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_observation_comes_twice_in_a_row(seed: int) -> None:
+    found = sequence(range(10), random.Random(seed))
+    assert sorted(found) == sorted([*range(10)] * 3)
+    assert all(one != two for one, two in itertools.pairwise(found))
+    assert sequence([4], random.Random(seed)) == [4, 4, 4]
+
+
+def test_both_get_the_same_bits_and_never_the_same_twice(job: Job, wrapped) -> None:
+    class Spy(Wrapped):
+        def infer(self, observation, **more):
+            told.append((id(self), observation["image"].tobytes(), observation["instruction"]))
+            return super().infer(observation, **more)
+
+    told: list[tuple] = []
+    policies = wrapped(Spy)
+    turns = Turns(job)
+    told.clear()
+    turns._time()
+    images = [[image for who, image, _ in told if who == id(policy)] for policy in policies]
+    assert images[0] == images[1]
+    assert len(set(images[0])) == 40
+    assert len({text for *_, text in told}) > 3
+    firsts = [who for who, *_ in told[::2]]
+    assert 0.2 < firsts.count(id(policies[0])) / len(firsts) < 0.8, "neither is always the first"
+
+
+def test_each_is_loaded_first_in_some_process(job: Job, monkeypatch) -> None:
     told: list[str] = []
-
-    class Spy:
-        def __init__(self, name: str) -> None:
-            self.name = name
-
-        def infer(self, _: object) -> None:
-            told.append(self.name)
-
-    from vlatool.runtime import policy
-
-    monkeypatch.setattr(policy.Policy, "open", lambda bundle, **_: Spy(str(bundle.path)))
+    real = _turns.load
+    monkeypatch.setattr(_turns, "load", lambda path, **more: told.append(path) or real(path, **more))
     for seed in range(6):
-        run_job(Job(**{**vars(job), "seed": seed}))
-    names = sorted(set(told))
-    assert len(names) == 2
-    firsts = told[2::2]
-    assert 0.3 < firsts.count(names[0]) / len(firsts) < 0.7
-    runs = [told[start] for start in range(0, len(told), 82)]
-    assert set(runs) == set(names), "each is loaded first in some process"
+        Turns(Job(**{**vars(job), "seed": seed}))
+    assert len(set(told[::2])) == 2
+
+
+def test_other_answers_than_in_a_fresh_session_are_told(job: Job, wrapped) -> None:
+    wrapped(lambda policy: Garbage(policy, after=8), only=job.candidate)
+    found = run_job(job)
+    assert found.strays > found.looked // 2
+    assert found.unsteady == 0
+
+
+def test_answers_from_memory_are_of_no_use(job: Job, wrapped) -> None:
+    made = wrapped(Memoising, only=job.candidate)
+    assert run_job(job).strays == 0
+    assert made[0].calls >= 40, "no call is answered from memory"
+
+
+def test_what_seems_slow_is_called_again_and_again(job: Job, wrapped) -> None:
+    class SlowOnText(Wrapped):
+        def infer(self, observation, **more):
+            end = _turns.time.perf_counter_ns() + (3_000_000 if observation["instruction"] else 0)
+            action = super().infer(observation, **more)
+            while _turns.time.perf_counter_ns() < end:
+                pass
+            return action
+
+    wrapped(SlowOnText, only=job.candidate)
+    found = run_job(job)
+    assert len(found.slow) == CONFIRM
+    assert "instruction '" in found.slow_input
+    assert "instruction ''" not in found.slow_input
+    assert sum(ratio > math.log(1.5) for ratio in found.slow) > CONFIRM // 2
+    assert len(found.candidate_ms) == len(found.places) == 40, "further calls are no part of the others"
+
+
+def test_observations_come_from_the_file(job: Job, float_bundle: Bundle, tmp_path, wrapped) -> None:
+    seen = set()
+
+    class Spy(Wrapped):
+        def infer(self, observation, **more):
+            seen.add(observation["instruction"])
+            return super().infer(observation, **more)
+
+    recording = read_recording(float_bundle.path / "data/evaluation.npz", float_bundle.manifest.spec)
+    drawn = [
+        each for each in Drawer(float_bundle, [recording]).draw(60, np.random.default_rng(0)) if each.kind == "recorded"
+    ]
+    save_drawn(tmp_path / "drawn.npz", drawn[:10])
+    wrapped(Spy)
+    Turns(Job(**{**vars(job), "observations": str(tmp_path / "drawn.npz")}))._time()
+    assert seen - {"go to the red"} <= {"go to the ball", "go to the box", "red ball", "blue box"}
+
+
+def test_what_the_baseline_cannot_answer_is_left_out(job: Job, wrapped) -> None:
+    class Fails(Wrapped):
+        def infer(self, observation, **more):
+            if observation["instruction"] == "" and self.calls > 3:
+                raise GraphError("not finite")
+            return super().infer(observation, **more)
+
+    wrapped(Fails)
+    turns = Turns(job)
+    found = turns.measure()
+    assert len(found.baseline_ms) == len(found.candidate_ms) == len(found.places) < 40
+    assert all(turns.pool[place].observation["instruction"] for place in found.places)
+
+
+def test_what_the_candidate_alone_cannot_answer_is_an_error(job: Job, wrapped) -> None:
+    class Fails(Wrapped):
+        def infer(self, observation, **more):
+            if observation["instruction"] == "" and self.calls > 3:
+                raise GraphError("The output 'action' is not finite.")
+            return super().infer(observation, **more)
+
+    wrapped(Fails, only=job.candidate)
+    with pytest.raises(
+        GraphError, match=r"fails where the baseline answers .*instruction ''.*: The output 'action' is"
+    ):
+        run_job(job)
+
+
+@pytest.mark.parametrize("side", ["baseline", "candidate"])
+def test_a_bundle_that_load_refuses_is_not_timed(job: Job, copied, side: str) -> None:
+    made = copied(Bundle.open(getattr(job, side)))
+    with np.load(made.path / "golden/golden.npz") as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    np.savez(made.path / "golden/golden.npz", **{**arrays, "out.action": -arrays["out.action"]})
+    sealed = seal(made.path, made.manifest)
+    with pytest.raises(GraphError, match="another golden action than recorded"):
+        run_job(Job(**{**vars(job), side: str(sealed.path)}))
+
+
+@pytest.mark.parametrize("side", ["baseline", "candidate"])
+def test_a_file_that_was_changed_is_not_timed(job: Job, copied, side: str) -> None:
+    made = copied(Bundle.open(getattr(job, side)))
+    with (made.path / "graphs/main.onnx").open("ab") as stream:
+        stream.write(b"x")
+    with pytest.raises(BundleError, match=r"main\.onnx"):
+        run_job(Job(**{**vars(job), side: str(made.path)}))
 
 
 def test_a_bundle_that_cannot_run_is_named(job: Job, tmp_path) -> None:

@@ -21,12 +21,23 @@ def test_growth_up_to_the_margin_passes(mine: float, margin: float, verdict: str
     assert found.sentence == f"{mine:.1f} MB, the baseline 100.0 MB ({mine - 100:+.1f}%; allowed: {margin:+.1%})"
 
 
-def test_the_size_is_that_of_the_graphs(float_bundle: Bundle, int8_bundle: Bundle) -> None:
-    sizes = [(bundle.path / "graphs/main.onnx").stat().st_size / 1e6 for bundle in (float_bundle, int8_bundle)]
+def test_the_size_is_that_of_graphs_and_assets(float_bundle: Bundle, int8_bundle: Bundle) -> None:
+    names = ("graphs/main.onnx", "assets/statistics.json", "assets/vocabulary.json")
+    sizes = [sum((bundle.path / name).stat().st_size for name in names) / 1e6 for bundle in (float_bundle, int8_bundle)]
     found = examine_size(int8_bundle, float_bundle, GrowthClaim(margin=10))
     assert found.measurements[0].value == pytest.approx(sizes[1])
     assert found.verdict == "pass"
     assert examine_size(float_bundle, float_bundle, GrowthClaim(margin=0)).verdict == "pass"
+
+
+@pytest.mark.parametrize("place", ["graphs/more.bin", "assets/more.bin", "data/more.bin", "reports/more.json"])
+def test_a_file_counts_wherever_it_lies_and_whoever_lists_it(float_bundle: Bundle, copied, place: str) -> None:
+    larger = copied(float_bundle)
+    (larger.path / place).parent.mkdir(exist_ok=True)
+    (larger.path / place).write_bytes(bytes(1_000_000))
+    found = examine_size(larger, float_bundle, GrowthClaim(margin=0.1))
+    assert found.verdict == "fail"
+    assert found.measurements[0].value - found.baseline[0].value == pytest.approx(1.0)
 
 
 def test_graphs_may_lie_anywhere_in_a_bundle(float_bundle: Bundle) -> None:
@@ -50,7 +61,8 @@ def test_the_memory_is_that_of_fresh_processes(
 ) -> None:
     asked = []
 
-    def probed(path, engine, threads, timeout):
+    def probed(path, engine, threads, timeout, observations):
+        assert observations is None
         asked.append((path, threads, timeout))
         return {"peak_rss_mb": 90.0 if path == float_bundle.path else 120.0 + len(asked)}
 

@@ -2,9 +2,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
-from vlatool.claims.latency import change, examine, slower, told
+from vlatool.benchmark._pairs import Pairs
+from vlatool.claims import _timed
+from vlatool.claims.latency import change, examine, examine_all, slower, told
 from vlatool.gate import LatencyClaim
 from vlatool.regression import Decision
 
@@ -15,10 +18,58 @@ from vlatool.regression import Decision
 def test_the_verdict_follows_the_slowdown(timed, slowdown: float, verdict: str) -> None:
     found = examine(timed(slowdown), LatencyClaim())
     assert (found.claim, found.verdict) == ("latency", verdict)
-    (measured,) = found.measurements
-    assert measured.name == "latency_ratio"
-    assert measured.low < 1 + slowdown < measured.high
-    assert measured.samples == (40 if verdict == "inconclusive" else 10)
+    assert [measured.name for measured in found.measurements] == ["latency_ratio", "latency_mean_ratio"]
+    for measured in found.measurements:
+        assert measured.low < 1 + slowdown < measured.high
+        assert measured.samples == (40 if verdict == "inconclusive" else 10)
+
+
+def test_a_few_slow_observations_fail_by_the_mean(timed, monkeypatch) -> None:
+    """Two of twenty observations take twice as long: the median is that of the baseline."""
+
+    def measured(job, timeout):
+        base = 5 * np.exp(0.02 * np.random.default_rng(job.seed).normal(size=60))
+        places = [number % 20 for number in range(60)]
+        mine = [2 * ms if place < 2 else ms for ms, place in zip(base, places, strict=True)]
+        return Pairs(tuple(base), tuple(mine), tuple(places))
+
+    processes = timed()
+    monkeypatch.setattr(_timed, "measure_pairs", measured)
+    found = examine(processes, LatencyClaim())
+    assert found.verdict == "fail"
+    assert found.sentence.startswith("the mean over observations is 10.0% slower")
+    assert found.measurements[0].value == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("slow", "verdict"), [(20, "fail"), (19, "fail"), (18, "pass"), (0, "pass")])
+def test_one_observation_that_is_slow_each_time_fails(timed, monkeypatch, slow: int, verdict: str) -> None:
+    def measured(job, timeout):
+        further = (math.log(3),) * slow + (0.0,) * (20 - slow)
+        return Pairs((5.0,) * 60, (5.0,) * 60, slow=further if job.seed == 3 else (), slow_input="recorded: 3x")
+
+    processes = timed()
+    monkeypatch.setattr(_timed, "measure_pairs", measured)
+    found = examine(processes, LatencyClaim())
+    assert found.verdict == verdict
+    assert ("1 of 10 processes found an observation that is slower by more than 50% each time: recorded: 3x"
+            in found.sentence) == (verdict == "fail")  # fmt: skip
+    assert examine(processes, LatencyClaim(worst=2.5)).verdict == "pass"
+
+
+@pytest.mark.parametrize(("slow", "verdicts"), [(4, ["pass", "fail"]), (1, ["fail", "pass"])])
+def test_each_number_of_threads_is_a_claim_of_its_own(timed, monkeypatch, slow: int, verdicts: list[str]) -> None:
+    """As fast as the baseline with one thread, slower with four: and the other way round."""
+
+    def measured(job, timeout):
+        base = 5 * np.exp(0.02 * np.random.default_rng(job.seed).normal(size=60))
+        return Pairs(tuple(base), tuple(base * (1.3 if job.threads == slow else 1.0)))
+
+    processes = timed()
+    monkeypatch.setattr(_timed, "measure_pairs", measured)
+    found = examine_all(processes, LatencyClaim(also_threads=(4,)))
+    assert [each.verdict for each in found] == verdicts
+    assert [each.claim for each in found] == ["latency", "latency, 4 threads"]
+    assert len({each.name for part in found for each in part.measurements}) == 4
 
 
 def test_a_process_that_was_measured_is_not_measured_again(timed) -> None:

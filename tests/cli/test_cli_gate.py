@@ -7,6 +7,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from vlatool import run_gate
+from vlatool.benchmark._agreement import run_agreement
 from vlatool.benchmark._pairs import Pairs
 from vlatool.claims import _timed
 
@@ -21,8 +23,9 @@ def slowdown(monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(
             _timed,
             "measure_pairs",
-            lambda job, timeout: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * job.seed,) * 50),
+            lambda job, timeout: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * (job.seed % 10),) * 50),
         )
+        monkeypatch.setattr(run_gate, "measure_agreement", lambda job, timeout: run_agreement(job))
 
     return make
 

@@ -32,8 +32,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.benchmark._pairs import Job, measure_pairs
 from vlatool.bundle import Bundle, seal
+from vlatool.claims._found import worst
 from vlatool.gate import Gate, LatencyClaim
-from vlatool.regression import sequential
+from vlatool.regression import jointly
 from vlatool.run_gate import run_gate
 from vlatool.stage import Context
 
@@ -76,13 +77,14 @@ def main() -> int:
 
 def one_gate(candidate: Bundle, base: Bundle, margin: float, number: int, output: Path) -> None:
     """Run a gate on latency alone and append its line."""
-    gate = Gate(latency=LatencyClaim(margin=margin), accuracy=None, memory=None, size=None)
+    gate = Gate(latency=LatencyClaim(margin=margin), accuracy=None, answers=None, memory=None, size=None)
     begun = time.monotonic()
     report = run_gate(candidate, base, gate, Context(), seed=1000 * number)
     ratio = report.rows[1].get("latency_ratio")
     assert ratio is not None
     found = {"verdict": report.verdict, "ratio": ratio.value, "low": ratio.low, "high": ratio.high,
-             "log_ratios": report.rows[1].raw["log_ratio"], "seconds": time.monotonic() - begun}  # fmt: skip
+             "log_ratios": report.rows[1].raw["log_ratio"], "log_mean_ratios": report.rows[1].raw["log_mean_ratio"],
+             "said": report.summary[1], "seconds": time.monotonic() - begun}  # fmt: skip
     with output.open("a") as stream:
         stream.write(json.dumps(found) + "\n")
     print(f"{number + 1}: {report.verdict} {ratio.value:.3f} after {ratio.samples} processes", flush=True)
@@ -101,10 +103,15 @@ def counted(output: Path) -> None:
 
 def resampled(output: Path, gates: int, margin: float) -> None:
     """Draw gates from the processes of a series, and print their verdicts."""
-    pool = [value for line in output.read_text().splitlines() for value in json.loads(line)["log_ratios"]]
+    lines = [json.loads(line) for line in output.read_text().splitlines()]
+    pool = [both for line in lines for both in zip(line["log_ratios"], line["log_mean_ratios"], strict=True)]
     draw = random.Random(0)
-    found = Counter(sequential(lambda _: draw.choice(pool), margin)[0].verdict for _ in range(gates))
-    print(f"{gates} gates drawn from {len(pool)} processes: {dict(found)}")
+    found = Counter(
+        worst(decision.verdict for decision in jointly(lambda _: draw.choice(pool), 2, margin)[0]) for _ in range(gates)
+    )
+    print(f"{gates} gates drawn from {len(pool)} processes (median and mean): {dict(found)}")
+    slow = sum("found an observation that is slower" in line["said"] for line in lines)
+    print(f"{slow} of {len(lines)} gates found an observation that is slower each time")
 
 
 @contextlib.contextmanager

@@ -8,23 +8,16 @@ both; the process is fresh, because how memory happens to lie makes one process 
 from __future__ import annotations
 
 import dataclasses
-import gc
 import json
 import math
-import random
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
 from vlatool.benchmark._child import answer, ask
 from vlatool.processes import die_with_parent
-
-WARMUP_MS = 200.0
-"""How long each bundle runs before its first call that counts, at least ``Job.warmup`` calls."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +31,8 @@ class Job:
         warmup: Calls of each before the first that counts.
         pairs: Calls of each that count.
         seconds: After which no further pair begins, once ``FEWEST`` are measured.
-        seed: Of the order in which the bundles are loaded and called.
+        seed: Of the order in which the bundles are loaded and called, and of noise and changes to observations.
+        observations: File of observations (``save_drawn``); drawn by the seed from the baseline alone when empty.
     """
 
     baseline: str
@@ -49,6 +43,7 @@ class Job:
     pairs: int = 150
     seconds: float = 10.0
     seed: int = 0
+    observations: str = ""
 
 
 FEWEST = 30
@@ -61,15 +56,46 @@ class Pairs:
 
     Args:
         baseline_ms, candidate_ms: Milliseconds of each call, in the order of the pairs.
+        places: Which observation each pair was called with; each one of its own when empty.
+        slow: Logarithms of candidate over baseline, of further pairs with the observation that seemed the slowest for
+            the candidate; empty when none seemed slow.
+        slow_input: That observation, in words.
+        looked: Timed answers of the candidate that were held against those of a fresh session.
+        strays: How many of those differ.
+        unsteady: How many of the baseline's differ likewise, looked at when the candidate's do.
     """
 
     baseline_ms: tuple[float, ...]
     candidate_ms: tuple[float, ...]
+    places: tuple[int, ...] = ()
+    slow: tuple[float, ...] = ()
+    slow_input: str = ""
+    looked: int = 0
+    strays: int = 0
+    unsteady: int = 0
 
     @property
     def log_ratio(self) -> float:
         """Natural logarithm of the candidate's median over the baseline's: above 0 is slower."""
         return math.log(median(self.candidate_ms) / median(self.baseline_ms))
+
+    @property
+    def mean_log_ratio(self) -> float:
+        """The same of the means over observations, each the median of its calls: what few slow observations change."""
+        mine, theirs = (fmean(self.medians(taken).values()) for taken in (self.candidate_ms, self.baseline_ms))
+        return math.log(mine / theirs)
+
+    def medians(self, taken: Sequence[float]) -> dict[int, float]:
+        """Return observation -> median of its calls, of one of the two series."""
+        return medians(taken, self.places or range(len(taken)))
+
+
+def medians(taken: Sequence[float], places: Sequence[int]) -> dict[int, float]:
+    """Return observation -> median of its calls."""
+    calls: dict[int, list[float]] = {}
+    for value, place in zip(taken, places, strict=True):
+        calls.setdefault(place, []).append(value)
+    return {place: median(values) for place, values in calls.items()}
 
 
 def measure_pairs(job: Job, timeout: float | None = None) -> Pairs:
@@ -80,46 +106,15 @@ def measure_pairs(job: Job, timeout: float | None = None) -> Pairs:
     """
     about = f"{job.candidate} beside {job.baseline}"
     found = ask("vlatool.benchmark._pairs", (), json.dumps(dataclasses.asdict(job)), about, timeout)
-    return Pairs(tuple(found["baseline_ms"]), tuple(found["candidate_ms"]))
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
+    return Pairs(**values)
 
 
 def run_job(job: Job) -> Pairs:
     """Measure in this process."""
-    from vlatool.bundle import Bundle
-    from vlatool.data import observations_for
-    from vlatool.runtime.policy import Policy
+    from vlatool.benchmark._turns import Turns
 
-    order = random.Random(job.seed)
-    paths = (job.baseline, job.candidate)
-    policies: list[Any] = [None, None]
-    observations: list[Sequence[Any]] = [(), ()]
-    for which in order.sample((0, 1), 2):
-        bundle = Bundle.open(Path(paths[which]), verify=False)
-        policies[which] = Policy.open(bundle, engine=job.engine, threads=job.threads, seed=0)
-        observations[which] = observations_for(bundle, 32)
-        _warm_up(policies[which], observations[which], job.warmup)
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    taken: tuple[list[float], list[float]] = ([], [])
-    begun = time.monotonic()
-    for number in range(job.pairs):
-        if number >= FEWEST and time.monotonic() - begun > job.seconds:
-            break
-        for which in order.sample((0, 1), 2):
-            observation = observations[which][number % len(observations[which])]
-            infer = policies[which].infer
-            start = time.perf_counter_ns()
-            infer(observation)
-            taken[which].append((time.perf_counter_ns() - start) / 1e6)
-    return Pairs(tuple(taken[0]), tuple(taken[1]))
-
-
-def _warm_up(policy: Any, observations: Sequence[Any], calls: int) -> None:
-    begun, number = time.monotonic(), 0
-    while number < calls or (time.monotonic() - begun) * 1e3 < WARMUP_MS:
-        policy.infer(observations[number % len(observations)])
-        number += 1
+    return Turns(job).measure()
 
 
 if __name__ == "__main__":

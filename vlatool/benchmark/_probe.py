@@ -1,6 +1,6 @@
 """Run in a fresh process: load a bundle, infer, and say how long each part took and how much memory it needed.
 
-``python -m vlatool.benchmark._probe BUNDLE ENGINE THREADS`` prints one line of JSON.
+``python -m vlatool.benchmark._probe BUNDLE ENGINE THREADS [OBSERVATIONS]`` prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -33,8 +33,14 @@ def cold_start(
     threads: int,
     limits: Limits = Limits(),  # noqa: B008
     timeout: float | None = None,
+    observations: Path | None = None,
 ) -> dict[str, Any]:
     """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
+
+    Args:
+        bundle, engine, threads: What is loaded, and how.
+        limits, timeout: Of the process.
+        observations: File of observations (``save_drawn``) to infer on after the golden one.
 
     Returns:
         ``start_ms`` (from the start of the process until its first line of Python), ``import_ms``, ``engine_ms`` (the
@@ -46,7 +52,7 @@ def cold_start(
         VlatoolError: what the bundle raises; GraphError when the process ends in another way, or takes longer.
     """
     begun = time.monotonic_ns()
-    words = (str(bundle), engine, str(threads))
+    words = (str(bundle), engine, str(threads), *([str(observations)] if observations else []))
     found = ask("vlatool.benchmark._probe", words, "", str(bundle), timeout, limits)
     found["start_ms"] = (found.pop("begun_ns") - begun) / 1e6
     found["total_ms"] = (found.pop("acted_ns") - begun) / 1e6
@@ -63,8 +69,8 @@ def main(arguments: list[str]) -> dict[str, Any]:
 
     imported = time.monotonic_ns()
     rss["imported"] = resident_mb()
-    opened = Bundle.open(arguments[0], verify=False)
-    _import_engine(arguments[1] or opened.manifest.engine or DEFAULT_ENGINE)
+    named = arguments[1] or Bundle.open(arguments[0], verify=False).manifest.engine  # load verifies what it opens
+    _import_engine(named or DEFAULT_ENGINE)
     ready = time.monotonic_ns()
     rss["engine"] = resident_mb()
     policy = load(arguments[0], engine=arguments[1], threads=int(arguments[2]), warmup=0)
@@ -77,6 +83,8 @@ def main(arguments: list[str]) -> dict[str, Any]:
     rss["first"] = resident_mb()
     for _ in range(MORE):
         policy.infer(observation, noise=noise)
+    if len(arguments) > 3:
+        _infer_on(policy, Path(arguments[3]))
     rss["more"] = resident_mb()
     return {
         "begun_ns": begun,
@@ -100,6 +108,18 @@ def _observation(policy: Any) -> tuple[Any, Any]:
     from vlatool.data import observations_for
 
     return observations_for(policy.bundle, 1)[0], None
+
+
+def _infer_on(policy: Any, path: Path) -> None:
+    """Infer on the observations of a file; one that no action can be had for has had its memory all the same."""
+    from vlatool.data import read_drawn
+    from vlatool.errors import GraphError
+
+    for drawn in read_drawn(path):
+        try:
+            policy.infer(drawn.observation)
+        except GraphError:
+            policy.reset()
 
 
 def _import_engine(name: str) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from vlatool.benchmark._pairs import Job, Pairs, measure_pairs
+from vlatool.benchmark._turns import wanted
+from vlatool.claims._inputs import TIMING, Inputs
 from vlatool.stage import Context
 
 
@@ -16,23 +18,39 @@ class Timed:
         job: What each measures; process n has the seed ``job.seed + n``.
         context: For progress.
         timeout: Seconds that a process may take.
+        inputs: What the bundles are called with; drawn by each process from the baseline's spec when None.
     """
 
     job: Job
     context: Context
     timeout: float | None = None
+    inputs: Inputs | None = None
     pairs: list[Pairs] = field(default_factory=list)
 
     def log_ratio(self, number: int) -> float:
-        """Return the log ratio of a process, candidate over baseline; measures it when it is the next one.
+        """Return the log ratio of a process, candidate over baseline; measures it when it is the next one."""
+        return self.process(number).log_ratio
+
+    def process(self, number: int) -> Pairs:
+        """Return what a process found; measures it when it is the next one.
 
         Raises:
             GraphError: when a bundle cannot be run, or the process takes longer than the timeout.
         """
         if number == len(self.pairs):
             self.context.tell(f"process {number + 1}: both bundles, call by call", None)
-            self.pairs.append(measure_pairs(replace(self.job, seed=self.job.seed + number), self.timeout))
-        return self.pairs[number].log_ratio
+            self.pairs.append(self._measure(replace(self.job, seed=self.job.seed + number), number))
+        return self.pairs[number]
+
+    def _measure(self, job: Job, number: int) -> Pairs:
+        if self.inputs is None:
+            return measure_pairs(job, self.timeout)
+        with self.inputs.file(wanted(job.pairs), TIMING, number) as path:
+            return measure_pairs(replace(job, observations=str(path)), self.timeout)
+
+    def at_threads(self, threads: int) -> Timed:
+        """Return the same with another number of threads, and nothing measured yet."""
+        return replace(self, job=replace(self.job, threads=threads), pairs=[])
 
     def processes(self) -> list[int]:
         """Return the process of each call."""

@@ -51,17 +51,23 @@ class _Drop:
         return words
 
 
-def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context) -> Found:
+def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = "") -> Found:
     """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
+
+    Args:
+        candidate, baseline: Each is run with its own statistics and vocabulary, and judged by its physical actions.
+        claim: What is claimed.
+        context: Progress and workers.
+        engine: Of the runtime, that of the other claims; the one that each bundle was made for when empty.
 
     Raises:
         DataError: when there is neither.
     """
     drops: list[_Drop] = []
-    if (data := data_of(candidate, claim)) is not None:
-        drops.append(_recorded(candidate, baseline, data, context))
+    if (data := data_of(baseline, claim)) is not None:
+        drops.append(_recorded(candidate, baseline, data, context, engine))
     if claim.episodes:
-        drops.append(_closed_loop(candidate, baseline, claim, context))
+        drops.append(_closed_loop(candidate, baseline, claim, context, engine))
     said = [each.told(claim.max_drop) for each in drops]
     measured = tuple(
         Measurement(each.name, each.value, "1", samples=each.samples, low=finite(each.low), high=finite(each.high),
@@ -80,23 +86,26 @@ def finite(bound: float) -> float | None:
     return bound if math.isfinite(bound) else None
 
 
-def data_of(candidate: Bundle, claim: AccuracyClaim) -> Path | None:
+def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
     """Return the recorded observations that the claim is examined on, None for the closed loop alone.
+
+    They are the gate's or the baseline's, never the candidate's: it would choose what it is judged on.
 
     Raises:
         DataError: when there are none and no episodes are asked for.
     """
-    own = candidate.path / EVALUATION if EVALUATION in candidate.manifest.files else None
+    own = baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None
     if (found := claim.data or own) is None and not claim.episodes:
         raise DataError(
-            f"Accuracy is claimed, but {candidate.path} carries no evaluation data and no episodes are asked for.",
+            f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the candidate "
+            "do not count) and no episodes are asked for.",
             "name recorded data (accuracy: data) or episodes in the gate, or set accuracy: null",
         )
     return found
 
 
-def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context) -> _Drop:
-    stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy)
+def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str) -> _Drop:
+    stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine)
     stage.check(candidate, None)
     rows = stage.run(candidate, context).rows
     before, after = (row.raw["success"] for row in rows)
@@ -106,11 +115,11 @@ def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, cont
     return _Drop("success_drop", "more failed episodes:", value, low, high, len(before), rows[0].measurements)
 
 
-def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context) -> _Drop:
-    recording = read_recording(data, candidate.manifest.spec)
+def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context, engine: str) -> _Drop:
+    recording = read_recording(data, baseline.manifest.spec)
     indices = recording.spread(MOST_SAMPLES)
-    action = candidate.manifest.spec.action
-    mine, theirs = (run_recorded(bundle, recording, indices, "", context) for bundle in (candidate, baseline))
+    action = baseline.manifest.spec.action
+    mine, theirs = (run_recorded(bundle, recording, indices, engine, context) for bundle in (candidate, baseline))
     episodes = None if recording.episodes is None else recording.episodes[indices]
     expert = None if recording.actions is None else recording.actions[indices]
     baselines = tuple(alone(action, theirs, expert, episodes))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 from statistics import median
 
 from vlatool.benchmark._probe import cold_start
-from vlatool.bundle import Bundle
+from vlatool.bundle import LOCATION, MANIFEST, Bundle
 from vlatool.claims._found import Found
+from vlatool.claims._inputs import MEMORY, Inputs
+from vlatool.data import CALIBRATION, EVALUATION
 from vlatool.gate import GrowthClaim, LatencyClaim
 from vlatool.report import Measurement
 from vlatool.stage import Context
@@ -15,26 +18,57 @@ from vlatool.stage import Context
 ROUNDING = 1e-9
 PROBES = 3
 """Fresh processes that load each bundle once."""
+OBSERVATIONS = 16
+"""Observations that such a process answers, beside the golden one."""
+ABOUT = (MANIFEST, LOCATION, CALIBRATION, EVALUATION, "recipe.yaml", "SIGNATURE",
+         "reports/report.html", "reports/report.md", "reports/report.json",
+    "reports/smooth_quant.json",
+    "reports/weights.json")  # fmt: skip
+"""Files of a bundle that no robot needs, beside the golden one."""
 
 
 def examine_memory(
-    candidate: Bundle, baseline: Bundle, claim: GrowthClaim, how: LatencyClaim, context: Context
+    candidate: Bundle,
+    baseline: Bundle,
+    claim: GrowthClaim,
+    how: LatencyClaim,
+    context: Context,
+    inputs: Inputs | None = None,
 ) -> Found:
-    """Examine the peak memory of a fresh process that loads a bundle and infers once."""
+    """Examine the peak memory of a fresh process that loads a bundle and infers on observations of all kinds.
+
+    Args:
+        candidate, baseline: Bundles.
+        claim, how: What is claimed, and engine and threads.
+        context: For progress.
+        inputs: What they are called with, beside the golden observation; that alone when None.
+    """
     peaks: tuple[list[float], list[float]] = ([], [])
     for number in range(PROBES):
         context.tell("memory of each in fresh processes", number / PROBES)
-        for bundle, found in zip((candidate, baseline), peaks, strict=True):
-            found.append(cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout)["peak_rss_mb"])
+        with inputs.file(OBSERVATIONS, MEMORY, number) if inputs else contextlib.nullcontext() as path:
+            for bundle, found in zip((candidate, baseline), peaks, strict=True):
+                probed = cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout, observations=path)
+                found.append(probed["peak_rss_mb"])
     mine, theirs = median(peaks[0]), median(peaks[1])
-    note = f"load and a few inferences, median of {PROBES} fresh processes"
+    note = f"load and some inferences, median of {PROBES} fresh processes"
     return judged("memory", theirs, Measurement("peak_rss", mine, "MB", samples=PROBES, note=note), claim)
 
 
 def examine_size(candidate: Bundle, baseline: Bundle, claim: GrowthClaim) -> Found:
-    """Examine the bytes of the graphs."""
-    mine, theirs = (bundle.graph_bytes / 1e6 for bundle in (candidate, baseline))
-    return judged("size", theirs, Measurement("size", mine, "MB", note="graphs on disk"), claim)
+    """Examine the bytes of the graphs and assets."""
+    mine, theirs = (deployed_bytes(bundle) / 1e6 for bundle in (candidate, baseline))
+    return judged("size", theirs, Measurement("size", mine, "MB", note="graphs and assets on disk"), claim)
+
+
+def deployed_bytes(bundle: Bundle) -> int:
+    """Return the bytes of everything in a bundle that a robot may need, whether the manifest names it or not.
+
+    Weights may lie in any file, so every file counts but those that are known for what else they are.
+    """
+    spared = {*ABOUT, bundle.manifest.golden}
+    files = (path for path in bundle.path.rglob("*") if path.is_file())
+    return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)
 
 
 def judged(name: str, baseline: float, measured: Measurement, claim: GrowthClaim) -> Found:

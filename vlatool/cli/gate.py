@@ -40,7 +40,10 @@ def run(
     margin: Annotated[
         float | None, typer.Option(min=0, max=10, help="largest slowdown of the median, a share (0.05 = 5 %)")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="of the order of loading and calling")] = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="of observations, noise and order; fresh, and told in the report, if unset"),
+    ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,

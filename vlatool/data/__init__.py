@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from vlatool.data._doubts import doubts
+from vlatool.data._drawn import DRAWN, OTHER, RECORDED, Drawer, Drawn, read_drawn, save_drawn
 from vlatool.data._observations import (
+    CALIBRATION,
+    EVALUATION,
     calibration_recording,
     observations_for,
     recorded_observations,
@@ -12,11 +15,20 @@ from vlatool.data._observations import (
 from vlatool.data._recording import Recording, read_recording
 
 __all__ = [
+    "CALIBRATION",
+    "DRAWN",
+    "EVALUATION",
+    "OTHER",
+    "RECORDED",
+    "Drawer",
+    "Drawn",
     "Recording",
     "calibration_recording",
     "doubts",
     "observations_for",
+    "read_drawn",
     "read_recording",
     "recorded_observations",
+    "save_drawn",
     "synthetic_observations",
 ]

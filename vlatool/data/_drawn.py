@@ -1,0 +1,206 @@
+"""Observations that cannot be known beforehand: recorded ones under other instructions, and drawn ones.
+
+What is judged on observations that its maker knows can be made to be good on those alone. These are drawn anew for each
+process: from recordings where there are any, from the words of the vocabulary, and over what each input can hold.
+"""
+
+from __future__ import annotations
+
+import json
+import string
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle import Bundle
+from vlatool.data._recording import Recording
+from vlatool.errors import DataError
+from vlatool.runtime.statistics import Normaliser, load_normaliser
+from vlatool.spec import TensorSpec
+
+Array = NDArray[Any]
+RECORDED, OTHER, DRAWN = "recorded", "other", "drawn"
+PATTERN = (RECORDED, OTHER, RECORDED, DRAWN)
+EXTREME = 4.0
+"""Standard deviations (or halves of the range) up to which a state is drawn."""
+LENGTHS = (0, 1, 2, 3, 5, 8, 13)
+"""Words of an instruction."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One observation and where it comes from.
+
+    Args:
+        kind: ``recorded`` (a sample of a recording), ``other`` (a recorded sample with another instruction, or whose
+            inputs are of different samples) or ``drawn`` (nothing of it was recorded).
+        observation: Input name -> value without the batch axis, in physical units; text as ``str``.
+    """
+
+    kind: str
+    observation: dict[str, Any]
+
+
+class Drawer:
+    """Draws observations that fit a bundle's spec.
+
+    Args:
+        bundle: Whose spec, vocabulary and statistics say what an observation may hold.
+        recordings: Of that spec.
+
+    Raises:
+        SpecError: when statistics are missing or do not fit.
+    """
+
+    def __init__(self, bundle: Bundle, recordings: Sequence[Recording] = ()) -> None:
+        self._inputs = bundle.manifest.spec.inputs
+        self._recordings = [recording for recording in recordings if len(recording)]
+        assets = bundle.path / "assets"
+        self._words = {each.name: words_of(assets / each.tokenizer) for each in self._inputs if each.kind == "text"}
+        self._normalisers = {each.name: load_normaliser(each, assets) for each in self._inputs if each.kind != "text"}
+
+    def draw(self, count: int, random: np.random.Generator) -> list[Drawn]:
+        """Return ``count`` observations of all kinds that can be drawn, in random order."""
+        kinds = [PATTERN[number % len(PATTERN)] if self._recordings else DRAWN for number in range(count)]
+        makers = {RECORDED: self._recorded, OTHER: self._other, DRAWN: self._drawn}
+        return [Drawn(kinds[place], makers[kinds[place]](random)) for place in random.permutation(count)]
+
+    def _recorded(self, random: np.random.Generator) -> dict[str, Any]:
+        recording = self._recordings[int(random.integers(len(self._recordings)))]
+        return recording.observation(int(random.integers(len(recording))))
+
+    def _other(self, random: np.random.Generator) -> dict[str, Any]:
+        """A recorded sample under another instruction; without text, inputs of samples that differ."""
+        if not self._words:
+            return {each.name: self._recorded(random)[each.name] for each in self._inputs}
+        return self._recorded(random) | {
+            each.name: self._sentence(each, random) for each in self._inputs if each.kind == "text"
+        }
+
+    def _drawn(self, random: np.random.Generator) -> dict[str, Any]:
+        like = self._recorded(random) if self._recordings else {}
+        return {each.name: self._value(each, like.get(each.name), random) for each in self._inputs}
+
+    def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator) -> Any:
+        if tensor.kind == "text":
+            return self._sentence(tensor, random)
+        shape = _shape(tensor, like)
+        dtype = np.dtype(tensor.dtype)
+        if dtype.kind == "b":
+            return random.integers(0, 2, shape).astype(np.bool_)
+        if dtype.kind in "iu":
+            return _whole_numbers(tensor, like, shape, random)
+        values = _structured(shape, random)
+        return _physical(values, self._normalisers[tensor.name], like).astype(dtype)
+
+    def _sentence(self, tensor: TensorSpec, random: np.random.Generator) -> str:
+        words = self._words[tensor.name]
+        most = tensor.max_tokens
+        lengths = [length for length in LENGTHS if length <= most] or [0]
+        return " ".join(random.choice(words, size=int(random.choice(lengths))))
+
+
+def words_of(path: Path) -> list[str]:
+    """Return the words of a vocabulary, or those tokens of a ``tokenizers`` file that are words.
+
+    Raises:
+        DataError: when the file cannot be read.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"The vocabulary {path} cannot be read: {error}.") from error
+    if not isinstance(data, dict) or not isinstance(data.get("model", {}), dict):
+        raise DataError(f"The vocabulary {path} is no mapping of words or tokens.")
+    found = data.get("words") if data.get("kind") == "words" else data.get("model", {}).get("vocab", ())
+    tokens = [item[0] if isinstance(item, list) else item for item in found or ()]
+    if data.get("kind") == "words":
+        return [token for token in tokens if token] or list(string.ascii_lowercase)
+    bare = {token.lstrip("\u0120\u2581") for token in tokens if token[:1] in "\u0120\u2581" or token.isalpha()}
+    return sorted(word for word in bare if word.isalpha()) or list(string.ascii_lowercase)
+
+
+def _shape(tensor: TensorSpec, like: Any) -> tuple[int, ...]:
+    if like is not None:
+        return tuple(np.shape(like))
+    return tuple(axis if isinstance(axis, int) else 1 for axis in tensor.shape[1:])
+
+
+def _whole_numbers(tensor: TensorSpec, like: Any, shape: tuple[int, ...], random: np.random.Generator) -> Array:
+    """Pixels over their range; other whole numbers over that of a recorded sample, else 0, which is always one."""
+    if tensor.dtype == "uint8":
+        values = _structured(shape, random)
+        return np.clip(np.rint(127.5 + 127.5 / EXTREME * 2 * values), 0, 255).astype(np.uint8)
+    low, high = (0, 0) if like is None or not np.size(like) else (int(np.min(like)), int(np.max(like)))
+    return random.integers(low, high + 1, shape).astype(tensor.dtype)
+
+
+def _noise(shape: tuple[int, ...], random: np.random.Generator) -> Array:
+    return random.standard_normal(shape)
+
+
+def _constant(shape: tuple[int, ...], random: np.random.Generator) -> Array:
+    return np.full(shape, random.uniform(-2, 2))
+
+
+def _gradient(shape: tuple[int, ...], random: np.random.Generator) -> Array:
+    """A ramp along each axis, of its own slope."""
+    values = np.zeros(shape)
+    for axis, length in enumerate(shape):
+        ramp = np.linspace(-1, 1, length) if length > 1 else np.zeros(1)
+        values = values + random.normal() * ramp.reshape([-1 if place == axis else 1 for place in range(len(shape))])
+    return values
+
+
+def _extreme(shape: tuple[int, ...], random: np.random.Generator) -> Array:
+    return random.choice([-EXTREME, EXTREME], size=shape)
+
+
+STRUCTURES: tuple[Callable[[tuple[int, ...], np.random.Generator], Array], ...] = (
+    _noise,
+    _constant,
+    _gradient,
+    _extreme,
+)
+
+
+def _structured(shape: tuple[int, ...], random: np.random.Generator) -> Array:
+    """Return noise, one value, ramps, or extremes, about N(0, 1) and never beyond ``EXTREME``."""
+    values = STRUCTURES[int(random.integers(len(STRUCTURES)))](shape, random)
+    return np.asarray(np.clip(values, -EXTREME, EXTREME))
+
+
+def _physical(values: Array, normaliser: Normaliser | None, like: Any) -> Array:
+    """Return values about N(0, 1) in the units of an input: by its statistics, else by what was recorded."""
+    if normaliser is not None:
+        return np.asarray(normaliser.inverse(values.astype(np.float32)))
+    if like is None:
+        return values
+    recorded = np.asarray(like, np.float64)
+    return np.asarray(values * (recorded.std() or 1.0) + recorded.mean())
+
+
+def save_drawn(path: Path, drawn: Sequence[Drawn]) -> None:
+    """Write observations to an ``.npz`` file."""
+    arrays: dict[str, Any] = {
+        f"{place}.{name}": np.asarray(value)
+        for place, each in enumerate(drawn)
+        for name, value in each.observation.items()
+    }
+    np.savez(path, kind=np.array([each.kind for each in drawn]), **arrays)
+
+
+def read_drawn(path: Path) -> list[Drawn]:
+    """Read what ``save_drawn`` wrote."""
+    with np.load(path, allow_pickle=False) as stored:
+        found = [Drawn(str(kind), {}) for kind in stored["kind"]]
+        for key in stored.files:
+            place, _, name = key.partition(".")
+            if name:
+                value = stored[key]
+                found[int(place)].observation[name] = str(value) if value.dtype.kind == "U" else value
+    return found
