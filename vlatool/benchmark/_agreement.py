@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.benchmark._child import answer, ask
-from vlatool.benchmark._limited import die_with_parent
 from vlatool.benchmark._pairs import Job
+from vlatool.processes import die_with_parent
 
 Array = NDArray[Any]
 FEWEST = 24
