@@ -83,7 +83,7 @@ def test_what_is_slow_on_some_observations_is_found_in_one_process(cheated, tmp_
     made = gate_cheats.CHEATS[name].make(base, tmp_path / "candidate")
     with Inputs(base, None, seed=1).file(20, TIMING) as path:
         found = run_job(Job(str(base.path), str(made.path), warmup=1, pairs=60, seed=1, observations=str(path)))
-    assert found.mean_log_ratio > math.log(1.3)
+    assert found.mean_log_ratio > 0.02
     assert len(found.slow) == _turns.CONFIRM
     assert sorted(found.slow)[5] > math.log(1.5)
 

@@ -46,6 +46,8 @@ class Job:
     observations: str = ""
 
 
+MOST = 2.0
+"""The largest factor that one observation counts for in the mean."""
 FEWEST = 30
 """Pairs that are measured however long they take: a median of fewer says little."""
 
@@ -81,9 +83,14 @@ class Pairs:
 
     @property
     def mean_log_ratio(self) -> float:
-        """The same of the means over observations, each the median of its calls: what few slow observations change."""
-        mine, theirs = (fmean(self.medians(taken).values()) for taken in (self.candidate_ms, self.baseline_ms))
-        return math.log(mine / theirs)
+        """The mean over observations of the same, each from the medians of its calls: what some slow ones change.
+
+        One observation counts for a factor of ``MOST`` at most: a call that the machine interrupted would outweigh all
+        others, and what is slower than that on few observations is found by ``slow``.
+        """
+        mine, theirs = (self.medians(taken) for taken in (self.candidate_ms, self.baseline_ms))
+        most = math.log(MOST)
+        return fmean(min(most, max(-most, math.log(mine[place] / theirs[place]))) for place in mine)
 
     def medians(self, taken: Sequence[float]) -> dict[int, float]:
         """Return observation -> median of its calls, of one of the two series."""
