@@ -417,7 +417,7 @@ def test_progress_is_a_bar_on_a_terminal(monkeypatch):
     ("typed", "told"),
     [
         (
-            ["optimize", "p", "--cache", "/data/me/cache", "-o", "/data/me/out"],
+            ["optimize", "p", "--cache", "/data/me/cache", "-o", "/data/out"],
             "vlatool optimize p --cache cache -o out",
         ),
         (["optimize", "p", "--cache=/data/me/cache", "-o/data/out"], "vlatool optimize p --cache=cache -oout"),
