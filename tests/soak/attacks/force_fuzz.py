@@ -108,7 +108,7 @@ def plant(root: Path, work: Work, chance: random.Random) -> None:
         elif kind == "nested":
             shutil.copytree(work.made["bundle"], folder / chance.choice(("sub", "graphs/sub")))
         elif kind == "link":
-            folder.symlink_to(chance.choice(("policy", "nowhere", str(work.made["bundle"]), "../policy")))
+            folder.symlink_to(chance.choice(("policy", "nowhere", "bundle", "../policy")))
         elif kind == "file":
             folder.write_text("mine")
         elif kind == "empty":
