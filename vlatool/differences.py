@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.errors import require
+from vlatool.errors import DataError, require
 from vlatool.npz_files import open_npz
 
 NAMED = 5
@@ -116,7 +116,7 @@ def explain(one: Path, two: Path) -> str:
     if one.suffix in special:
         try:
             said = special[one.suffix](one, two)
-        except (ValueError, OSError, KeyError):
+        except (DataError, ValueError, OSError, KeyError):
             said = ""
         if said:
             return said

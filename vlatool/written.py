@@ -158,7 +158,7 @@ def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
     if not stat.S_ISREG(mode):
         return "is a link" if stat.S_ISLNK(mode) else "is no regular file"
     if name == LEDGER:
-        return ""
+        return "" if _read_ledger(path.parent) == listing else CHANGED
     if name not in listing.files:
         return NOT_OURS
     try:
@@ -195,13 +195,14 @@ def read_listing(directory: Path) -> Listing | None:
 
 
 def _read_ledger(directory: Path) -> Listing | None:
-    data, _ = _read_json(directory / LEDGER)
+    data, content = _read_json(directory / LEDGER)
     files, folders = data.get("files"), data.get("folders", [])
     if data.get("schema") != SCHEMA or not isinstance(files, dict) or not isinstance(folders, list):
         return None
     if not all(isinstance(each, str) for each in (*files.values(), *folders)):
         return None
-    return Listing.of(files, folders)
+    listing = Listing.of(files, folders)
+    return listing if content == _told(listing) else None
 
 
 def _bundle_listing(directory: Path) -> Listing | None:
@@ -250,7 +251,8 @@ def _read_json(path: Path) -> tuple[dict[str, Any], bytes]:
     return (data, content) if isinstance(data, dict) else ({}, b"")
 
 
-def _write(directory: Path, listing: Listing) -> None:
+def _told(listing: Listing) -> bytes:
+    """Return the one way in which a list is written."""
     told = {
         "vlatool": "The files that vlatool wrote here, by SHA-256. --force replaces this directory only while it holds "
         "no other file and no file that was changed.",
@@ -258,6 +260,10 @@ def _write(directory: Path, listing: Listing) -> None:
         "files": listing.files,
         "folders": sorted(listing.folders),
     }
+    return (json.dumps(told, indent=1) + "\n").encode()
+
+
+def _write(directory: Path, listing: Listing) -> None:
     draft = directory / f"{LEDGER}.{os.getpid()}.part"
-    draft.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    draft.write_bytes(_told(listing))
     os.replace(draft, directory / LEDGER)

@@ -16,7 +16,7 @@ import pytest
 from vlatool import __version__, cli, registry
 from vlatool.bundle import Bundle, seal
 from vlatool.cli import main
-from vlatool.cli._console import leave, progress
+from vlatool.cli._console import command_line, leave, progress
 from vlatool.cli._stages import DEFAULTS
 from vlatool.cli.optimize import share
 from vlatool.errors import GateFailed, Inconclusive, UsageError
@@ -421,3 +421,20 @@ def test_progress_is_a_bar_on_a_terminal(monkeypatch):
         context.tell("measuring", None)
         context.tell("measuring", 0.5)
     assert sys.stderr.getvalue().strip()
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        (
+            ["optimize", "p", "--cache", "/data/me/cache", "-o", "/data/out"],
+            "vlatool optimize p --cache cache -o out",
+        ),
+        (["optimize", "p", "--cache=/data/me/cache", "-o/data/out"], "vlatool optimize p --cache=cache -oout"),
+        (["gate", "p", "--junit", "../ci/gate.xml", "-o", "out/x"], "vlatool gate p --junit gate.xml -o out/x"),
+        (["export", "p", "-o"], "vlatool export p -o"),
+    ],
+)
+def test_a_command_in_a_report_names_no_folder_of_the_machine(monkeypatch, typed, told) -> None:
+    monkeypatch.setattr(sys, "argv", ["vlatool", *typed])
+    assert command_line() == told

@@ -770,13 +770,24 @@ def until_measuring():
 
 
 @pytest.fixture
-def evil(there: Target, tmp_path: Path) -> Callable[[str], None]:
+def instead_of_ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """What the target sends, without a server between: a shell command runs as ``ssh``."""
+
+    def put(command: str) -> None:
+        (tmp_path / "programs").mkdir()
+        script(tmp_path / "programs/ssh", f"#!/bin/sh\nexec {command}\n")
+        monkeypatch.setenv("PATH", str(tmp_path / "programs"), prepend=os.pathsep)
+
+    return put
+
+
+@pytest.fixture
+def evil(tmp_path: Path, instead_of_ssh: Callable[[str], None]) -> Callable[[str], None]:
     """A target on which a program of somebody else's answers."""
 
     def put(program: str) -> None:
-        file = tmp_path / "evil.py"
-        file.write_text(EVIL + textwrap.dedent(program))
-        there.prepare(f"exec {sys.executable} {file}\n")
+        (tmp_path / "evil.py").write_text(EVIL + textwrap.dedent(program))
+        instead_of_ssh(f"{sys.executable} {tmp_path / 'evil.py'}")
 
     return put
 
@@ -784,12 +795,13 @@ def evil(there: Target, tmp_path: Path) -> Callable[[str], None]:
 @pytest.mark.parametrize(
     "flood",
     [
-        "timeout 5 cat /dev/zero", "timeout 5 yes", "timeout 5 cat /dev/zero >&2", "timeout 5 yes >&2",
+        "timeout 30 cat /dev/zero", "timeout 30 yes", "sh -c 'timeout 30 cat /dev/zero >&2'",
+        "sh -c 'timeout 30 yes >&2'",
     ],
 )  # fmt: skip
-def test_a_target_that_floods_is_cut_off(there, bundle, monkeypatch, flood):
+def test_a_target_that_floods_is_cut_off(there, bundle, instead_of_ssh, monkeypatch, flood):
     monkeypatch.setenv("VLATOOL_LIMITS", "target_bytes=2e7")
-    there.prepare(flood + "\n")
+    instead_of_ssh(flood)
     before = psutil.Process().memory_info().rss
     with pytest.raises(TargetError, match="the limit 'target_bytes' allows 20000000") as caught:
         there.measure(bundle)

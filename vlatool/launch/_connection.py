@@ -192,7 +192,7 @@ class Connection:
             self._in.close()
         until = time.monotonic() + (0 if self._flooded else CLEANING_S)
         try:
-            while self._ssh.poll() is None and time.monotonic() < until:
+            while self._ssh.poll() is None and time.monotonic() < until and not self._flooded:
                 if self._out in self._ready(50) and not os.read(self._out.fileno(), BLOCK):
                     self._ssh.wait(max(0.1, until - time.monotonic()))
         except subprocess.TimeoutExpired:
@@ -245,8 +245,8 @@ class Connection:
     def _count(self, count: int) -> None:
         """Refuse a target that never stops talking."""
         self._came += count
+        self._flooded = self._came > limit("target_bytes")
         if not self._closing:
-            self._flooded = self._came > limit("target_bytes")
             check("target_bytes", self._came, f"What {self._target} sends", TargetError)
 
     def _try(self) -> str:

@@ -139,6 +139,7 @@ def _send(connection: Connection, target: str, load: _push.Load, tell: Tell) -> 
     answer = connection.receive(PLACE_S)
     if "ready" not in answer:
         raise _refused(target, answer)
+    place = text_of(answer, "ready", target)
     sent = 0
     for packed, size in load.packed():
         connection.doing = f"while files were sent ({sent / 1e6:.1f} of {load.size / 1e6:.1f} MB)"
@@ -147,7 +148,7 @@ def _send(connection: Connection, target: str, load: _push.Load, tell: Tell) -> 
             raise _refused(target, connection.receive())
         sent += size
     tell(f"sent {load.size / 1e6:.1f} MB to {target}", 1.0)
-    return text_of(answer, "ready", target)
+    return place
 
 
 def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:

@@ -108,7 +108,7 @@ def plant(root: Path, work: Work, chance: random.Random) -> None:
         elif kind == "nested":
             shutil.copytree(work.made["bundle"], folder / chance.choice(("sub", "graphs/sub")))
         elif kind == "link":
-            folder.symlink_to(chance.choice(("policy", "nowhere", str(work.made["bundle"]), "../policy")))
+            folder.symlink_to(chance.choice(("policy", "nowhere", "bundle", "../policy")))
         elif kind == "file":
             folder.write_text("mine")
         elif kind == "empty":
@@ -133,10 +133,15 @@ def ours(root: Path, work: Work) -> set[Path]:
     """Files in directories that hold what vlatool wrote and nothing else: these may go."""
     shapes = [files_of(made) for made in work.made.values()]
     found: set[Path] = set()
-    for folder in [root / name for name in NAMES]:
+    for folder in [path for path in root.rglob("*") if path.is_dir()]:
         if folder.is_dir() and not folder.is_symlink() and files_of(folder) in shapes:
             found |= {path for path in folder.rglob("*") if path.is_file()}
     return found
+
+
+def listed(path: Path) -> bool:
+    """Say whether a file is a list that vlatool keeps, to which it adds what it writes later."""
+    return path.name == LEDGER and '"The files that vlatool wrote here' in path.read_text()
 
 
 def files_of(folder: Path) -> dict[str, str]:
@@ -213,7 +218,8 @@ def trial(work: Work, seed: int) -> tuple[str, list[str]]:
         if name != "int8":
             shutil.copytree(made, root / name)
     replaceable = ours(root, work)
-    before = {name: value for name, value in files_of(root).items() if root / name not in replaceable}
+    kept = {name: value for name, value in files_of(root).items() if root / name not in replaceable}
+    before = {name: value for name, value in kept.items() if not listed(root / name)}
     words = command(root, chance)
     here = Path.cwd()
     os.chdir(root)
