@@ -62,14 +62,16 @@ def test_the_golden_action_is_what_the_graph_says_and_not_what_the_engine_gives(
     np.testing.assert_array_equal(right[2], wrong[2])
 
 
-@pytest.mark.parametrize(("factor", "tolerance"), [(1.0, 0.01), (1.008, 0.017), (1.03, 0.045), (1.1, 0.121)])
+@pytest.mark.parametrize("factor", [1.0, 1.008, 1.03, 1.1])
 def test_the_tolerance_of_the_golden_action_is_what_was_measured_and_some_more(
-    float_bundle, wrong_engine, tmp_path, factor, tolerance
+    float_bundle, wrong_engine, tmp_path, factor
 ):
     wrong_engine(factor)
     made = again(float_bundle, tmp_path)
-    assert made.manifest.golden_tolerance == pytest.approx(tolerance, abs=0.0011)
-    assert load(tmp_path, threads=1, accept=[ENGINE_DIFFERENCE]).golden_error == pytest.approx(factor - 1, abs=1e-3)
+    seen = load(tmp_path, threads=1, accept=[ENGINE_DIFFERENCE]).golden_error
+    assert factor - 1 <= seen + 1e-3 < 1.2 * factor - 1.19, "of the action as the graph gives it, and as a chunk"
+    wanted = max(0.01, 1.2 * seen, min(2 * seen, 0.045))
+    assert wanted <= made.manifest.golden_tolerance < wanted + 0.0011
 
 
 def test_an_engine_that_is_further_from_the_graph_than_rounding_is_a_finding(float_bundle, wrong_engine, tmp_path):

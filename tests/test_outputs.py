@@ -53,17 +53,27 @@ def test_a_file_system_of_its_own_is_never_replaced(tmp_path: Path, monkeypatch)
 @pytest.mark.parametrize(
     ("out", "message"),
     [
-        ("policy", "is an input"), (".", "holds policy"), ("policy/sub", "lies in policy"), ("link", "is an input"),
-        ("link/deep/sub", "lies in policy"), ("policy/policy.py", "lies in policy"),
+        ("bundle", "is an input"), (".", "holds bundle"), ("bundle/sub", "lies in bundle"), ("link", "is an input"),
+        ("link/deep/sub", "lies in bundle"), ("bundle/graphs", "lies in bundle"),
     ],
 )  # fmt: skip
 def test_an_input_is_never_the_output(tmp_path: Path, monkeypatch, out: str, message: str):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "policy").mkdir()
-    (tmp_path / "policy/policy.py").touch()
-    (tmp_path / "link").symlink_to("policy")
+    (tmp_path / "bundle/graphs").mkdir(parents=True)
+    (tmp_path / "bundle/manifest.json").touch()
+    (tmp_path / "link").symlink_to("bundle")
     with pytest.raises(OutputError, match=message):
-        refuse_inputs(Path(out), [None, "policy"])
+        refuse_inputs(Path(out), [None, "bundle"])
+
+
+def test_a_policy_may_have_its_output_beside_it_and_the_recipe_of_an_output_may_be_used_again(tmp_path: Path):
+    (tmp_path / "policy/out").mkdir(parents=True)
+    for name in ("policy.py", "out/recipe.yaml", "out/other.yaml"):
+        (tmp_path / "policy" / name).touch()
+    out = tmp_path / "policy/out"
+    refuse_inputs(out, [tmp_path / "policy", out / "recipe.yaml"])
+    with pytest.raises(OutputError, match="an input of this command"):
+        refuse_inputs(out, [tmp_path / "policy", out / "other.yaml"])
 
 
 @pytest.mark.parametrize("given", ["policy/policy.py", "policy/policy.py:make", "./policy/../policy/policy.py:make"])

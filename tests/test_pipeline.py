@@ -127,7 +127,8 @@ def test_the_result_is_a_bundle_that_a_robot_loads(from_torch):
 
 def test_recorded_data_stays_behind(from_torch):
     found = {path.name for path in from_torch.out.iterdir()}
-    assert found == {"assets", "golden", "graphs", "manifest.json", "recipe.yaml", "reports"}
+    beside = {"manifest.json", "manifest.sha256", ".written-by-vlatool.json", "recipe.yaml"}
+    assert found == {"assets", "golden", "graphs", "reports", *beside}
     assert {path.name for path in (from_torch.out / "reports").iterdir()} == {
         "report.json",
         "report.html",

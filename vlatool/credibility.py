@@ -11,6 +11,8 @@ from vlatool.statistics import wilson
 
 DECIDE = ("success", "success_chance", "skill_expert", "variation")
 """The measurements that the credibility rests on."""
+FAILS = "The reference fails"
+"""How the sentence about a reference begins that does not do its task."""
 SKILL = 0.1
 """Share of the best constant action's error that a credible policy does not make, at least."""
 FEW = 100
@@ -76,7 +78,7 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
 
 
 def _failing(reason: str, look_at: str, table: tuple[dict[str, Any], ...] = ()) -> Credibility:
-    first = f"The reference fails, so that nothing can be held against it: {reason}."
+    first = f"{FAILS}, so that nothing can be held against it: {reason}."
     return Credibility("fails", (first, look_at), table=table)
 
 

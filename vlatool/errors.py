@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import importlib.util
+import sys
 from collections.abc import Iterable
 from types import ModuleType
 
@@ -125,6 +127,22 @@ def nearest(name: str, known: Iterable[str]) -> str:
     hits = difflib.get_close_matches(name, names, n=1)
     listing = "known: " + (", ".join(names) if names else "none")
     return f"did you mean '{hits[0]}'? {listing}" if hits else listing
+
+
+def require_present(module: str, extra: str) -> None:
+    """Say which extra provides a module that is absent, without importing it.
+
+    Raises:
+        MissingExtra: when the module is not installed.
+    """
+    try:
+        absent = module not in sys.modules and importlib.util.find_spec(module) is None
+    except ImportError:
+        absent = True
+    if absent or sys.modules.get(module, ...) is None:
+        raise MissingExtra(
+            f"This needs the package '{module}', which the extra '{extra}' provides.", f"pip install 'vlatool[{extra}]'"
+        )
 
 
 def require(module: str, extra: str) -> ModuleType:

@@ -9,8 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from vlatool.errors import OutputError
-from vlatool.written import refuse_foreign
+from vlatool.written import LEDGER, refuse_foreign
 
+RECIPE = "recipe.yaml"
+WRITTEN = (LEDGER, "manifest.json", "report.json")
+"""Names that tell of a directory which a program wrote: another file in it would make it another one."""
 EXISTS = "choose another output, or pass --force to replace it"
 
 
@@ -53,7 +56,10 @@ def _dear() -> dict[str, Path]:
 
 
 def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) -> None:
-    """Refuse an output that is an input of the command, holds one, or lies in one.
+    """Refuse an output that is an input of the command, holds one, or lies in one that vlatool wrote.
+
+    A place in the directory of a policy may be written to, and the recipe that an output holds may be its input: it was
+    read before, and is written again.
 
     Args:
         final: Where something is to be written.
@@ -69,10 +75,10 @@ def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) 
         if file is None:
             continue
         source = Path(os.path.realpath(file))
-        if source.is_relative_to(place):
+        if source.is_relative_to(place) and source != place / RECIPE:
             what = "is an input of this command" if source == place else f"holds {given}, an input of this command"
             raise OutputError(f"{final} {what}.", "name a directory for the output alone")
-        if source.is_dir() and place.is_relative_to(source):
+        if source.is_dir() and place.is_relative_to(source) and any((source / name).exists() for name in WRITTEN):
             raise OutputError(f"{final} lies in {given}, an input of this command.", f"name a directory beside {given}")
 
 

@@ -17,6 +17,7 @@ from vlatool.claims._found import Found, worst
 from vlatool.claims._inputs import AGREEMENT, Inputs
 from vlatool.claims._same import check
 from vlatool.claims._timed import Timed
+from vlatool.credibility import FAILS
 from vlatool.gate import Gate, LatencyClaim
 from vlatool.host import before_run
 from vlatool.report import Measurement, Report, Row
@@ -131,5 +132,7 @@ def _summary(name: str, found: Sequence[Found]) -> tuple[str, ...]:
         "fail": f"{name} does not keep to: {named['fail']}.",
         "inconclusive": f"The samples cannot decide about {named['inconclusive']} of {name}.",
     }[worst(each.verdict for each in found)]
+    if any(each.sentence.startswith(FAILS) for each in found) and not named["fail"]:
+        first = f"Nothing is said about {name}, for the baseline is no reference: it does not do its task."
     said = sorted(found, key=lambda each: order.index(each.verdict))
     return (first, *(f"{each.claim}: {each.verdict}: {each.sentence}." for each in said))

@@ -62,7 +62,7 @@ def test_a_policy_that_remembers_is_caught_and_an_honest_one_is_not(policy, obse
     expected_answers(memoising, observations)
     found = remembered(memoising, observations)
     assert found.remembers
-    assert found.ratio > found.low > 1.10
+    assert found.ratio >= found.low > 1.10
     assert found.pairs == 40
 
 

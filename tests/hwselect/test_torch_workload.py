@@ -96,13 +96,16 @@ def test_a_large_policy_is_counted_without_its_memory(tmp_path: Path) -> None:
     bundle = remade(folder, tmp_path / "source")
     code = (
         "import json, resource, sys\nfrom pathlib import Path\nimport torch\n"
-        "from vlatool.bundle import Bundle\nfrom vlatool.hwselect._torch_workload import torch_workload\n"
+        "from vlatool import trust\nfrom vlatool.bundle import Bundle\n"
+        "from vlatool.hwselect._torch_workload import torch_workload\ntrust.name(Path(sys.argv[2]))\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "found = torch_workload(Bundle.open(Path(sys.argv[1]))).graphs['main']\n"
         "grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before\n"
         "print(json.dumps([found.macs, found.weights, found.weight_bytes, grown]))"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(bundle.path)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(bundle.path), str(folder)], capture_output=True, text=True, check=True
+    )
     macs, weights, stored, grown = json.loads(done.stdout)
     assert macs == {"float32": 4 * 16384**2}
     assert weights == 4 * 16384**2

@@ -63,7 +63,8 @@ def llama(llama_template, tmp_path_factory) -> Bundle:
 def llama_float(llama, tmp_path_factory) -> Bundle:
     """The same policy with no weight quantized: every graph in float32."""
     out = tmp_path_factory.mktemp("llama-float") / "bundle"
-    return run_transform(Unquantized(embeddings="float32"), llama, out, Context())
+    out.mkdir()
+    return Unquantized(embeddings="float32").run(llama, out, Context())
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ Prints a table of counts; the exit status is 1 when anything was violated.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import shutil
@@ -148,19 +147,9 @@ def contents(bundle: Path) -> dict[str, bytes]:
 def make_policy(folder: Path) -> Path:
     """Write the tiny policy of the tests."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    import conftest
-    import numpy as np
+    from _tiny import write_policy
 
-    folder.mkdir()
-    (folder / "policy.yaml").write_text(conftest.POLICY_YAML)
-    (folder / "policy.py").write_text(conftest.POLICY_PY)
-    (folder / "environment.py").write_text(conftest.ENVIRONMENT_PY)
-    (folder / "vocabulary.json").write_text(json.dumps(conftest.VOCABULARY))
-    (folder / "statistics.json").write_text(json.dumps(conftest.STATISTICS))
-    np.savez(folder / "calibration.npz", **conftest.observations(24, seed=1))
-    np.savez(folder / "evaluation.npz", **conftest.observations(16, seed=2))
-    conftest.write_weights(folder / "weights.safetensors")
-    return folder
+    return write_policy(folder)
 
 
 def works(folder: Path, names: list[str]) -> dict[str, Work]:

@@ -125,7 +125,7 @@ def remembered(
     logs = [math.log(fresh / repeated) for repeated, fresh in zip(*taken, strict=True)]
     low = lower_bound(logs, ALPHA)
     ratio = float(np.median(taken[1]) / np.median(taken[0]))
-    return Memory(ratio, math.exp(low) if math.isfinite(low) else 0.0, len(logs))
+    return Memory(ratio, min(ratio, math.exp(low)) if math.isfinite(low) else 0.0, len(logs))
 
 
 def varied(observation: Mapping[str, Any], spec: PolicySpec, random: np.random.Generator) -> dict[str, Any]:

@@ -7,20 +7,21 @@ from dataclasses import replace
 from statistics import median
 
 from vlatool.benchmark._probe import cold_start
-from vlatool.bundle import LOCATION, MANIFEST, Bundle
+from vlatool.bundle import DIGEST, LOCATION, MANIFEST, Bundle
 from vlatool.claims._found import Found
 from vlatool.claims._inputs import MEMORY, Inputs
 from vlatool.data import CALIBRATION, EVALUATION
 from vlatool.gate import GrowthClaim, LatencyClaim
 from vlatool.report import Measurement
 from vlatool.stage import Context
+from vlatool.written import LEDGER
 
 ROUNDING = 1e-9
 PROBES = 3
 """Fresh processes that load each bundle once."""
 OBSERVATIONS = 16
 """Observations that such a process answers, beside the golden one."""
-ABOUT = (MANIFEST, LOCATION, CALIBRATION, EVALUATION, "recipe.yaml", "SIGNATURE",
+ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json",
     "reports/smooth_quant.json",
     "reports/weights.json")  # fmt: skip

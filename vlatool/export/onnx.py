@@ -17,7 +17,7 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, SourceError, require
+from vlatool.errors import GraphError, SourceError, require, require_present
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
@@ -31,6 +31,9 @@ from vlatool.stage import Context, Transform, source_of
 
 if TYPE_CHECKING:
     from torch import nn
+
+    from vlatool.profile import Profile
+
 
 EXTERNAL_DATA_BYTES = 1_500_000_000
 """Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
@@ -52,6 +55,11 @@ class ExportOnnx(Transform):
     def runs(self, source: Bundle | None) -> str:
         """The factory builds the modules, and their forward() runs."""
         return factory_of(source)
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """What exports is installed: the child process that imports it takes seconds to say so."""
+        for module in ("torch", "onnxscript", "onnx"):
+            require_present(module, "build")
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Export, run, compare, and write the bundle."""

@@ -28,7 +28,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from conftest import POLICY_PY, POLICY_YAML, STATISTICS, VOCABULARY, observations, write_weights
+from _tiny import POLICY_PY, POLICY_YAML, STATISTICS, VOCABULARY, observations, write_weights
 
 from vlatool.cli import main
 from vlatool.written import LEDGER

@@ -17,18 +17,18 @@ from gate_graphs import (
     counted,
     counting,
     own_output,
-    proprio_is_not,
+    proprio_is_none_of,
     regilded,
     slow_when,
     wrong_when,
 )
 from onnx import TensorProto, helper
 
-from vlatool.bundle import Bundle, manifest_bytes, seal
+from vlatool.bundle import Bundle, restate, seal
 from vlatool.data import DRAWN, Drawer, read_recording
 from vlatool.evaluate.recorded import run_recorded
 from vlatool.manifest import FileRecord
-from vlatool.runtime.policy import Policy, load_golden
+from vlatool.runtime.policy import Policy, load_goldens
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context
 
@@ -65,10 +65,9 @@ def golden_of_another(base: Bundle, out: Path) -> Bundle:
 
 def golden_alone(base: Bundle, out: Path) -> Bundle:
     """Right for the golden states, zero everywhere else."""
-    golden = load_golden(base)
-    assert golden is not None
-    state = Policy.open(base, threads=1).encode(golden[0])["proprio"][0].tolist()
-    return copied(base, out, wrong_when(proprio_is_not(state), "Zero"))
+    encode = Policy.open(base, threads=1).encode
+    states = [encode(golden[0])["proprio"][0].tolist() for golden in load_goldens(base)]
+    return copied(base, out, wrong_when(proprio_is_none_of(states), "Zero"))
 
 
 def without_golden(base: Bundle, out: Path) -> Bundle:
@@ -83,7 +82,7 @@ def other_statistics(base: Bundle, out: Path) -> Bundle:
     table = json.loads(path.read_text())
     table["action"]["std"] = [3 * value for value in table["action"]["std"]]
     path.write_text(json.dumps(table))
-    return seal(out, made.manifest)
+    return regilded(seal(out, made.manifest))
 
 
 def other_words(base: Bundle, out: Path) -> Bundle:
@@ -149,8 +148,7 @@ def outside(place: str, listed: bool, added: int = 4_000_000) -> Make:
 def rewritten(bundle: Bundle, **fields: Any) -> Bundle:
     """Return the bundle with another manifest over the same files."""
     manifest = replace(bundle.manifest, **fields)
-    (bundle.path / "manifest.json").write_bytes(manifest_bytes(manifest))
-    return Bundle(bundle.path, manifest)
+    return restate(bundle, manifest)
 
 
 def resized(base: Bundle, out: Path) -> Bundle:

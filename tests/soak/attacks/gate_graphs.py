@@ -109,17 +109,19 @@ def text_is_none_of(known: Sequence[Sequence[int]]) -> Change:
     return add
 
 
-def proprio_is_not(values: Sequence[float]) -> Change:
+def proprio_is_none_of(states: Sequence[Sequence[float]]) -> Change:
     """A condition: the normalised state is another one."""
 
     def add(model: onnx.ModelProto) -> None:
-        constant(model, "cond_state", np.asarray([values], np.float32))
+        constant(model, "cond_states", np.asarray(states, np.float32))
         constant(model, "cond_near", np.float32(1e-6))
+        constant(model, "cond_axis", np.array([1], np.int64))
         model.graph.node.extend([
-            helper.make_node("Sub", ["proprio", "cond_state"], ["cond_off"]),
+            helper.make_node("Sub", ["cond_states", "proprio"], ["cond_off"]),
             helper.make_node("Abs", ["cond_off"], ["cond_abs"]),
-            helper.make_node("ReduceMax", ["cond_abs"], ["cond_worst"], keepdims=0),
-            helper.make_node("Greater", ["cond_worst", "cond_near"], ["cond"]),
+            helper.make_node("ReduceMax", ["cond_abs", "cond_axis"], ["cond_worst"], keepdims=0),
+            helper.make_node("ReduceMin", ["cond_worst"], ["cond_nearest"], keepdims=0),
+            helper.make_node("Greater", ["cond_nearest", "cond_near"], ["cond"]),
         ])  # fmt: skip
 
     return add
