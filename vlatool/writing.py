@@ -15,6 +15,7 @@ import json
 import os
 import re
 import shutil
+import threading
 import uuid
 import warnings
 from collections.abc import Iterator
@@ -92,6 +93,10 @@ class _Draft:
             self.place.rmdir()
 
 
+BEGINNING = threading.Lock()
+"""Held until a draft is locked: another thread would take it for one that was left behind by this process's number."""
+
+
 @contextlib.contextmanager
 def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Iterator[Path]:
     """Yield a fresh directory that becomes ``final`` when the block ends well.
@@ -113,11 +118,12 @@ def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Itera
         if not damaged:
             refuse_replacing(final, force=force)
         final.parent.mkdir(parents=True, exist_ok=True)
-        sweep(final)
-        draft = _Draft.make(final)
-    lock = os.open(draft.place, os.O_RDONLY)
+        with BEGINNING:
+            sweep(final)
+            draft = _Draft.make(final)
+            lock = os.open(draft.place, os.O_RDONLY)
+            fcntl.flock(lock, fcntl.LOCK_EX)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
         with output_errors(final):
             yield draft.content
             note(draft.content)

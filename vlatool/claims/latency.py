@@ -41,7 +41,7 @@ def examine(timed: Timed, claim: LatencyClaim) -> Found:
             name, decision.ratio, "x", samples=len(found), low=decision.low, high=decision.high, confidence=CONFIDENCE,
             note=f"candidate over baseline, {what}, fresh processes with both, Hodges-Lehmann",
         )
-        for name, what, decision in zip(("latency_ratio", "latency_mean_ratio"), ("medians", "means"), decisions,
+        for name, what, decision in zip(("latency_ratio", "latency_mean_ratio"), ("medians", "means of ratios"), decisions,
                                         strict=True)
     )  # fmt: skip
     verdicts = [decision.verdict for decision in decisions]

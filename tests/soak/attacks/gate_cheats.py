@@ -210,11 +210,13 @@ def exported(folder: Path) -> Bundle:
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from _tiny import write_policy
 
+    from vlatool import trust
     from vlatool.export.onnx import ExportOnnx
     from vlatool.sources.torch_module import TorchModule
 
     policy = folder / "policy"
     write_policy(policy)
+    trust.name(policy)
     for name in ("source", "exported"):
         (folder / name).mkdir()
     source = TorchModule(policy=policy).run(None, folder / "source", Context())

@@ -31,11 +31,13 @@ from typing import Any
 import victim
 from mutations import Files, mutated, read, repaired, without_golden
 
+from vlatool import sealed_files
 from vlatool.errors import VlatoolError
 
 HANG = 10.0
 MEMORY = 1 << 30
 BATCH = 2000
+TOLD_S = 60.0
 REFUSED = "refused: "
 SAME = "loaded, same answer"
 UNREPAIRED = "hashes not repaired, another answer"
@@ -129,6 +131,7 @@ class Attack:
 def work(original: Files, folder: Path, seed: int, numbers: range, now: mmap.mmap, out: Path) -> None:
     """Go through some tries in this process; what was found is written after each that may be the last."""
     warnings.simplefilter("ignore")
+    sealed_files.TICK_NS = 0  # nobody else writes here, so that nothing can change within a tick of the clock
     found = Found()
     attack = Attack(original, folder, seed)
     for number in numbers:
@@ -203,7 +206,7 @@ class Worker:
 
 def soak(tries: int, seed: int, workers: int) -> Found:
     """Make so many mutants in some processes at a time."""
-    found = Found()
+    found, told = Found(), time.monotonic() + TOLD_S
     place = Path(tempfile.mkdtemp(prefix="mutants-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     try:
         original = read(victim.make(place / "original").path)
@@ -214,6 +217,9 @@ def soak(tries: int, seed: int, workers: int) -> Found:
                 running.append(Worker(original, place, seed, waiting.pop(), found))
             running = [worker for worker in running if not worker.ended()]
             time.sleep(0.02)
+            if time.monotonic() > told:
+                told += TOLD_S
+                print(f"... {sum(found.counts.values())} of {tries}", file=sys.stderr, flush=True)
     finally:
         shutil.rmtree(place, ignore_errors=True)
     return found
