@@ -14,6 +14,7 @@ from vlatool.report import Measurement
 
 STATISTICS = ("median", "mean")
 """Of the calls; of the observations, each the median of its calls."""
+TOLD = (("latency_ratio", "medians"), ("latency_mean_ratio", "means of ratios"))
 AGREE = CONFIRM - 1
 """Pairs of ``CONFIRM`` that must be slow: between equal bundles, 19 of 20 are so once in 50,000 times."""
 
@@ -41,8 +42,7 @@ def examine(timed: Timed, claim: LatencyClaim) -> Found:
             name, decision.ratio, "x", samples=len(found), low=decision.low, high=decision.high, confidence=CONFIDENCE,
             note=f"candidate over baseline, {what}, fresh processes with both, Hodges-Lehmann",
         )
-        for name, what, decision in zip(("latency_ratio", "latency_mean_ratio"), ("medians", "means of ratios"), decisions,
-                                        strict=True)
+        for (name, what), decision in zip(TOLD, decisions, strict=True)
     )  # fmt: skip
     verdicts = [decision.verdict for decision in decisions]
     slow = slow_observations(timed, claim.worst)
