@@ -210,7 +210,7 @@ CASES = (
     Case("the world turns a deaf ear", world=(("move = np.clip(action, -0.3, 0.3)", "move = np.zeros(2)"),)),
     Case("the world takes degrees", world=(("move = np.clip(action, -0.3, 0.3)", "move = np.radians(action)"),)),
     # candidates
-    Case("int8 scales corrupted", refused=True, candidate=scaled),
+    Case("int8 scales corrupted", candidate=scaled),
     Case("int8 weights are zeros", candidate=lambda name, array: array * 0 if array.dtype == np.int8 else array),
     Case("int8 weights shuffled", candidate=lambda name, array: shuffled(array) if array.dtype == np.int8 else array),
     Case("int8 far from a float32 that moves little", f"{INNER} * 0.05", evidence="recordings", candidate=scaled),
