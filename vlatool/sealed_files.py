@@ -74,10 +74,10 @@ def read_all(handle: int, size: int) -> bytes:
 def hash_handle(handle: int) -> str:
     """Return the SHA-256 of an open file from its start, as hex."""
     digest = hashlib.sha256()
-    at = 0
-    while block := os.pread(handle, BLOCK, at):
-        digest.update(block)
-        at += len(block)
+    buffer, at = bytearray(BLOCK), 0  # one for all blocks: fresh memory takes longer to get than to fill
+    while count := os.preadv(handle, [buffer], at):
+        digest.update(memoryview(buffer)[:count])
+        at += count
     return digest.hexdigest()
 
 
@@ -198,11 +198,13 @@ def held(root: Path, folder: str, files: dict[str, tuple[str, int]]) -> Iterator
 def contains(root: Path, name: str, part: bytes) -> bool:
     """Say whether a file holds some bytes, a block at a time."""
     with open_inside(root, name) as handle:
-        at, kept = 0, b""
-        while block := os.pread(handle, BLOCK, at):
-            if part in kept + block:
+        over, at = len(part) - 1, 0  # bytes before a block, in which the part may begin
+        buffer = bytearray(over + BLOCK)
+        while count := os.preadv(handle, [memoryview(buffer)[over:]], at):
+            if buffer.find(part, 0 if at else over, over + count) >= 0:
                 return True
-            kept, at = block[-len(part) :], at + len(block)
+            buffer[:over] = buffer[count : count + over]
+            at += count
     return False
 
 

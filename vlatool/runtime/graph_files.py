@@ -16,7 +16,7 @@ from vlatool.runtime.external_data import LOCATION, external_files
 from vlatool.sealed_files import contains, open_inside, read_all
 from vlatool.typed import outside, shown
 
-WHOLE = 64 * MIB
+WHOLE = 4 * MIB
 """Bytes of a graph up to which the engine gets its content; a larger one would be in the memory twice."""
 
 
@@ -41,7 +41,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
     path = bundle.path / graph.file
     if _size(bundle, graph.file) <= WHOLE:
         content = bundle.read(graph.file)
-        if not external_files(content):
+        if LOCATION not in content or not external_files(content):
             return engine(path, threads, graph.compute, content)
         del content
     with contextlib.ExitStack() as stack:
