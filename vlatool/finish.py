@@ -24,8 +24,8 @@ GOLDEN_COUNT = 2
 ENGINE_DIFFERENCE = "engine-difference"
 ROUNDING = 0.045
 """Relative L2 difference of an engine from what the graph says, up to which it is rounding that falls the other way. On
-right engines and processors it was at most 0.035, on wrong ones at least 0.09; where int8 products saturate it starts
-at 0.045 (sample policies, vit-s, vla-45m and vit-b; docs/concepts/trust.md)."""
+right engines and processors it was seen to be at most 0.035, on wrong ones at least 0.09, and where int8 products
+saturate from 0.045 on."""
 LEAST_TOLERANCE = 0.01
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""

@@ -109,7 +109,8 @@ class ClosedLoop(Measure):
         where, function = split_factory(job.environment)
         file = factory_file(job.environment, Path(job.folder))
         if self.policy or self.environment:
-            trust.name(file.parent if file else Path(job.folder))
+            if file or self.policy:  # a package that is named makes no code of the current directory run
+                trust.name(file.parent if file else Path(job.folder))
             return
         if file is None:
             raise SourceError(
