@@ -196,7 +196,8 @@ class Policy:
         """
         if tolerance is None:
             tolerance = self.bundle.manifest.golden_tolerance or GOLDEN_TOLERANCE
-        steps = load_goldens(self.bundle)
+        stored = _stored(self.bundle)
+        steps = _goldens(self.bundle, stored)
         if self.program.keeps and steps and len(steps) < GOLDEN_STEPS:
             raise BundleError(
                 f"The golden file of {self.bundle.path} has one step; a policy that keeps values needs {GOLDEN_STEPS}.",
@@ -205,7 +206,7 @@ class Policy:
         if not steps or not inferences:
             return
         errors: list[float] = []
-        chunks = _golden_chunks(self.bundle, len(steps))
+        chunks = _golden_chunks(self.spec.action, stored, len(steps))
         for number in range(max(inferences, len(steps))):
             observation, noise, expected = steps[number % len(steps)]
             if not number % len(steps):
@@ -286,11 +287,22 @@ def load_goldens(bundle: Bundle) -> list[Golden]:
         BundleError: when the file is not the one that the manifest records.
         DataError: when the file cannot be read or does not fit the spec.
     """
+    return _goldens(bundle, _stored(bundle))
+
+
+def _stored(bundle: Bundle) -> Mapping[str, Array]:
+    """Return the arrays of the golden file; none when there is no such file."""
+    name = bundle.manifest.golden
+    if not name:
+        return {}
+    return open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=f"The golden file {bundle.path / name}")
+
+
+def _goldens(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
     name, spec = bundle.manifest.golden, bundle.manifest.spec
     if not name:
         return []
     where = f"The golden file {bundle.path / name}"
-    stored = open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=where)
     noise = [key for key in stored if key.startswith("noise.")]
     action = f"out.{spec.action.name}"
     needed = [*(f"in.{tensor.name}" for tensor in spec.inputs), *noise, action]
@@ -314,13 +326,12 @@ def load_goldens(bundle: Bundle) -> list[Golden]:
     ]
 
 
-def _golden_chunks(bundle: Bundle, steps: int) -> list[Array]:
+def _golden_chunks(action: TensorSpec, stored: Mapping[str, Array], steps: int) -> list[Array]:
     """Return the recorded actions in physical units; none for indices, and where they were not recorded."""
-    name, action = bundle.manifest.golden, bundle.manifest.spec.action
-    stored = open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=name).get(f"chunk.{action.name}")
-    if stored is None or action.kind == "discrete" or not stored.ndim or stored.dtype.kind not in "fiu":
+    chunks = stored.get(f"chunk.{action.name}")
+    if chunks is None or action.kind == "discrete" or not chunks.ndim or chunks.dtype.kind not in "fiu":
         return []
-    return list(stored) if len(stored) == steps else []
+    return list(chunks) if len(chunks) == steps else []
 
 
 def relative_error(got: Array, expected: Array) -> float:
