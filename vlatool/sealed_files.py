@@ -195,19 +195,6 @@ def held(root: Path, folder: str, files: dict[str, tuple[str, int]]) -> Iterator
             raise BundleError(f"The bundle {root} was changed while {', '.join(files)} was opened.", FIX)
 
 
-def contains(root: Path, name: str, part: bytes) -> bool:
-    """Say whether a file holds some bytes, a block at a time."""
-    with open_inside(root, name) as handle:
-        over, at = len(part) - 1, 0  # bytes before a block, in which the part may begin
-        buffer = bytearray(over + BLOCK)
-        while count := os.preadv(handle, [memoryview(buffer)[over:]], at):
-            if buffer.find(part, 0 if at else over, over + count) >= 0:
-                return True
-            buffer[:over] = buffer[count : count + over]
-            at += count
-    return False
-
-
 def _place(root: Path, folder: str, handle: int) -> Path:
     """A name for an open directory, whatever is renamed meanwhile."""
     place = Path(f"/proc/self/fd/{handle}")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from _written import MEMORY, SUM, X, Y, written
 from vlatool.errors import GraphError, SpecError
 from vlatool.manifest import ProgramStep
 from vlatool.runtime import load
-from vlatool.runtime.contract import Outputs, Port, check_chunk
+from vlatool.runtime.contract import Outputs, Port, check_chunk, written_as_declared
 from vlatool.spec import PolicySpec, TensorSpec
 
 ENGINES = pytest.mark.parametrize("engine", ["ort_cpu", "openvino"])
@@ -167,3 +168,39 @@ def test_an_action_of_float16_reaches_the_controller_as_float32(tmp_path: Path):
     )
     action = load(bundle.path).infer({"x": [1.0, 2.0]})
     assert (action.chunk.dtype, action.outputs["y"].dtype) == (np.float32, np.float16)
+
+
+def test_shape_and_dtype_are_not_looked_at_where_the_engine_cannot_give_others(tmp_path: Path):
+    plain = load(written(tmp_path / "plain", "g (float[1,2] x) => (float[1,2] y) { y = Neg(x) }").path)
+    assert written_as_declared(plain.bundle.manifest, plain.program.sessions) == {"y"}
+    free = "g (float[1,N] x) => (float[1,N] y) { y = Neg(x) }"
+    free_policy = load(written(tmp_path / "free", free, outputs=(TensorSpec("y", (1, "n")),)).path)
+    assert written_as_declared(free_policy.bundle.manifest, free_policy.program.sessions) == set()
+
+
+def test_what_a_program_makes_in_another_way_is_looked_at():
+    session = SimpleNamespace(bound=True)
+    spec = PolicySpec((X,), (Y,), 10, 1)
+    step = ProgramStep("g", {"x": "x"}, {"out": "y"})
+    for steps in ((step, step), (replace(step, gives={"out": "z"}, carry={"z": "y"}),)):
+        manifest = SimpleNamespace(spec=spec, program=steps)
+        assert written_as_declared(manifest, {"g": session}) == set()
+    assert written_as_declared(SimpleNamespace(spec=spec, program=(step,)), {"g": session}) == {"y"}
+    assert written_as_declared(SimpleNamespace(spec=spec, program=(step,)), {"g": object()}) == set()
+
+
+def test_what_is_certain_is_returned_unseen_but_for_numbers_that_are_not_finite():
+    outputs = Outputs((Y, replace(Y, name="z")), action=False, certain={"y", "z"})
+    assert list(outputs({"y": 1, "z": np.ones((1, 2), np.float32), "more": 2})) == ["y", "z"]
+    with pytest.raises(GraphError, match="'z' is not finite"):
+        outputs({"y": 1, "z": np.full((1, 2), np.nan, np.float32)})
+
+
+@ENGINES
+def test_a_graph_that_gives_another_shape_than_it_declares_fails(tmp_path: Path, engine):
+    text = "g (float[1,2] x) => (float[1,2] y) { a = NonZero(x)  b = Cast<to = 1>(a)  i = Constant<value_ints = [0]>()"
+    text += "  j = Constant<value_ints = [1]>()  y = Slice(b, i, j, i) }"
+    policy = load(written(tmp_path, text).path, engine=engine)
+    policy.infer({"x": [1.0, 2.0]})
+    with pytest.raises(GraphError):
+        policy.infer({"x": [1.0, 0.0]})

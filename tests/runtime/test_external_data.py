@@ -1,5 +1,7 @@
 import contextlib
+import os
 import random
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -7,7 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import external_files
+from vlatool.runtime.external_data import SMALL, OpenFile, external_files
 
 
 def external(name: str, location: str) -> onnx.TensorProto:
@@ -67,6 +69,44 @@ PLACES = {
 
 def test_every_place_where_a_model_may_keep_weights_is_found():
     assert external_files(everywhere().SerializeToString()) == PLACES
+
+
+def large() -> onnx.ModelProto:
+    """The same model with much between its weights, some of which read like the key."""
+    model = everywhere()
+    values = np.frombuffer(b"location" * SMALL, np.float32)
+    for number in range(8):
+        model.graph.initializer.insert(0, numpy_helper.from_array(values, f"large_{number}"))
+        value = numpy_helper.from_array(values, f"constant_{number}")
+        model.graph.node.insert(0, helper.make_node("Constant", [], [f"constant_{number}"], value=value))
+    return model
+
+
+def in_file(content: bytes, folder: Path) -> set[str]:
+    path = folder / "model.onnx"
+    path.write_bytes(content)
+    with path.open("rb") as stream:
+        return external_files(OpenFile(stream.fileno()))
+
+
+def test_of_an_open_file_the_data_of_large_tensors_are_not_read(tmp_path, monkeypatch):
+    content = large().SerializeToString()
+    assert external_files(content) == PLACES
+    read = []
+    true = os.pread
+    monkeypatch.setattr(os, "pread", lambda handle, size, at: read.append(size) or true(handle, size, at))
+    assert in_file(content, tmp_path) == PLACES
+    assert len(content) > 2_000_000 > 2 * sum(read)
+
+
+def test_a_file_that_becomes_shorter_meanwhile_is_told(tmp_path, monkeypatch):
+    path = tmp_path / "model.onnx"
+    path.write_bytes(large().SerializeToString())
+    with path.open("rb") as stream:
+        opened = OpenFile(stream.fileno())
+        os.truncate(path, 1_000_000)
+        with pytest.raises(GraphError, match="ends within a number"):
+            external_files(opened)
 
 
 def test_a_model_without_external_data_has_none():
@@ -133,7 +173,7 @@ def nested(field: int, content: bytes) -> bytes:
     return bytes([field << 3 | 2]) + length + bytes([size]) + content
 
 
-def test_whatever_protobuf_reads_from_a_damaged_model_is_found():
+def test_whatever_protobuf_reads_from_a_damaged_model_is_found(tmp_path):
     """Fuzz: what onnx finds in a damaged model, the walk finds, too, or refuses the model."""
     chance = random.Random(0)
     original = everywhere().SerializeToString()
@@ -144,6 +184,7 @@ def test_whatever_protobuf_reads_from_a_damaged_model_is_found():
             content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
         with contextlib.suppress(GraphError):
             found = external_files(bytes(content))
+            assert in_file(bytes(content), tmp_path) == found
             with contextlib.suppress(Exception):
                 agreed += locations(onnx.ModelProto.FromString(bytes(content))) <= found or pytest.fail("missed one")
     assert agreed > 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -188,21 +188,41 @@ def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
         )
 
 
+def written_as_declared(manifest: Manifest, sessions: Mapping[str, Any]) -> set[str]:
+    """Return the outputs that an engine writes into arrays of the declared shape and dtype, and cannot give otherwise.
+
+    Those are what one graph gives, and nothing else makes, where its session has ``bound`` (``check_graphs`` has held
+    what it gives against the spec).
+    """
+    makers: dict[str, list[bool]] = {}
+    for step in manifest.program:
+        bound = getattr(sessions[step.graph], "bound", False)
+        for name in step.gives.values():
+            makers.setdefault(name, []).append(bound)
+        for name in (*step.carry.values(), *_sources(step)):
+            makers.setdefault(name, []).append(False)
+    return {tensor.name for tensor in manifest.spec.outputs if makers.get(tensor.name) == [True]}
+
+
 class Outputs:
     """Holds the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
 
     Args:
         outputs: What is declared.
         action: Whether the first is looked at for finite numbers, too; a policy does that in physical units.
+        certain: Names of outputs whose shape and dtype need not be looked at.
     """
 
-    def __init__(self, outputs: Iterable[TensorSpec], *, action: bool = True) -> None:
+    def __init__(self, outputs: Iterable[TensorSpec], *, action: bool = True, certain: Collection[str] = ()) -> None:
+        self._names = []
         self._wanted = []
         for number, tensor in enumerate(outputs):
             dtype = np.dtype(tensor.dtype)
             fixed = tensor.shape if all(isinstance(axis, int) for axis in tensor.shape) else None
             floating = dtype.kind == "f" and (action or number > 0)
-            self._wanted.append((tensor.name, fixed, dtype, floating, tensor))
+            self._names.append(tensor.name)
+            if floating or tensor.name not in certain:
+                self._wanted.append((tensor.name, fixed, dtype, floating, tensor))
 
     def __call__(self, values: Mapping[str, Any], who: str = "The policy") -> dict[str, Array]:
         """Return the outputs by name.
@@ -210,15 +230,14 @@ class Outputs:
         Raises:
             GraphError: naming the output, what it is and what is declared.
         """
-        found = {}
         for name, shape, dtype, floating, tensor in self._wanted:
             array = values[name]
-            if array.dtype != dtype or (array.shape != shape and (shape or not _fits(array, tensor))):
+            known = array.dtype is dtype or array.dtype == dtype  # numpy has one object for each of its own dtypes
+            if not known or (array.shape != shape and (shape or not _fits(array, tensor))):
                 raise _misfit(array, tensor, who)
             if floating and not all_finite(array):
                 raise not_finite(name)
-            found[name] = array
-        return found
+        return {name: values[name] for name in self._names}
 
 
 def not_finite(name: str, what: str = "output") -> GraphError:

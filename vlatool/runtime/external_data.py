@@ -1,7 +1,11 @@
-"""Which files beside an ONNX graph hold its weights: the graph's bytes are walked, nothing is built from them."""
+"""Which files beside an ONNX graph hold its weights: the graph's bytes are walked, nothing is built from them.
+
+Of a file, what need not be looked at is not even read: the data of large tensors are passed over.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 from vlatool.errors import GraphError
@@ -9,6 +13,8 @@ from vlatool.limits import check, limit
 
 LOCATION = b"location"
 VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5
+HEAD = 15
+"""Bytes that the tag and the length of a field take at most."""
 STRING_ENTRY = "StringStringEntryProto"
 MESSAGES: dict[str, dict[int, str]] = {
     "ModelProto": {7: "GraphProto", 20: "TrainingInfoProto", 25: "FunctionProto"},
@@ -26,11 +32,37 @@ MESSAGES: dict[str, dict[int, str]] = {
 """Message -> number of a field -> message in it, as far as they lead to a tensor (onnx.proto)."""
 
 
-def external_files(model: bytes) -> set[str]:
+SMALL = 16 * 1024
+"""Bytes of a message up to which it is searched for the key as a whole before it is walked, and of one read."""
+
+
+class OpenFile:
+    """The bytes of an open file, read where they are looked at.
+
+    Args:
+        handle: Descriptor of a file open for reading; it stays open.
+    """
+
+    def __init__(self, handle: int) -> None:
+        self._handle = handle
+        self._size = os.fstat(handle).st_size
+        self._at, self._part = 0, b""
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, where: slice) -> bytes:
+        start, end, _ = where.indices(self._size)
+        if not self._at <= start <= end <= self._at + len(self._part):
+            self._at, self._part = start, os.pread(self._handle, max(SMALL, end - start), start)
+        return self._part[start - self._at : end - self._at]
+
+
+def external_files(model: bytes | OpenFile) -> set[str]:
     """Return the locations of all external data that a serialized ``ModelProto`` names, as they stand there.
 
-    Initialisers, attributes, subgraphs, functions and training graphs are gone through; time and memory are linear in
-    the size of the model.
+    Initialisers, attributes, subgraphs, functions and training graphs are gone through, as far as the key stands in
+    them. Time is linear in the number of parts, and in the size of those that name weights beside the graph.
 
     Raises:
         GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth`` or have more parts
@@ -40,29 +72,33 @@ def external_files(model: bytes) -> set[str]:
         >>> external_files(b"")
         set()
     """
-    if LOCATION not in model:  # the key stands in every such entry, as it is
-        return set()
     found: set[str] = set()
     seen, most = 0, limit("graph_fields")
-    levels = [("ModelProto", _fields(model, 0, len(model)))]
+    levels = [("ModelProto", _fields(model, 0, len(model)))] if _may_name(model, 0, len(model)) else []
     while levels and seen <= most:
         message, fields = levels[-1]
         field, start, end = next(fields, (0, 0, 0))
         seen += 1
+        inner = MESSAGES[message].get(field)
         if not field:
             levels.pop()
-        elif (inner := MESSAGES[message].get(field)) == STRING_ENTRY:
+        elif inner == STRING_ENTRY:
             found |= _location(model, start, end)
-        elif inner:
+        elif inner and _may_name(model, start, end):
             levels.append((inner, _fields(model, start, end)))
             check("graph_depth", len(levels), "The graph", GraphError)
     check("graph_fields", seen, "The graph", GraphError)
     return found
 
 
-def _location(model: bytes, start: int, end: int) -> set[str]:
+def _may_name(model: bytes | OpenFile, start: int, end: int) -> bool:
+    """Say whether a message may hold the key, which stands in every such entry as it is: a large one may."""
+    return end - start > SMALL or LOCATION in model[start:end]
+
+
+def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
     """Return every value of a key-value pair one of whose keys is ``location``: the last of several would win."""
-    pairs = [(field, model[at:to]) for field, at, to in _fields(model, start, end)]
+    pairs = [(field, model[at : min(to, at + SMALL)]) for field, at, to in _fields(model, start, end)]
     if not any(field == 1 and key == LOCATION for field, key in pairs):
         return set()
     try:
@@ -71,31 +107,33 @@ def _location(model: bytes, start: int, end: int) -> set[str]:
         raise GraphError("The graph names external data by bytes that are no UTF-8.") from None
 
 
-def _fields(model: bytes, at: int, end: int) -> Iterator[tuple[int, int, int]]:
+def _fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
     """Yield number, start and end of the fields of a message that have a length; others are passed over."""
     while at < end:
-        tag, at = _varint(model, at, end, 5)
+        head = model[at : min(end, at + HEAD)]
+        tag, used = _varint(head, 0, 5)
         field, kind = tag >> 3, tag & 7
         if kind == LENGTH:
-            size, at = _varint(model, at, end, 10)
+            size, used = _varint(head, used, 10)
+            at += used
             if size > end - at:
                 raise GraphError("The graph is no ONNX model: a part of it is longer than the whole.")
             yield field, at, at + size
             at += size
         elif kind == VARINT:
-            _, at = _varint(model, at, end, 10)
+            at += _varint(head, used, 10)[1]
         elif kind in (FIXED32, FIXED64):
-            at += 4 if kind == FIXED32 else 8
+            at += used + (4 if kind == FIXED32 else 8)
         if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or at > end or tag >> 32:
             raise GraphError("The graph is no ONNX model: it has a field of an unknown kind.")
 
 
-def _varint(model: bytes, at: int, end: int, longest: int) -> tuple[int, int]:
+def _varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
     value = 0
     for number in range(longest):
-        if at >= end:
+        if at >= len(head):
             raise GraphError("The graph is no ONNX model: it ends within a number.")
-        byte = model[at]
+        byte = head[at]
         at += 1
         value |= (byte & 0x7F) << (7 * number)
         if byte < 0x80:

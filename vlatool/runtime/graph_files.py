@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError
-from vlatool.limits import MIB, check
+from vlatool.limits import MIB
 from vlatool.manifest import Graph
-from vlatool.runtime.external_data import LOCATION, external_files
-from vlatool.sealed_files import contains, open_inside, read_all
+from vlatool.runtime.external_data import OpenFile, external_files
+from vlatool.sealed_files import open_inside
 from vlatool.typed import outside, shown
 
 WHOLE = 4 * MIB
@@ -41,7 +40,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
     path = bundle.path / graph.file
     if _size(bundle, graph.file) <= WHOLE:
         content = bundle.read(graph.file)
-        if LOCATION not in content or not external_files(content):
+        if not external_files(content):
             return engine(path, threads, graph.compute, content)
         del content
     with contextlib.ExitStack() as stack:
@@ -58,12 +57,8 @@ def _size(bundle: Bundle, file: str) -> int:
 
 
 def _beside(place: Path, name: str) -> set[str]:
-    if not contains(place, name, LOCATION):
-        return set()
     with open_inside(place, name) as handle:
-        size = os.fstat(handle).st_size
-        check("graph_bytes", size, name, BundleError)
-        return external_files(read_all(handle, size))
+        return external_files(OpenFile(handle))
 
 
 def _recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:

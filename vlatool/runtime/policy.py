@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from threading import get_ident
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,15 @@ from vlatool.limits import check
 from vlatool.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.npz_files import open_npz
 from vlatool.runtime.assets import Assets
-from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, not_finite
+from vlatool.runtime.contract import (
+    Outputs,
+    allowed_mb,
+    check_chunk,
+    check_graphs,
+    check_sizes,
+    not_finite,
+    written_as_declared,
+)
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
@@ -70,7 +79,9 @@ class Policy:
         self.program = program
         self.encode = ObservationEncoder(self.spec, bundle)
         self._decode = _Decoder(self.spec, bundle)
-        self._outputs = Outputs(self.spec.outputs, action=False)
+        certain = written_as_declared(bundle.manifest, program.sessions)
+        self._outputs = Outputs(self.spec.outputs, action=False, certain=certain)
+        self._action = self.spec.action.name
         self._sequence = 0
         self._turn = threading.RLock()  # a signal handler may strike between lock and owner
         self._owner = 0
@@ -121,22 +132,22 @@ class Policy:
             self._check_overlap()
         with self._turn:
             try:
-                self._owner = threading.get_ident()
-                outputs, chunk, labels = self.program.run(self.encode(observation), noise, self._answer)
+                self._owner = get_ident()
+                outputs, (chunk, labels) = self.program.run(self.encode(observation), noise, self._answer)
                 sequence = self._sequence
                 self._sequence += 1
             finally:
                 self._owner = 0
         return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
 
-    def _answer(self, values: dict[str, Any]) -> tuple[dict[str, Array], Array, tuple[str, ...]]:
+    def _answer(self, values: dict[str, Any]) -> tuple[dict[str, Array], tuple[Array, tuple[str, ...]]]:
         outputs = self._outputs(values)
-        return outputs, *self._decode(outputs[self.spec.action.name])
+        return outputs, self._decode(outputs[self._action])
 
     def _check_overlap(self) -> None:
         """Refuse a call during an inference where taking turns would not make it right."""
         fix = "open one policy for each thread"
-        if self._owner == threading.get_ident():
+        if self._owner == get_ident():
             raise UsageError("The policy is called while it infers, in the same thread (a signal handler?).", fix)
         if self.program.keeps:
             raise UsageError(
@@ -147,14 +158,10 @@ class Policy:
     def reset(self) -> None:
         """Start a new episode: forget kept values, restart the noise from its seed.
 
-        Args:
-            inferences: How often.
-            tolerance: Largest relative L2 difference; the one in the manifest when None.
-
         Raises:
             UsageError: when this thread's own inference is under way.
         """
-        if self._owner == threading.get_ident():
+        if self._owner == get_ident():
             self._check_overlap()
         with self._turn:
             self._sequence = 0

@@ -78,6 +78,7 @@ class OrtCpuSession:
         self.takes = {node.name: _port(node) for node in self._session.get_inputs()}
         self.gives = {node.name: _port(node) for node in self._session.get_outputs()}
         self._bound = _Bound.of(self._session, ort)
+        self.bound = self._bound is not None
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run the graph: input name -> array, output name -> array.
@@ -139,13 +140,15 @@ class _Bound:
     def __init__(self, session: Any, ort: Any, inputs: dict[str, Array], outputs: dict[str, Array]) -> None:
         self._inputs = [(name, buffer, buffer.shape, buffer.dtype) for name, buffer in inputs.items()]
         self._outputs = list(outputs.items())
-        self._binding = session.io_binding()
-        self._start = session.run_with_iobinding
+        self._binding = binding = session.io_binding()
         shared = ort.OrtValue.ortvalue_from_numpy
         for name, buffer in inputs.items():
-            self._binding.bind_ortvalue_input(name, shared(buffer))
+            binding.bind_ortvalue_input(name, shared(buffer))
         for name, buffer in outputs.items():
-            self._binding.bind_ortvalue_output(name, shared(buffer))
+            binding.bind_ortvalue_output(name, shared(buffer))
+        self._start, self._bindings = session.run_with_iobinding, binding
+        if hasattr(session, "_sess") and hasattr(binding, "_iobinding"):  # past checks that concern other providers
+            self._start, self._bindings = session._sess.run_with_iobinding, binding._iobinding
 
     @classmethod
     def of(cls, session: Any, ort: Any) -> _Bound | None:
@@ -168,9 +171,9 @@ class _Bound:
             buffer[...] = value
         return len(feeds) == len(self._inputs)
 
-    def run(self, *options: Any) -> dict[str, Array]:
+    def run(self, options: Any = None) -> dict[str, Array]:
         """Run on what the buffers hold and return copies of the outputs."""
-        self._start(self._binding, *options)
+        self._start(self._bindings, options)
         return {name: buffer.copy() for name, buffer in self._outputs}
 
 
