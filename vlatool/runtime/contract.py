@@ -214,15 +214,20 @@ class Outputs:
     """
 
     def __init__(self, outputs: Iterable[TensorSpec], *, action: bool = True, certain: Collection[str] = ()) -> None:
-        self._names = []
+        self.names = []
         self._wanted = []
         for number, tensor in enumerate(outputs):
             dtype = np.dtype(tensor.dtype)
             fixed = tensor.shape if all(isinstance(axis, int) for axis in tensor.shape) else None
             floating = dtype.kind == "f" and (action or number > 0)
-            self._names.append(tensor.name)
+            self.names.append(tensor.name)
             if floating or tensor.name not in certain:
                 self._wanted.append((tensor.name, fixed, dtype, floating, tensor))
+
+    @property
+    def certain(self) -> bool:
+        """Whether there is nothing to look at."""
+        return not self._wanted
 
     def __call__(self, values: Mapping[str, Any], who: str = "The policy") -> dict[str, Array]:
         """Return the outputs by name.
@@ -237,7 +242,7 @@ class Outputs:
                 raise _misfit(array, tensor, who)
             if floating and not all_finite(array):
                 raise not_finite(name)
-        return {name: values[name] for name in self._names}
+        return {name: values[name] for name in self.names}
 
 
 def not_finite(name: str, what: str = "output") -> GraphError:

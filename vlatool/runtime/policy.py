@@ -7,7 +7,6 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from threading import get_ident
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,9 +81,10 @@ class Policy:
         certain = written_as_declared(bundle.manifest, program.sessions)
         self._outputs = Outputs(self.spec.outputs, action=False, certain=certain)
         self._action = self.spec.action.name
+        self._direct = program.plain and self._outputs.certain
         self._sequence = 0
-        self._turn = threading.RLock()  # a signal handler may strike between lock and owner
-        self._owner = 0
+        self._turn = threading.RLock()  # a signal handler may call while this thread has it
+        self._busy = False
         self.golden_error: float | None = None
 
     @classmethod
@@ -128,16 +128,21 @@ class Policy:
             UsageError: when another inference of a policy that keeps values is under way, or one of this thread.
         """
         start = time.perf_counter_ns()
-        if self._owner:
+        if self._busy:
             self._check_overlap()
         with self._turn:
             try:
-                self._owner = get_ident()
-                outputs, (chunk, labels) = self.program.run(self.encode(observation), noise, self._answer)
+                self._busy = True
+                if self._direct:
+                    values = self.program.run(self.encode(observation), noise)
+                    outputs = {name: values[name] for name in self._outputs.names}
+                    chunk, labels = self._decode(outputs[self._action])
+                else:
+                    outputs, (chunk, labels) = self.program.run(self.encode(observation), noise, self._answer)
                 sequence = self._sequence
                 self._sequence += 1
             finally:
-                self._owner = 0
+                self._busy = False
         return Action(chunk, labels, (time.perf_counter_ns() - start) / 1e6, sequence, outputs)
 
     def _answer(self, values: dict[str, Any]) -> tuple[dict[str, Array], tuple[Array, tuple[str, ...]]]:
@@ -147,9 +152,11 @@ class Policy:
     def _check_overlap(self) -> None:
         """Refuse a call during an inference where taking turns would not make it right."""
         fix = "open one policy for each thread"
-        if self._owner == get_ident():
-            raise UsageError("The policy is called while it infers, in the same thread (a signal handler?).", fix)
-        if self.program.keeps:
+        if self._turn.acquire(blocking=False):  # this thread has the turn already, or it has just become free
+            self._turn.release()
+            if self._busy:
+                raise UsageError("The policy is called while it infers, in the same thread (a signal handler?).", fix)
+        elif self.program.keeps:
             raise UsageError(
                 "Two threads call a policy at once that keeps values from step to step; it would mix their episodes.",
                 fix,
@@ -161,9 +168,9 @@ class Policy:
         Raises:
             UsageError: when this thread's own inference is under way.
         """
-        if self._owner == get_ident():
-            self._check_overlap()
         with self._turn:
+            if self._busy:
+                self._check_overlap()
             self._sequence = 0
             self.program.reset()
 

@@ -66,6 +66,11 @@ class Program:
         }
 
     @property
+    def plain(self) -> bool:
+        """Whether it is one graph, run once: there is nothing to take back when an inference fails."""
+        return self._plain is not None
+
+    @property
     def keeps(self) -> bool:
         """Whether an inference depends on those before it."""
         return bool(self._kept)
