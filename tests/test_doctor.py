@@ -12,6 +12,7 @@ import pytest
 from vlatool import doctor, host
 from vlatool.doctor import EXTRAS, Check
 from vlatool.errors import MissingExtra
+from vlatool.runtime.engines._arithmetic import EXACT, SATURATING
 
 JETSON = "NVIDIA Jetson Orin Nano Engineering Reference Developer Kit Super"
 
@@ -28,6 +29,28 @@ def named(checks: Iterable[Check], name: str) -> Check:
     found = [check for check in checks if check.name == name]
     assert len(found) == 1
     return found[0]
+
+
+def arithmetic_of(monkeypatch: pytest.MonkeyPatch, found: str) -> list[Check]:
+    engine = SimpleNamespace(arithmetic=lambda: found)
+    monkeypatch.setattr(doctor.registry, "load", lambda kind, name: engine)
+    return list(doctor.arithmetic())
+
+
+def test_int8_products_are_measured_for_every_engine(monkeypatch) -> None:
+    assert {check.status for check in arithmetic_of(monkeypatch, EXACT)} == {"ok"}
+    saturating = arithmetic_of(monkeypatch, SATURATING)
+    assert {check.status for check in saturating} == {"warn"}
+    assert "--layout ort" in named(saturating, "int8 openvino").fix
+    assert "saturating" in named(saturating, "int8 ort_cpu").finding
+
+
+def test_an_engine_that_is_not_installed_is_not_asked(monkeypatch) -> None:
+    def missing() -> str:
+        raise MissingExtra("openvino is not installed")
+
+    monkeypatch.setattr(doctor.registry, "load", lambda kind, name: SimpleNamespace(arithmetic=missing))
+    assert list(doctor.arithmetic()) == []
 
 
 def test_every_check_says_something_and_names_are_unique(tmp_path: Path) -> None:

@@ -14,8 +14,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-from vlatool import host
-from vlatool.errors import MissingExtra, require
+from vlatool import host, registry
+from vlatool.errors import MissingExtra, VlatoolError, require
+from vlatool.runtime.engines._arithmetic import EXACT
+from vlatool.runtime.policy import DEFAULT_ENGINE
 from vlatool.telemetry.rapl import UDEV_RULE
 
 Status = Literal["ok", "warn", "missing"]
@@ -70,6 +72,7 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
     return [
         python_version(),
         *engines(installed, host.board(root), providers),
+        *arithmetic(),
         *extras(installed),
         instruction_set(host.isa(root)),
         *telemetry(root),
@@ -124,6 +127,24 @@ def _onnxruntime(title: str, board: str | None, ask: Callable[[], list[str]]) ->
         fix = "install the onnxruntime-gpu wheel of NVIDIA's Jetson index for your JetPack; the plain wheel has no GPU"
         return Check("engine onnxruntime", "warn", f"{finding}; this board's GPU stays idle", fix)
     return Check("engine onnxruntime", "ok", finding)
+
+
+def arithmetic() -> Iterator[Check]:
+    """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
+    for name in registry.names("engines"):
+        try:
+            engine: Any = registry.load("engines", name)
+            found = str(engine.arithmetic())
+        except VlatoolError:
+            continue
+        title = f"int8 {name}"
+        if found == EXACT:
+            yield Check(title, "ok", "products of uint8 and int8 are exact")
+        elif name == DEFAULT_ENGINE:
+            yield Check(title, "warn", f"products of uint8 and int8 are {found}", "measure int8 against float32 here")
+        else:
+            fix = "make int8 bundles for ONNX Runtime here: vlatool quantize METHOD SOURCE -o BUNDLE --layout ort"
+            yield Check(title, "warn", f"products of uint8 and int8 are {found}", fix)
 
 
 def extras(installed: Mapping[str, str]) -> Iterator[Check]:

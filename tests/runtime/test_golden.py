@@ -14,6 +14,8 @@ from vlatool.finish import GOLDEN, save_npz, write_golden
 from vlatool.manifest import Graph, Manifest, ProgramStep
 from vlatool.npz_files import open_npz
 from vlatool.runtime import load
+from vlatool.runtime.engines._arithmetic import SATURATING
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import load_golden, load_goldens, relative_error
 from vlatool.spec import PolicySpec, TensorSpec
 
@@ -143,3 +145,12 @@ def test_an_action_of_another_size_is_another_action(bundle):
 
     with pytest.raises(GraphError, match="relative error inf"):
         load(rewritten(bundle, widened).path)
+
+
+def test_arithmetic_that_is_not_exact_is_told_of_an_int8_policy_alone(int8_bundle, float_bundle, monkeypatch):
+    monkeypatch.setattr(OrtCpuSession, "arithmetic", staticmethod(lambda: SATURATING))
+    for bundle, told in ((int8_bundle, True), (float_bundle, False)):
+        policy = load(bundle.path)
+        with pytest.raises(GraphError, match="another golden action") as caught:
+            policy.warm_up(1, tolerance=-1.0)
+        assert ("int8 products are saturating" in caught.value.message) == told

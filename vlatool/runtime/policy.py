@@ -28,6 +28,7 @@ from vlatool.runtime.contract import (
     not_finite,
     written_as_declared,
 )
+from vlatool.runtime.engines._arithmetic import EXACT
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
@@ -235,9 +236,17 @@ class Policy:
         if not self.golden_error <= tolerance:
             raise GraphError(
                 f"This machine computes another golden action than recorded: relative error {self.golden_error:.3g}, "
-                f"allowed {tolerance:g}.",
+                f"allowed {tolerance:g}.{self._arithmetic()}",
                 "the engine or processor may lack what this precision needs; run: vlatool doctor",
             )
+
+    def _arithmetic(self) -> str:
+        """Say how the engine computes int8 products here, where the graphs have some and that is not exact."""
+        if not any("int8" in graph.precision for graph in self.bundle.manifest.graphs.values()):
+            return ""
+        engine: Any = registry.load("engines", self.engine)
+        found = str(engine.arithmetic())
+        return "" if found == EXACT else f" Its int8 products are {found}."
 
 
 def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, nearest, require
 from vlatool.runtime.contract import Port
+from vlatool.runtime.engines import _arithmetic
 
 DEVICE = "CPU"
 GRACE_MS = 1000
@@ -161,6 +162,18 @@ class OpenvinoSession:
             MissingExtra: when openvino is not installed.
         """
         return version_of(require("openvino", "openvino"))
+
+    @staticmethod
+    def arithmetic() -> str:
+        """Say whether integer products are exact on this machine, or saturate. Takes a fraction of a second.
+
+        Raises:
+            MissingExtra: when openvino is not installed.
+        """
+        core = require("openvino", "openvino").Core()
+        compiled = core.compile_model(core.read_model(io.BytesIO(_arithmetic.model())), DEVICE, settings_for(1, ""))
+        found = float(compiled(_arithmetic.operand())[0].min())
+        return _arithmetic.EXACT if found == _arithmetic.WANTED else _arithmetic.SATURATING
 
 
 def settings_for(threads: int | None, compute: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
 from vlatool.runtime.contract import Port, port
+from vlatool.runtime.engines import _arithmetic
 
 PROVIDER = "CPUExecutionProvider"
 SMALL = 256 * 1024
@@ -56,14 +57,8 @@ class OrtCpuSession:
         ort = require("onnxruntime", "ort")
         if compute not in ("", "float32"):
             raise GraphError(f"ONNX Runtime on the CPU does not compute in {compute}.", "use the engine openvino")
-        options = ort.SessionOptions()
-        options.log_severity_level = 3
-        options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
-        options.inter_op_num_threads = 1
-        if not self.optimized:
-            options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         try:
-            self._session = _open(ort, path if opened is None else opened, options)
+            self._session = _open(ort, path if opened is None else opened, threads, self.optimized)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
             raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}") from error
         self._session.disable_fallback()
@@ -127,6 +122,19 @@ class OrtCpuSession:
             MissingExtra: when onnxruntime is not installed.
         """
         return str(require("onnxruntime", "ort").__version__)
+
+    @staticmethod
+    def arithmetic() -> str:
+        """Say whether integer products are exact on this machine, or saturate.
+
+        Raises:
+            MissingExtra: when onnxruntime is not installed.
+        """
+        ort = require("onnxruntime", "ort")
+        if _arithmetic.ort_product(ort) == _arithmetic.WANTED:
+            return _arithmetic.EXACT
+        exact = _arithmetic.ort_product(ort, precise=True) == _arithmetic.WANTED
+        return _arithmetic.EXACT_BY_OPTION if exact else _arithmetic.SATURATING
 
 
 class _Bound:
@@ -193,19 +201,34 @@ def _buffer(node: Any) -> Array | None:
     return np.zeros(node.shape, dtype)
 
 
-def _open(ort: Any, model: Path | bytes, options: Any) -> Any:
-    """Open a session; without the rewriting of QDQ pairs where that breaks the graph.
+def _open(ort: Any, model: Path | bytes, threads: int | None, optimized: bool) -> Any:
+    """Open a session; with other options where these break the graph.
 
-    ONNX Runtime (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such
-    type. The first error is the one that is told.
+    Exact products of uint8 activations refuse a graph with int8 ones, which are exact anyway. And ONNX Runtime (1.31)
+    takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type. The first
+    error is the one that is told.
     """
+    saturates = _arithmetic.ort_product(ort) != _arithmetic.WANTED
+    ways = [*([(_arithmetic.PRECISE,)] if saturates else []), (), (("session.disable_quant_qdq", "1"),)]
     try:
-        return _session(ort, model, options)
+        return _session(ort, model, _options(ort, threads, optimized, ways[0]))
     except Exception:
-        options.add_session_config_entry("session.disable_quant_qdq", "1")
-        with contextlib.suppress(Exception):
-            return _session(ort, model, options)
+        for way in ways[1:]:
+            with contextlib.suppress(Exception):
+                return _session(ort, model, _options(ort, threads, optimized, way))
         raise
+
+
+def _options(ort: Any, threads: int | None, optimized: bool, entries: Iterable[tuple[str, str]]) -> Any:
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
+    options.inter_op_num_threads = 1
+    if not optimized:
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+    for entry in entries:
+        options.add_session_config_entry(*entry)
+    return options
 
 
 def _session(ort: Any, model: Path | bytes, options: Any) -> Any:

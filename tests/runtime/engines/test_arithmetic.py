@@ -1,0 +1,113 @@
+"""The arithmetic probe: what it is, what it finds, and what an engine does about it."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+
+from vlatool.errors import GraphError
+from vlatool.runtime.engines import _arithmetic
+from vlatool.runtime.engines._arithmetic import (
+    EXACT,
+    EXACT_BY_OPTION,
+    PRECISE,
+    SATURATING,
+    SHAPE,
+    WANTED,
+    model,
+    operand,
+    ort_product,
+)
+from vlatool.runtime.engines.openvino import OpenvinoSession
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+
+SATURATED = 32767.0 * SHAPE[1] / 2
+"""Pairs of products become 32,767 each."""
+
+
+def integer_product(path: Path, kind: int) -> Path:
+    """A file with a product of activations of a kind and int8 weights."""
+    nodes = [helper.make_node("MatMulIntegerToFloat", ["a", "w", "s", "s"], ["y"], domain="com.microsoft")]
+    graph = helper.make_graph(
+        nodes, "product", [helper.make_tensor_value_info("a", kind, SHAPE)],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, (16, 16))],
+        [numpy_helper.from_array(np.full((64, 16), 127, np.int8), "w"), numpy_helper.from_array(np.float32(1), "s")],
+    )  # fmt: skip
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
+    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=9), path)
+    return path
+
+
+def option(session: OrtCpuSession) -> str:
+    return session._session.get_session_options().get_session_config_entry(PRECISE[0])
+
+
+def test_the_probe_is_the_product_that_it_says():
+    found = onnx.ModelProto.FromString(model())
+    onnx.checker.check_model(found, full_check=True)
+    weights = numpy_helper.to_array(found.graph.initializer[0])
+    assert weights.dtype == np.int8
+    assert (weights == 127).all()
+    got = ReferenceEvaluator(found).run(None, {"x": operand()})[0]
+    assert (got == WANTED).all()
+
+
+def test_with_the_option_products_are_exact_on_every_processor():
+    assert ort_product(onnxruntime, precise=True) == WANTED
+
+
+def test_what_a_processor_finds_is_exact_or_saturated():
+    assert ort_product(onnxruntime) in (WANTED, SATURATED)
+
+
+@pytest.mark.parametrize("engine", [OrtCpuSession, OpenvinoSession])
+def test_an_engine_says_how_it_computes(engine):
+    if engine is OpenvinoSession:
+        pytest.importorskip("openvino")
+    assert engine.arithmetic() in (EXACT, EXACT_BY_OPTION, SATURATING)
+
+
+def test_openvino_is_asked_by_a_product_of_its_own(monkeypatch):
+    """Weights whose product is not the one wanted stand for a processor that saturates."""
+    pytest.importorskip("openvino")
+    monkeypatch.setattr(_arithmetic, "WANTED", WANTED + 1)
+    assert OpenvinoSession.arithmetic() == SATURATING
+
+
+@pytest.fixture
+def saturating(monkeypatch):
+    """A processor without VNNI: what it would compute is believed."""
+    found = {False: SATURATED, True: WANTED}
+    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False: found[precise])
+    return found
+
+
+def test_where_products_saturate_the_option_is_set(tmp_path: Path, saturating):
+    session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
+    assert option(session) == "1"
+    assert (session.run({"a": np.full(SHAPE, 255, np.uint8)})["y"] == WANTED).all()
+    assert OrtCpuSession.arithmetic() == EXACT_BY_OPTION
+    saturating[True] = SATURATED
+    assert OrtCpuSession.arithmetic() == SATURATING
+
+
+def test_signed_activations_open_all_the_same(tmp_path: Path, saturating):
+    session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.INT8), threads=1)
+    assert (session.run({"a": np.full(SHAPE, 127, np.int8)})["y"] == 127 * 127 * 64).all()
+
+
+def test_the_first_error_is_told(tmp_path: Path, saturating):
+    with pytest.raises(GraphError, match="refuses"):
+        OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.FLOAT), threads=1)
+
+
+def test_where_products_are_exact_nothing_is_set(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False: WANTED)
+    session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
+    assert OrtCpuSession.arithmetic() == EXACT
+    with pytest.raises(RuntimeError):
+        option(session)
