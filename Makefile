@@ -9,7 +9,7 @@ SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
 BASE ?=
 
-.PHONY: gate peers help install demo test check robot docs format clean metaworld
+.PHONY: gate peers python310 help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -48,6 +48,12 @@ robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnx
 	@test -x $(OUT)/robot/venv/bin/python || $(PYTHON310) -m venv $(OUT)/robot/venv
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 numpy
 	PYTHONPATH=. $(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
+
+python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundle under Python 3.10, without torch
+	$(BIN)/vlatool export sample_models/vln-babyai -o $(OUT)/python310/bundle --force
+	@test -x $(OUT)/python310/venv/bin/python || $(PYTHON310) -m venv $(OUT)/python310/venv
+	$(OUT)/python310/venv/bin/python -m pip install --quiet --disable-pip-version-check -e '.[ort]' onnx onnxscript onnx-ir safetensors
+	$(OUT)/python310/venv/bin/python tests/robot/build_side.py $(OUT)/python310/bundle -o $(OUT)/python310/made
 
 gate: $(BIN)/vlatool  ## hold the sample policies against those that the commit before makes (BASE=COMMIT names another)
 	$(BIN)/python tests/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate

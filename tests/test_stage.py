@@ -117,6 +117,11 @@ def test_a_package_that_is_not_installed_does_not_break_the_key():
     assert len(Odd().key("a")) == 16
 
 
+def test_made_by_leaves_out_what_is_not_installed(monkeypatch):
+    monkeypatch.setattr(DynamicInt8, "packages", ("numpy", "no-such-distribution"))
+    assert list(DynamicInt8().made_by()["versions"]) == ["numpy"]
+
+
 def test_made_by_names_stage_options_versions_and_seed():
     made = DynamicInt8(per_channel=False).made_by(seed=3)
     assert (made["vlatool"], made["stage"], made["seed"]) == (__version__, "quantize.dynamic_int8", 3)

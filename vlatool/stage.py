@@ -171,9 +171,8 @@ class Transform(Stage):
             ``files`` (name -> SHA-256 of each file outside the source), ``seed`` and ``calibration``. No paths, no
             times: the same command gives the same entry in another directory and on another day.
         """
-        from importlib import metadata
-
-        versions = {package: metadata.version(package) for package in self.used_packages()}
+        found = {package: installed_version(package) for package in self.used_packages()}
+        versions = {package: version for package, version in found.items() if version}
         made: dict[str, Any] = {"vlatool": __version__, "stage": self.name(), "options": self._told_options()}
         files = self.input_hashes()
         made |= {"versions": versions, **({"files": files} if files else {})}
