@@ -38,6 +38,29 @@ def test_actions_that_leave_the_experts_fail(
     assert examine(worse, float_bundle, AccuracyClaim(), Context()).verdict == verdict
 
 
+@pytest.mark.parametrize("expert", [True, False])
+def test_an_element_that_should_hold_still_and_does_not_fails(
+    float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, expert: bool
+) -> None:
+    """The last element never changes in the recordings: the expert's standard deviation of it is 0."""
+    real = accuracy.run_recorded
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files if expert or name != "action"}
+    if expert:
+        data["action"][..., -1] = -1.0
+    np.savez(tmp_path / "still.npz", **data)
+
+    def run(bundle, recording, indices, engine, context):
+        found = real(float_bundle, recording, indices, engine, context).copy()
+        found[..., -1] = 1.0 if bundle is opens else -1.0
+        return found
+
+    monkeypatch.setattr(accuracy, "run_recorded", run)
+    opens, claim = Bundle.open(float_bundle.path), AccuracyClaim(data=tmp_path / "still.npz")
+    assert examine(float_bundle, float_bundle, claim, Context()).verdict == "pass"
+    assert examine(opens, float_bundle, claim, Context()).verdict == "fail"
+
+
 def test_without_an_expert_the_baselines_actions_are_right(
     float_bundle: Bundle, int8_bundle: Bundle, tmp_path: Path
 ) -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vlatool.evaluate._losses import drop, losses
+from vlatool.evaluate._losses import LEAST_SCALE, drop, losses, scale_of
 from vlatool.spec import TensorSpec
 
 CONTINUOUS = TensorSpec("action", (1, 2, 2), "float32")
@@ -14,8 +14,21 @@ def test_continuous_losses_by_hand() -> None:
     wanted = np.zeros((2, 2, 2))
     wanted[..., 0] = [[0, 2], [0, 2]]
     got = wanted + np.array([0.5, 7.0])
-    assert losses(CONTINUOUS, got, wanted).tolist() == [0.5, 0.5], "an element that never changes does not count"
+    still = 7.0 / (LEAST_SCALE * 1.0)
+    assert losses(CONTINUOUS, got, wanted) == pytest.approx([(0.5 + still) / 2] * 2), "holding still is a task, too"
     assert losses(CONTINUOUS, np.ones((2, 2, 2)), np.zeros((2, 2, 2))).tolist() == [1, 1], "unless none does"
+
+
+def test_an_element_is_taken_to_vary_by_a_tenth_of_what_the_largest_of_its_unit_does() -> None:
+    action = TensorSpec("action", (1, 1, 4), unit=("m", "m", "rad", "1"))
+    wanted = np.zeros((2, 1, 4))
+    wanted[:, 0] = [[0, 1e-9, 0, -1], [8, 2e-9, 2e-3, -1]]
+    assert scale_of(action, wanted) == pytest.approx([4, 0.4, 1e-3, 0.4]), "the gripper's unit has none that moves"
+    assert not scale_of(action, np.ones((3, 1, 4))).any()
+    jitter = wanted + np.array([0, 4e-9, 0, 0])
+    assert losses(action, jitter, wanted).max() < 1e-7
+    opened = wanted + np.array([0, 0, 0, 2])
+    assert losses(action, opened, wanted) == pytest.approx([2 / 0.4 / 4] * 2)
 
 
 def test_a_longer_chunk_is_compared_as_far_as_both_go() -> None:

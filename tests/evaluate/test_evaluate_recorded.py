@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
+from functools import partialmethod
 
 import numpy as np
 import pytest
 
-from vlatool.bundle import Bundle, seal
-from vlatool.errors import DataError
+from vlatool.bundle import Bundle, restate, seal
+from vlatool.errors import DataError, GraphError
 from vlatool.evaluate import recorded
 from vlatool.evaluate.recorded import Recorded, compare, run_recorded
-from vlatool.runtime import load
+from vlatool.runtime import Policy, load
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context
 
@@ -197,3 +199,24 @@ def test_discrete_actions_agree_or_not():
 
 def test_nothing_to_compare_with_gives_nothing():
     assert compare(TURN, np.zeros((2, 1)), None, "expert") == []
+
+
+def test_what_a_stage_found_to_be_wrong_is_said(float_bundle, copied):
+    bundle = copied(float_bundle)
+    finding = {"name": "engine-difference", "message": "the engine computes something else."}
+    bundle = restate(bundle, replace(bundle.manifest, findings=(finding,)))
+    warnings = Recorded().run(bundle, Context()).warnings
+    assert "load refuses this bundle (engine-difference): the engine computes something else." in warnings
+
+
+def test_what_load_refuses_is_not_evaluated(float_bundle, copied, monkeypatch):
+    bundle = copied(float_bundle)
+    monkeypatch.setattr(Policy, "warm_up", partialmethod(Policy.warm_up, tolerance=-1.0))
+    with pytest.raises(GraphError, match="another golden action"):
+        Recorded().run(bundle, Context())
+
+
+def test_an_inference_without_end_is_stopped(float_bundle, monkeypatch):
+    monkeypatch.setattr("vlatool.evaluate.recorded.FIRST_RUN_S", -1.0)
+    with pytest.raises(GraphError, match="takes longer than"):
+        Recorded().run(float_bundle, Context())

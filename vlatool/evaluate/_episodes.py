@@ -86,7 +86,9 @@ class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
-        self.queue = ChunkQueue(Policy.open(Bundle.open(Path(path)), engine=engine, threads=1, seed=0))
+        policy = Policy.open(Bundle.open(Path(path)), engine=engine, threads=1, seed=0)
+        policy.warm_up(1)
+        self.queue = ChunkQueue(policy)
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
         self._environment: Any = None

@@ -14,24 +14,37 @@ Array = NDArray[Any]
 DRAWS = 4000
 ROUNDING = 1e-6
 """Share of the largest value below which a standard deviation is that of rounding."""
+LEAST_SCALE = 0.1
+"""Share of the largest standard deviation that every element is taken to vary by at least."""
 
 
 def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
     """Return how far each sample is from what was wanted, (N,) float64.
 
     Discrete: the share of its actions that differ. Continuous: the mean over steps and elements of |difference|, each
-    element divided by the standard deviation of what was wanted; elements that never change do not count.
+    element divided by its scale in what was wanted (``scale_of``); not divided where nothing wanted ever changes.
     """
     count = len(got)
     if action.kind == "discrete":
         return np.asarray((got.reshape(count, -1) != wanted.reshape(count, -1)).mean(axis=1), np.float64)
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
+    scale = scale_of(action, wanted)
+    return np.asarray((np.abs(got - wanted) / np.where(scale > 0, scale, 1.0)).mean(axis=(1, 2)))
+
+
+def scale_of(action: TensorSpec, wanted: Array) -> Array:
+    """Return by what the difference of each element is divided, (A,); zeros where nothing wanted ever changes.
+
+    It is the element's standard deviation, but no less than ``LEAST_SCALE`` of the largest among the elements of its
+    unit (of all elements, where none of that unit changes). An element that is meant to hold still would else count for
+    nothing, however far off it is, and one that jitters by a nanometre for everything.
+    """
     spread = spread_of(wanted)
-    varied = spread > 0
-    if not varied.any():
-        return np.asarray(np.abs(got - wanted).mean(axis=(1, 2)))
-    return np.asarray((np.abs(got - wanted)[..., varied] / spread[varied]).mean(axis=(1, 2)))
+    units = action.units() if len(action.units()) == len(spread) else ("",) * len(spread)
+    largest = {unit: max(value for value, own in zip(spread, units, strict=True) if own == unit) for unit in units}
+    floors = np.asarray([LEAST_SCALE * (largest[unit] or spread.max()) for unit in units])
+    return np.asarray(np.maximum(spread, floors), np.float64)
 
 
 def spread_of(actions: Array) -> Array:

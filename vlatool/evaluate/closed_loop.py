@@ -13,6 +13,7 @@ from vlatool.credibility import Credibility, credibility
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._controls import CONTROLS
 from vlatool.evaluate._episodes import Job, run_jobs
+from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._paired import compare_success, success_row, with_chance
 from vlatool.host import fingerprint
 from vlatool.report import Report, Row
@@ -82,7 +83,7 @@ class ClosedLoop(Measure):
         verdict = "inconclusive" if believed.fails else "info"
         return Report(
             "evaluate", title, verdict, (*believed.sentences, text), tuple(rows), environment=fingerprint(),
-            warnings=believed.warnings,
+            warnings=(*believed.warnings, *found_wrong(source)),
         )  # fmt: skip
 
     def _reference(self, baseline: Bundle, jobs: list[Job], context: Context) -> Row:

@@ -16,11 +16,12 @@ from vlatool.bundle import MANIFEST, Bundle
 from vlatool.credibility import Credibility, credibility
 from vlatool.data import Recording, read_recording
 from vlatool.errors import DataError
-from vlatool.evaluate._losses import spread_of
+from vlatool.evaluate._findings import found_wrong
+from vlatool.evaluate._losses import scale_of
 from vlatool.evaluate._skill import skill, variation
 from vlatool.host import fingerprint
 from vlatool.report import Measurement, Report, Row
-from vlatool.runtime.policy import Policy
+from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.spec import TensorSpec
 from vlatool.stage import Context, Measure
 from vlatool.statistics import wilson
@@ -80,7 +81,8 @@ class Recorded(Measure):
         text = f"{title}: {_summary(rows[-1])}."
         verdict = "inconclusive" if trust.fails else "info"
         said = (*trust.sentences, text)
-        return Report("evaluate", title, verdict, said, tuple(rows), environment=fingerprint(), warnings=trust.warnings)
+        warnings = (*trust.warnings, *found_wrong(source))
+        return Report("evaluate", title, verdict, said, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _reference(
         self, baseline: Bundle, source: Bundle, recording: Recording, indices: Sequence[int], context: Context
@@ -135,8 +137,14 @@ def alone(action: TensorSpec, got: Array, expert: Array | None, episodes: Array 
 
 
 def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], engine: str, context: Context) -> Array:
-    """Return the chunks of the policy: (N, T, A) float32 in physical units, or (N, T) int64."""
+    """Return the chunks of the policy: (N, T, A) float32 in physical units, or (N, T) int64.
+
+    Raises:
+        GraphError: when this machine computes another golden action than recorded, or an inference takes longer than
+            ``FIRST_RUN_S``.
+    """
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
+    policy.warm_up(1)
     chunks = []
     episode = None
     for number, index in enumerate(indices):
@@ -146,7 +154,8 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
         if current != episode:
             policy.reset()
             episode = current
-        chunks.append(policy.infer(recording.observation(index)).chunk)
+        with policy.stopped_after(FIRST_RUN_S):
+            chunks.append(policy.infer(recording.observation(index)).chunk)
     return np.stack(chunks)
 
 
@@ -156,7 +165,8 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     Returns:
         Discrete: ``agreement_WHOSE`` (share, Wilson interval). Continuous: ``error_WHOSE.LABEL`` (mean absolute error
         in the element's unit), ``error_WHOSE`` (the mean of those, each divided by the standard deviation of the wanted
-        element), and ``gripper_flips_WHOSE``: the share of steps in which a gripper element has the other sign.
+        element, or by what stands for it: ``scale_of``), and ``gripper_flips_WHOSE``: the share of steps in which a
+        gripper element has the other sign.
     """
     if wanted is None:
         return []
@@ -169,10 +179,10 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     labels = action.labels or tuple(str(index) for index in range(action.width))
     errors = np.abs(got - wanted)
     mean, count = errors.mean(axis=(0, 1)), len(got)
-    spread = spread_of(wanted)
-    varied = spread > 0
-    relative = float(np.mean(mean[varied] / spread[varied])) if varied.any() else math.nan
-    note = "mean |error| / standard deviation" if varied.any() else NEVER_VARIES[whose]
+    scale = scale_of(action, wanted)
+    varies = bool(scale.any())
+    relative = float(np.mean(mean / scale)) if varies else math.nan
+    note = "mean |error| / standard deviation" if varies else NEVER_VARIES[whose]
     norms = np.linalg.norm(wanted.reshape(count, -1), axis=1)
     distances = np.linalg.norm((got - wanted).reshape(count, -1), axis=1) / np.where(norms > 0, norms, 1.0)
     found = [Measurement(f"error_{whose}", relative, "1", samples=count, note=note)]
