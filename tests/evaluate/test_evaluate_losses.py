@@ -22,9 +22,11 @@ def test_continuous_losses_by_hand() -> None:
 def test_an_element_is_taken_to_vary_by_a_tenth_of_what_the_largest_of_its_unit_does() -> None:
     action = TensorSpec("action", (1, 1, 4), unit=("m", "m", "rad", "1"))
     wanted = np.zeros((2, 1, 4))
-    wanted[:, 0] = [[0, 1e-9, 0, -1], [8, 2e-9, 2e-3, -1]]
-    assert scale_of(action, wanted) == pytest.approx([4, 0.4, 1e-3, 0.4]), "the gripper's unit has none that moves"
+    wanted[:, 0] = [[0, 1e-9, 0, -1], [8, 2e-9, 2e-2, -1]]
+    assert scale_of(action, wanted) == pytest.approx([4, 0.4, 1e-2, 0.4]), "the gripper's unit has none that moves"
     assert not scale_of(action, np.ones((3, 1, 4))).any()
+    trembling = wanted * np.array([1, 1, 1e-6, 1])
+    assert scale_of(action, trembling) == pytest.approx([4, 0.4, 0.4, 0.4]), "a unit that only trembles holds still"
     jitter = wanted + np.array([0, 4e-9, 0, 0])
     assert losses(action, jitter, wanted).max() < 1e-7
     opened = wanted + np.array([0, 0, 0, 2])

@@ -16,6 +16,8 @@ ROUNDING = 1e-6
 """Share of the largest value below which a standard deviation is that of rounding."""
 LEAST_SCALE = 0.1
 """Share of the largest standard deviation that every element is taken to vary by at least."""
+STILL = 1e-3
+"""Share of the largest standard deviation below which all elements of a unit hold still."""
 
 
 def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
@@ -37,13 +39,14 @@ def scale_of(action: TensorSpec, wanted: Array) -> Array:
     """Return by what the difference of each element is divided, (A,); zeros where nothing wanted ever changes.
 
     It is the element's standard deviation, but no less than ``LEAST_SCALE`` of the largest among the elements of its
-    unit (of all elements, where none of that unit changes). An element that is meant to hold still would else count for
-    nothing, however far off it is, and one that jitters by a nanometre for everything.
+    unit, or among all elements where what that unit does is less than ``STILL`` of it. An element that is meant to hold
+    still would else count for nothing, however far off it is, and one that jitters by a nanometre for everything.
     """
     spread = spread_of(wanted)
     units = action.units() if len(action.units()) == len(spread) else ("",) * len(spread)
     largest = {unit: max(value for value, own in zip(spread, units, strict=True) if own == unit) for unit in units}
-    floors = np.asarray([LEAST_SCALE * (largest[unit] or spread.max()) for unit in units])
+    moving = {unit: value if value > STILL * spread.max() else spread.max() for unit, value in largest.items()}
+    floors = np.asarray([LEAST_SCALE * moving[unit] for unit in units])
     return np.asarray(np.maximum(spread, floors), np.float64)
 
 
