@@ -71,6 +71,10 @@ def gate_page() -> str:
     for claim in (gate.LatencyClaim, gate.AccuracyClaim, gate.AnswersClaim, gate.GrowthClaim, gate.DeadlineClaim):
         names = [name for name, field in gate.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
         parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")
+    told = gate.Gate.model_fields["accept"].description
+    parts.append(
+        f"## accept\n\n`accept: [engine-difference]`: {told}; see `vlatool inspect`. None when nothing is said.\n"
+    )
     return "\n".join(parts)
 
 

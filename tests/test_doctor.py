@@ -42,7 +42,20 @@ def test_int8_products_are_measured_for_every_engine(monkeypatch) -> None:
     saturating = arithmetic_of(monkeypatch, SATURATING)
     assert {check.status for check in saturating} == {"warn"}
     assert "--layout ort" in named(saturating, "int8 openvino").fix
+    assert "--layout openvino --reduce-range" in named(saturating, "int8 openvino").fix
     assert "saturating" in named(saturating, "int8 ort_cpu").finding
+
+
+def test_avx2_without_vnni_names_flags_and_the_engine_that_is_exact() -> None:
+    found = doctor.instruction_set(["avx2", "fma"])
+    assert "ONNX Runtime is told to be exact" in found.finding
+    assert {"--layout", "--reduce-range"} <= {*re.findall(r"--[a-z-]+", found.fix)}
+
+
+def test_a_variable_that_confines_openvino_is_a_warning() -> None:
+    (found,) = doctor.confined("AVX2")
+    assert (found.status, "ONEDNN_MAX_CPU_ISA=AVX2" in found.finding) == ("warn", True)
+    assert list(doctor.confined(None)) == []
 
 
 def test_an_engine_that_is_not_installed_is_not_asked(monkeypatch) -> None:

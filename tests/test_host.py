@@ -24,10 +24,21 @@ def tree(root: Path, files: dict[str, Any]) -> Path:
     return root
 
 
-def test_an_empty_tree_has_nothing_and_no_zeros(tmp_path: Path) -> None:
+def test_an_empty_tree_has_nothing_and_no_zeros(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
     found = host.fingerprint(tmp_path)
     unknown = {key: value for key, value in found.items() if key not in ("python", "versions")}
     assert {*unknown.values()} == {None}
+
+
+@pytest.mark.parametrize(
+    ("said", "told"), [(None, None), ("", None), ("AVX2", "AVX2"), ("/home/me", "?"), ("A" * 99, "?")]
+)
+def test_what_openvino_is_confined_to_is_recorded(monkeypatch, tmp_path: Path, said, told) -> None:
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    if said is not None:
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", said)
+    assert host.fingerprint(tmp_path)["onednn_max_cpu_isa"] == told
 
 
 def test_this_machine_is_described_in_json_without_names() -> None:

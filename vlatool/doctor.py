@@ -75,6 +75,7 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
         *arithmetic(),
         *extras(installed),
         instruction_set(host.isa(root)),
+        *confined(host.onednn_max_cpu_isa()),
         *telemetry(root),
         clocks(root),
         cores(root),
@@ -143,7 +144,10 @@ def arithmetic() -> Iterator[Check]:
         elif name == DEFAULT_ENGINE:
             yield Check(title, "warn", f"products of uint8 and int8 are {found}", "measure int8 against float32 here")
         else:
-            fix = "make int8 bundles for ONNX Runtime here: vlatool quantize METHOD SOURCE -o BUNDLE --layout ort"
+            fix = (
+                "vlatool quantize static-int8 SOURCE -o BUNDLE --layout ort: ONNX Runtime is told to be exact here; or "
+            )
+            fix += f"--layout {name} --reduce-range"
             yield Check(title, "warn", f"products of uint8 and int8 are {found}", fix)
 
 
@@ -178,10 +182,23 @@ def instruction_set(features: Sequence[str] | None) -> Check:
         if wanted in features:
             return Check(name, "ok", meaning)
     if "avx2" in features:
-        finding = "AVX2 without VNNI: int8 is at best twice as fast as float32, and 8-bit weights may saturate"
-        return Check(name, "warn", finding, "quantize with reduce_range=true, or stay with float32")
+        finding = (
+            "AVX2 without VNNI: int8 is at best twice as fast as float32, and 8-bit weights saturate in OpenVINO; "
+        )
+        finding += "ONNX Runtime is told to be exact, which is slower"
+        fix = "quantize with --layout ort, or with --reduce-range, and measure it; or stay with float32"
+        return Check(name, "warn", finding, fix)
     finding = "no int8 dot product: int8 saves memory here, but may be slower than float32"
     return Check(name, "warn", finding, "measure before you ship int8")
+
+
+def confined(isa: str | None) -> Iterator[Check]:
+    """Whether a variable keeps OpenVINO from instructions that the processor has."""
+    if isa is not None:
+        finding = (
+            f"ONEDNN_MAX_CPU_ISA={isa} confines OpenVINO to older instructions: it is slower and may round otherwise"
+        )
+        yield Check("oneDNN", "warn", finding, "unset ONEDNN_MAX_CPU_ISA, unless you mean to try another processor")
 
 
 def telemetry(root: Path = host.ROOT) -> Iterator[Check]:

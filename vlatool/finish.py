@@ -14,6 +14,7 @@ import numpy as np
 
 from vlatool.bundle import Bundle, restate, seal
 from vlatool.manifest import FileRecord, Graph, Manifest
+from vlatool.runtime.engines._arithmetic import SATURATING, is_int8, told
 from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.policy import DEFAULT_ENGINE, Action, Policy, load_golden, relative_error
@@ -22,6 +23,7 @@ from vlatool.runtime.program import Program, draw
 GOLDEN = "golden/golden.npz"
 GOLDEN_COUNT = 2
 ENGINE_DIFFERENCE = "engine-difference"
+INEXACT = "inexact-reference"
 ROUNDING = 0.045
 """Relative L2 difference of an engine from what the graph says, up to which it is rounding that falls the other way. On
 right engines and processors it was seen to be at most 0.035, on wrong ones at least 0.09, and where int8 products
@@ -76,16 +78,24 @@ def finish(
     build = (*history(source), _step(source, draft.manifest))
     made = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
     limit = _limit(source, made, difference)
-    seen = max(difference, of_chunk if draft.manifest.spec.action.kind != "discrete" else 0.0)
-    tolerance = max(LEAST_TOLERANCE, 1.2 * seen, min(2 * seen, ROUNDING))
     found = [] if difference <= limit else [_engine_difference(made, difference, limit)]
-    kept = [each for each in source.manifest.findings if each["name"] != ENGINE_DIFFERENCE]
-    return restate(made, replace(made.manifest, golden_tolerance=_rounded_up(tolerance), findings=(*kept, *found)))
+    if is_int8(made.manifest) and ReferenceSession.arithmetic() == SATURATING:
+        found.append(_inexact_reference(made))
+    kept = [each for each in source.manifest.findings if each["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
+    discrete = made.manifest.spec.action.kind == "discrete"
+    return restate(made, replace(
+        made.manifest, golden_tolerance=_tolerance(difference),
+        golden_chunk_tolerance=0.0 if discrete else _tolerance(of_chunk), findings=(*kept, *found),
+    ))  # fmt: skip
 
 
-def _rounded_up(tolerance: float) -> float:
-    """Return the next larger number of three decimals; 1 for what is no number."""
-    return math.ceil(tolerance * 1000) / 1000 if math.isfinite(tolerance) else 1.0
+def _tolerance(seen: float) -> float:
+    """Return what a machine may differ where the engine was seen to differ so much, in three decimals; at most 1.
+
+    What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding.
+    """
+    wanted = max(LEAST_TOLERANCE, 1.2 * seen, min(2 * seen, ROUNDING))
+    return math.ceil(wanted * 1000) / 1000 if math.isfinite(wanted) else 1.0
 
 
 def _limit(source: Bundle, made: Bundle, difference: float) -> float:
@@ -105,11 +115,19 @@ def _limit(source: Bundle, made: Bundle, difference: float) -> float:
 def _engine_difference(made: Bundle, difference: float, limit: float) -> dict[str, Any]:
     engine = made.manifest.engine or DEFAULT_ENGINE
     words = f"the engine {engine} computes another action than the graphs say on this machine: relative difference "
-    words += f"{difference:.2g}, allowed {limit:.2g}. Do not trust this bundle; leave layers out with --exclude, or "
-    words += "use another layout or engine."
+    words += f"{difference:.2g}, allowed {limit:.2g}. Do not trust this bundle; "
+    cause, remedy = told(made.manifest, engine)
+    words += remedy or "leave layers out with --exclude, or use another layout or engine"
+    words += f". {cause}".rstrip()
     value = round(difference, 4) if math.isfinite(difference) else 1e9
     stage = str(made.manifest.made_by.get("stage", ""))
     return {"name": ENGINE_DIFFERENCE, "message": words, "value": value, "allowed": round(limit, 4), "stage": stage}
+
+
+def _inexact_reference(made: Bundle) -> dict[str, Any]:
+    words = "the golden action of this bundle was computed where int8 products are not exact, with any option of ONNX "
+    words += "Runtime that was tried: it may be another one than the graphs say. Make the bundle on another machine."
+    return {"name": INEXACT, "message": words, "stage": str(made.manifest.made_by.get("stage", ""))}
 
 
 def history(bundle: Bundle) -> tuple[dict[str, Any], ...]:

@@ -70,6 +70,7 @@ def fingerprint(root: Path = ROOT) -> dict[str, Any]:
         "architecture": architecture(root),
         "board": board(root),
         "isa": isa(root),
+        "onednn_max_cpu_isa": onednn_max_cpu_isa(),
         "cores": usable_cores(root),
         "cores_online": online_cores(root),
         "cpu_quota": cpu_quota(root),
@@ -136,6 +137,15 @@ def isa(root: Path = ROOT) -> list[str] | None:
         return None
     everywhere = set.intersection(*(set(line.split()) for line in lines))
     return [feature for feature in ISA_FEATURES if feature in everywhere]
+
+
+def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
+    """The instruction set that ``ONEDNN_MAX_CPU_ISA`` confines oneDNN, and so OpenVINO, to; None when it is not set.
+
+    What is no name of an instruction set is told as ``?``: it may be anything, and reports are shared.
+    """
+    said = variables.get("ONEDNN_MAX_CPU_ISA")
+    return None if not said else said if re.fullmatch(r"[A-Za-z0-9_]{1,32}", said) else "?"
 
 
 def board(root: Path = ROOT) -> str | None:

@@ -110,6 +110,8 @@ class Manifest:
         golden: File with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
         golden_tolerance: Largest relative L2 difference from the golden action with which a machine loads the bundle,
             from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
+        golden_chunk_tolerance: The same for the action in physical units, where a small action makes a large relative
+            difference; ``golden_tolerance`` when 0.
         findings: What a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
             and ``gate`` refuse the bundle unless each is overruled by its name.
         accuracy: Measured accuracy: name -> value, interval, samples.
@@ -133,6 +135,7 @@ class Manifest:
     parts: dict[str, list[str]] = field(default_factory=dict)
     golden: str = ""
     golden_tolerance: float = 0.0
+    golden_chunk_tolerance: float = 0.0
     findings: tuple[dict[str, Any], ...] = ()
     accuracy: dict[str, Any] = field(default_factory=dict)
     description: str = ""
@@ -295,7 +298,7 @@ def _check_type(name: str, value: Any, item: Any) -> None:
     where = f"The manifest's '{name}'"
     if name in ("spec", "schema"):
         return
-    if name == "golden_tolerance":
+    if name in ("golden_tolerance", "golden_chunk_tolerance"):
         if finite(value, where, BundleError) < 0:
             raise BundleError(f"{where} is {shown(value)}; allowed: a number from 0.")
         return

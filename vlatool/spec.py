@@ -25,13 +25,14 @@ class TensorSpec:
     Args:
         name: The key of the observation, or of the result.
         shape: With the batch axis in front; a string names an axis whose length is free.
-        dtype: One of ``DTYPES``; what the graph sees.
+        dtype: What the graph sees: float32, float16, int64, int32, uint8 or bool.
         kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
             of logits over ``labels``; the action is the index of the largest).
         unit: One unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
         labels: A name for each element of the last axis.
         mode: How a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
-        normalisation: How the runtime maps physical values to what the graph sees (outputs: and back).
+        normalisation: How the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
+            ``mean_std``, ``min_max`` or ``quantiles``.
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
         tokenizer: File of the tokenizer, relative to the assets (``kind: text``).
         max_tokens: Number of ids that the tokenizer pads or cuts to (``kind: text``).

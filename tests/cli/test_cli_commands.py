@@ -19,9 +19,12 @@ from vlatool.cli import main
 from vlatool.cli._console import command_line, leave, progress
 from vlatool.cli._stages import DEFAULTS
 from vlatool.cli.optimize import share
-from vlatool.errors import GateFailed, Inconclusive, UsageError
+from vlatool.errors import GateFailed, GraphError, Inconclusive, UsageError
+from vlatool.finish import save_npz
+from vlatool.npz_files import open_npz
 from vlatool.profile import names
 from vlatool.report import Measurement, Report, Row, read_report
+from vlatool.runtime import load
 from vlatool.stage import Context
 
 FAST = ["--iterations", "20", "--duration", "0", "--no-cold"]
@@ -223,10 +226,29 @@ def test_inspect_prints_the_manifest_as_it_is_written(vlatool, int8_bundle):
     assert vlatool("inspect", int8_bundle.path, "--json")[1] == (int8_bundle.path / "manifest.json").read_text()
 
 
+@pytest.mark.parametrize("also", [(), ("--json",)])
+def test_a_probe_ends_as_load_would(vlatool, float_bundle, copied, also):
+    """A golden action that is three times what the graphs give."""
+    bundle = copied(float_bundle)
+    arrays = open_npz(bundle.path / bundle.manifest.golden)
+    arrays["out.action"] = arrays["out.action"] * 3
+    save_npz(bundle.path / bundle.manifest.golden, arrays)
+    seal(bundle.path, bundle.manifest)
+    code, out, err = vlatool("inspect", bundle.path, "--probe", *also)
+    assert code == 3
+    assert "golden error 0.67 (allowed 0.01), in physical units " in out or also
+    assert "another golden action than recorded: relative error 0.667, allowed 0.01." in err
+    with pytest.raises(GraphError) as caught:
+        load(bundle.path)
+    assert caught.value.message in err
+
+
 def test_inspect_runs_a_bundle_once_in_a_process_with_limits(vlatool, int8_bundle):
     code, out, _ = vlatool("inspect", int8_bundle.path, "--probe")
     assert code == 0
     assert "probe      ran once: golden error" in out
+    assert f"(allowed {int8_bundle.manifest.golden_tolerance:g})" in out
+    assert f"(allowed {int8_bundle.manifest.golden_chunk_tolerance:g}), " in out
     code, _, err = vlatool("inspect", int8_bundle.path, "--probe", "--memory", "20")
     assert code == 3
     assert "more than 20 MB of memory" in err

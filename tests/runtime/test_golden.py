@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from vlatool.manifest import Graph, Manifest, ProgramStep
 from vlatool.npz_files import open_npz
 from vlatool.runtime import load
 from vlatool.runtime.engines._arithmetic import SATURATING
+from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import load_golden, load_goldens, relative_error
 from vlatool.spec import PolicySpec, TensorSpec
@@ -137,6 +139,33 @@ def test_other_statistics_of_the_action_show_in_the_golden_chunk(float_bundle, c
         load(resealed(bundle).path)
 
 
+def scaled(bundle: Bundle, key: str, factor: float) -> Bundle:
+    def change(arrays: dict[str, Any]) -> None:
+        arrays[key] = arrays[key] * factor
+
+    return rewritten(bundle, change)
+
+
+@pytest.mark.parametrize(("key", "where"), [("out.y", " than"), ("chunk.y", " in physical units than")])
+def test_each_golden_action_has_a_tolerance_of_its_own(bundle, key, where):
+    """What is allowed of one is not allowed of the other."""
+    manifest = replace(bundle.manifest, golden_tolerance=0.01, golden_chunk_tolerance=0.3)
+    if key == "chunk.y":
+        manifest = replace(manifest, golden_tolerance=0.3, golden_chunk_tolerance=0.01)
+    scaled(seal(bundle.path, manifest), key, 1 / 1.1)
+    with pytest.raises(GraphError, match=rf"another golden action{where} recorded: relative error 0\.1, allowed 0\.01"):
+        load(bundle.path)
+    policy = load(bundle.path, golden_tolerance=0.2)
+    found = (policy.golden_error, policy.golden_chunk_error)
+    assert found == pytest.approx((0.1, 0) if key == "out.y" else (0, 0.1), abs=1e-6)
+
+
+def test_a_bundle_from_before_has_one_tolerance_for_both(bundle):
+    scaled(seal(bundle.path, replace(bundle.manifest, golden_tolerance=0.2)), "chunk.y", 1 / 1.1)
+    assert "golden_chunk_tolerance" not in (bundle.path / "manifest.json").read_text()
+    assert load(bundle.path).golden_tolerances == (0.2, 0.2)
+
+
 def test_an_action_of_another_size_is_another_action(bundle):
     assert relative_error(np.zeros((1, 4)), np.zeros((1, 2))) == np.inf
 
@@ -154,3 +183,12 @@ def test_arithmetic_that_is_not_exact_is_told_of_an_int8_policy_alone(int8_bundl
         with pytest.raises(GraphError, match="another golden action") as caught:
             policy.warm_up(1, tolerance=-1.0)
         assert ("int8 products are saturating" in caught.value.message) == told
+        assert ("--reduce-range" in caught.value.fix) == told
+
+
+def test_where_openvino_saturates_the_remedy_is_what_was_seen_to_be_right(int8_bundle, monkeypatch):
+    pytest.importorskip("openvino")
+    monkeypatch.setattr(OpenvinoSession, "arithmetic", staticmethod(lambda: SATURATING))
+    with pytest.raises(GraphError, match="saturating") as caught:
+        load(int8_bundle.path, engine="openvino", golden_tolerance=0)
+    assert {*re.findall(r"--[a-z-]+", caught.value.fix)} == {"--reduce-range", "--layout"}

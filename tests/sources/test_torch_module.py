@@ -91,6 +91,25 @@ def test_a_missing_asset(policy_dir: Path, tmp_path: Path, name):
         build(policy_dir, tmp_path / "out")
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("statistics.json", '"std"', '"sd"', "The statistics 'proprio' in {file} lack 'std'"),
+        ("statistics.json", '"action"', '"acts"', "{file} has no statistics 'action'"),
+        ("vocabulary.json", '"pad"', '"filler"', "The vocabulary {file} needs"),
+    ],
+)
+def test_an_asset_that_does_not_fit_is_told_by_the_name_that_the_user_gave_it(
+    policy_dir: Path, tmp_path: Path, name, old, new, message
+):
+    file = policy_dir / name
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(SpecError) as caught:
+        build(policy_dir, tmp_path / "out")
+    assert message.format(file=file) in caught.value.message
+    assert str(tmp_path / "out") not in str(caught.value)
+
+
 @pytest.mark.parametrize("place", ["../outside.json", "absolute"])
 def test_an_asset_outside_the_policys_folder_is_refused_and_nothing_is_written_outside(
     policy_dir: Path, tmp_path: Path, place: str

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from vlatool.bundle import Bundle, manifest_bytes
+from vlatool.errors import GraphError
 from vlatool.manifest import Manifest
 from vlatool.printable import printable
 from vlatool.runtime.policy import FIRST_RUN_S
@@ -19,7 +21,10 @@ def inspect(
     bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False)],
     as_json: Annotated[bool, typer.Option("--json", help="print the manifest as JSON")] = False,
     probe: Annotated[
-        bool, typer.Option("--probe", help="run it once, too, in a child process that is limited in time and memory")
+        bool,
+        typer.Option(
+            "--probe", help="run it once, too, in a child process with limits; ends with 3 where load would refuse it"
+        ),
     ] = False,
     first_run: Annotated[
         float, typer.Option("--first-run", min=0.1, help="seconds that the run of --probe may take")
@@ -34,13 +39,22 @@ def inspect(
     tried = try_once(bundle, first_run_s=first_run, memory_mb=memory) if probe else None
     if as_json:
         typer.echo(manifest_bytes(opened.manifest).decode(), nl=False)
-        return
-    for line in describe(opened):
-        typer.echo(printable(line))
-    if tried is not None:
-        error = "no golden action" if tried["golden_error"] is None else f"golden error {tried['golden_error']:.2g}"
-        used = f"{tried['peak_rss_mb']:,.0f} MB resident, {tried['memory_mb']:,.0f} MB allowed"
-        typer.echo(f"  probe      ran once: {error}, {used}")
+    else:
+        for line in [*describe(opened), *([] if tried is None else [_probed(tried)])]:
+            typer.echo(printable(line))
+    if tried is not None and tried["refused"]:
+        raise GraphError(*tried["refused"])
+
+
+def _probed(tried: Mapping[str, Any]) -> str:
+    """Return a line on the run of ``--probe``: each error of the golden action beside the one that is allowed."""
+    errors = zip(
+        (tried["golden_error"], tried["golden_chunk_error"]), tried["golden_tolerances"],
+        ("golden error", "in physical units"), strict=True,
+    )  # fmt: skip
+    parts = [f"{name} {error:.2g} (allowed {allowed:g})" for error, allowed, name in errors if error is not None]
+    used = f"{tried['peak_rss_mb']:,.0f} MB resident, {tried['memory_mb']:,.0f} MB allowed"
+    return f"  probe      ran once: {', '.join([*(parts or ['no golden action']), used])}"
 
 
 def describe(bundle: Bundle) -> list[str]:

@@ -36,8 +36,8 @@ def load(
         threads: Intra-op threads of the engine; the cores that this process may use when None.
         seed: Seed of the noise that a program draws; fresh entropy when None.
         warmup: Inferences on the golden observation before this returns (the first is the slowest).
-        golden_tolerance: Largest relative L2 difference between the recorded golden action and this machine's; the one
-            that was measured when the bundle was made when None.
+        golden_tolerance: Largest relative L2 difference between the recorded golden action and this machine's, as the
+            graphs give it and in physical units; what was measured of each when the bundle was made when None.
         accept: Names of findings in the manifest that are overruled, see ``vlatool inspect``.
         first_run_s: Seconds that an inference of the warm-up may take before it is stopped. (Opening a graph cannot be
             stopped, nor can OpenVINO inside of a loop: it goes on until the process ends; ``probe`` can.)

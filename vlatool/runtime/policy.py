@@ -28,7 +28,7 @@ from vlatool.runtime.contract import (
     not_finite,
     written_as_declared,
 )
-from vlatool.runtime.engines._arithmetic import EXACT
+from vlatool.runtime.engines._arithmetic import told
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
@@ -87,6 +87,7 @@ class Policy:
         self._turn = threading.RLock()  # a signal handler may call while this thread has it
         self._busy = False
         self.golden_error: float | None = None
+        self.golden_chunk_error: float | None = None
 
     @classmethod
     def open(
@@ -201,7 +202,7 @@ class Policy:
 
         Args:
             inferences: At least so many, and each golden observation once; none when 0.
-            tolerance: Largest relative L2 difference; the one in the manifest when None.
+            tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
             first_run_s: Seconds that each may take.
 
         Raises:
@@ -209,8 +210,6 @@ class Policy:
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
-        if tolerance is None:
-            tolerance = self.bundle.manifest.golden_tolerance or GOLDEN_TOLERANCE
         stored = _stored(self.bundle)
         steps = _goldens(self.bundle, stored)
         if self.program.keeps and steps and len(steps) < GOLDEN_STEPS:
@@ -221,6 +220,7 @@ class Policy:
         if not steps or not inferences:
             return
         errors: list[float] = []
+        of_chunks: list[float] = []
         chunks = _golden_chunks(self.spec.action, stored, len(steps))
         for number in range(max(inferences, len(steps))):
             observation, noise, expected = steps[number % len(steps)]
@@ -230,23 +230,37 @@ class Policy:
                 action = self.infer(observation, noise=noise)
             errors.append(relative_error(action.outputs[self.spec.action.name], expected))
             if chunks:
-                errors.append(relative_error(action.chunk, chunks[number % len(steps)]))
+                of_chunks.append(relative_error(action.chunk, chunks[number % len(steps)]))
         self.reset()
-        self.golden_error = next(filter(math.isnan, errors), max(errors))
-        if not self.golden_error <= tolerance:
-            raise GraphError(
-                f"This machine computes another golden action than recorded: relative error {self.golden_error:.3g}, "
-                f"allowed {tolerance:g}.{self._arithmetic()}",
-                "the engine or processor may lack what this precision needs; run: vlatool doctor",
-            )
+        self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
+        self.check_golden(tolerance)
 
-    def _arithmetic(self) -> str:
-        """Say how the engine computes int8 products here, where the graphs have some and that is not exact."""
-        if not any("int8" in graph.precision for graph in self.bundle.manifest.graphs.values()):
-            return ""
-        engine: Any = registry.load("engines", self.engine)
-        found = str(engine.arithmetic())
-        return "" if found == EXACT else f" Its int8 products are {found}."
+    def check_golden(self, tolerance: float | None = None) -> None:
+        """Hold what the warm-up found against what is allowed.
+
+        Args:
+            tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
+
+        Raises:
+            GraphError: when a difference is larger or not a number.
+        """
+        limits = self.golden_tolerances if tolerance is None else (tolerance, tolerance)
+        found = zip((self.golden_error, self.golden_chunk_error), limits, ("", " in physical units"), strict=True)
+        for error, allowed, where in found:
+            if error is not None and not error <= allowed:
+                cause, remedy = told(self.bundle.manifest, self.engine)
+                raise GraphError(
+                    f"This machine computes another golden action{where} than recorded: relative error {error:.3g}, "
+                    f"allowed {allowed:g}.{cause and ' ' + cause}",
+                    remedy or "the engine or processor may lack what this precision needs; run: vlatool doctor",
+                )
+
+    @property
+    def golden_tolerances(self) -> tuple[float, float]:
+        """Largest relative L2 difference that the manifest allows, of outputs and of chunks in physical units."""
+        manifest = self.bundle.manifest
+        own = manifest.golden_tolerance or GOLDEN_TOLERANCE
+        return own, manifest.golden_chunk_tolerance or own
 
 
 def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
@@ -355,6 +369,12 @@ def _golden_chunks(action: TensorSpec, stored: Mapping[str, Array], steps: int) 
     if chunks is None or action.kind == "discrete" or not chunks.ndim or chunks.dtype.kind not in "fiu":
         return []
     return list(chunks) if len(chunks) == steps else []
+
+
+def _worst(errors: Iterable[float]) -> float | None:
+    """Return the largest; one that is no number before all others, None when there is none."""
+    found = list(errors)
+    return next(filter(math.isnan, found), max(found, default=None))
 
 
 def relative_error(got: Array, expected: Array) -> float:

@@ -47,7 +47,9 @@ def probe(
             size of the graphs when None.
 
     Returns:
-        ``memory_mb`` that was allowed, ``peak_rss_mb`` of the process, ``golden_error`` (None without a golden file).
+        ``memory_mb`` that was allowed, ``peak_rss_mb`` of the process, ``golden_error`` and ``golden_chunk_error``
+        (None without a golden file), ``golden_tolerances`` of both, and ``refused``: message and fix with which
+        ``load`` refuses the bundle on this machine for one of them, or None.
 
     Raises:
         GraphError: when the process is ended by a limit or a signal; says how to raise the limit.
@@ -88,7 +90,15 @@ def _run(path: str, engine: str, threads: int | None, first_run_s: float, memory
     policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=0, memory_mb=memory_mb)
     policy.warm_up(1, float("inf"), first_run_s)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"golden_error": policy.golden_error, "peak_rss_mb": peak * 1024 / 1e6}
+    refused = None
+    try:
+        policy.check_golden()
+    except GraphError as error:
+        refused = (error.message, error.fix)
+    return {
+        "golden_error": policy.golden_error, "golden_chunk_error": policy.golden_chunk_error,
+        "golden_tolerances": policy.golden_tolerances, "refused": refused, "peak_rss_mb": peak * 1024 / 1e6,
+    }  # fmt: skip
 
 
 def _search_path() -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -10,8 +11,10 @@ from pydantic import Field
 
 from vlatool import trust
 from vlatool.bundle import Bundle, hash_file, seal
-from vlatool.errors import SourceError
+from vlatool.errors import MissingExtra, SourceError, SpecError
 from vlatool.manifest import Manifest
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources._description import Description, read_description, write_location
 from vlatool.sources._factory import factory_file, split_factory
 from vlatool.sources._shards import fingerprint, sampled_hash, shard_files
@@ -114,6 +117,7 @@ def copy_assets(described: Description, out: Path) -> None:
 
     Raises:
         SourceError: when a file that the spec names is missing.
+        SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
     """
     for name in sorted(described.assets()):
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
@@ -123,7 +127,23 @@ def copy_assets(described: Description, out: Path) -> None:
         target = out / "assets" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(described.folder / name, target)
+    check_assets(described, out / "assets")
     for key, path in (("calibration", described.calibration), ("evaluation", described.evaluation)):
         if path is not None:
             (out / "data").mkdir(exist_ok=True)
             shutil.copyfile(path, out / "data" / f"{key}.npz")
+
+
+def check_assets(described: Description, copies: Path) -> None:
+    """Read the copies of tokenizers and statistics as a robot would; what a robot would need for it may be absent.
+
+    Raises:
+        SpecError: when one does not fit the spec; names the file that was copied.
+    """
+    try:
+        with contextlib.suppress(MissingExtra):
+            ObservationEncoder(described.spec, copies)
+        for tensor in described.spec.outputs:
+            load_normaliser(tensor, copies)
+    except SpecError as error:
+        raise SpecError(error.message.replace(str(copies), str(described.folder)), error.fix) from error

@@ -22,6 +22,7 @@ from vlatool.runtime.engines._arithmetic import (
     operand,
     ort_product,
 )
+from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
@@ -56,6 +57,15 @@ def test_the_probe_is_the_product_that_it_says():
     assert (got == WANTED).all()
 
 
+def test_the_written_probe_is_the_same_product_as_an_integer_operator():
+    found = onnx.ModelProto.FromString(model(written=True))
+    onnx.checker.check_model(found, full_check=True)
+    assert "MatMulInteger" in {node.op_type for node in found.graph.node}
+    assert (ReferenceEvaluator(found).run(None, {"x": operand()})[0] == WANTED).all()
+    assert ort_product(onnxruntime, precise=True, written=True) == WANTED
+    assert ort_product(onnxruntime, written=True) == ort_product(onnxruntime)
+
+
 def test_with_the_option_products_are_exact_on_every_processor():
     assert ort_product(onnxruntime, precise=True) == WANTED
 
@@ -82,7 +92,7 @@ def test_openvino_is_asked_by_a_product_of_its_own(monkeypatch):
 def saturating(monkeypatch):
     """A processor without VNNI: what it would compute is believed."""
     found = {False: SATURATED, True: WANTED}
-    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False: found[precise])
+    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False, written=False: found[precise])
     return found
 
 
@@ -93,6 +103,33 @@ def test_where_products_saturate_the_option_is_set(tmp_path: Path, saturating):
     assert OrtCpuSession.arithmetic() == EXACT_BY_OPTION
     saturating[True] = SATURATED
     assert OrtCpuSession.arithmetic() == SATURATING
+
+
+def level(session: OrtCpuSession) -> object:
+    return session._session.get_session_options().graph_optimization_level
+
+
+def test_where_products_saturate_the_reference_is_opened_so_that_they_are_exact(tmp_path: Path, saturating):
+    """The option has no effect in a session that rewrites nothing."""
+    levels = onnxruntime.GraphOptimizationLevel
+    session = ReferenceSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
+    assert (option(session), level(session)) == ("1", levels.ORT_ENABLE_EXTENDED)
+    assert (session.run({"a": np.full(SHAPE, 255, np.uint8)})["y"] == WANTED).all()
+    assert ReferenceSession.arithmetic() == EXACT_BY_OPTION
+
+
+def test_where_the_option_does_not_make_them_exact_the_reference_says_so_and_rewrites_nothing(
+    tmp_path: Path, saturating
+):
+    saturating[True] = SATURATED
+    session = ReferenceSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
+    assert level(session) == onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    assert ReferenceSession.arithmetic() == SATURATING
+
+
+def test_the_reference_opens_signed_activations_all_the_same(tmp_path: Path, saturating):
+    session = ReferenceSession(integer_product(tmp_path / "product.onnx", TensorProto.INT8), threads=1)
+    assert (session.run({"a": np.full(SHAPE, 127, np.int8)})["y"] == 127 * 127 * 64).all()
 
 
 def test_signed_activations_open_all_the_same(tmp_path: Path, saturating):
@@ -106,8 +143,11 @@ def test_the_first_error_is_told(tmp_path: Path, saturating):
 
 
 def test_where_products_are_exact_nothing_is_set(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False: WANTED)
+    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False, written=False: WANTED)
     session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
     assert OrtCpuSession.arithmetic() == EXACT
     with pytest.raises(RuntimeError):
         option(session)
+    reference = ReferenceSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
+    assert level(reference) == onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    assert ReferenceSession.arithmetic() == EXACT

@@ -149,3 +149,18 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GraphError, match=r"OpenVINO .* refuses .*bad.onnx: ") as caught:
         OpenvinoSession(path)
     assert len(caught.value.message.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("confined", "fix"), [("SSE41", "unset ONEDNN_MAX_CPU_ISA"), (None, "--layout ort")])
+def test_where_openvino_has_no_kernel_the_error_says_what_to_do(tmp_path: Path, monkeypatch, confined, fix):
+    class Refusing:
+        def read_model(self, *_):
+            raise RuntimeError("bad combination")
+
+    monkeypatch.setattr("openvino.Core", Refusing)
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    if confined:
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", confined)
+    with pytest.raises(GraphError, match="bad combination") as caught:
+        OpenvinoSession(tmp_path / "any.onnx")
+    assert fix in caught.value.fix

@@ -2,14 +2,47 @@
 
 No engine to run a robot on, but the one that others are held against: an engine that rewrites a graph may compute other
 numbers than the graph says, and an answer of its own would not show it.
+
+Where integer operators saturate, they do so in a session that rewrites nothing, too, and a saturated answer is not what
+the graph says. There the option that makes them exact is set, with the rewriting that it takes and no more
+(``_arithmetic.as_written``), and the product is asked again: an option is not believed.
 """
 
 from __future__ import annotations
 
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from typing import Any
+
+from vlatool.errors import require
+from vlatool.runtime.engines import _arithmetic
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession, session_options
 
 
 class ReferenceSession(OrtCpuSession):
-    """One ONNX file open in ONNX Runtime on the CPU with all rewriting of the graph off."""
+    """One ONNX file open in ONNX Runtime on the CPU, with rewriting of the graph off as far as products are exact."""
 
     optimized = False
+
+    @staticmethod
+    def _ways(ort: Any, threads: int | None) -> list[Any]:
+        """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
+        wanted = [True, False] if _exact(ort) == _arithmetic.EXACT_BY_OPTION else [False]
+        ways = [session_options(ort, threads) for _ in wanted]
+        for options, precise in zip(ways, wanted, strict=True):
+            _arithmetic.as_written(ort, options, precise)
+        return ways
+
+    @staticmethod
+    def arithmetic() -> str:
+        """Say whether integer products of the reference are exact on this machine, or saturate.
+
+        Raises:
+            MissingExtra: when onnxruntime is not installed.
+        """
+        return _exact(require("onnxruntime", "ort"))
+
+
+def _exact(ort: Any) -> str:
+    if _arithmetic.ort_product(ort, written=True) == _arithmetic.WANTED:
+        return _arithmetic.EXACT
+    exact = _arithmetic.ort_product(ort, precise=True, written=True) == _arithmetic.WANTED
+    return _arithmetic.EXACT_BY_OPTION if exact else _arithmetic.SATURATING

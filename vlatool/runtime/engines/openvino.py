@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from vlatool.errors import GraphError, nearest, require
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engines import _arithmetic
+from vlatool.typed import shown
 
 DEVICE = "CPU"
 GRACE_MS = 1000
 """How long a run that is cancelled may take to end."""
 HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
 """What OpenVINO is told to compute in: left alone it silently takes bfloat16 where the processor has it."""
+NO_KERNEL = ("bad combination", "inner product")
+"""What OpenVINO says of a processor without the instructions that a graph needs."""
 
 
 class OpenvinoSession:
@@ -50,7 +53,8 @@ class OpenvinoSession:
             self._compiled = core.compile_model(model, DEVICE, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
-            raise GraphError(f"OpenVINO {version_of(openvino)} refuses {path}: {_last_line(error)}") from error
+            words = f"OpenVINO {version_of(openvino)} refuses {path}: {_last_line(error)}"
+            raise GraphError(words, _remedy(error)) from error
         self.path = path
         self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
         if self.precision != HINTS[compute]:
@@ -174,6 +178,15 @@ class OpenvinoSession:
         compiled = core.compile_model(core.read_model(io.BytesIO(_arithmetic.model())), DEVICE, settings_for(1, ""))
         found = float(compiled(_arithmetic.operand())[0].min())
         return _arithmetic.EXACT if found == _arithmetic.WANTED else _arithmetic.SATURATING
+
+
+def _remedy(error: Exception) -> str:
+    """Return what to do where OpenVINO has no kernel for this processor, or for what a variable confines it to."""
+    if confined := os.environ.get("ONEDNN_MAX_CPU_ISA"):
+        return f"unset ONEDNN_MAX_CPU_ISA, which confines OpenVINO to {shown(confined)}"
+    if any(sign in str(error) for sign in NO_KERNEL):
+        return "this processor lacks instructions that OpenVINO needs for it: quantize with --layout ort"
+    return ""
 
 
 def settings_for(threads: int | None, compute: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -58,7 +58,7 @@ class OrtCpuSession:
         if compute not in ("", "float32"):
             raise GraphError(f"ONNX Runtime on the CPU does not compute in {compute}.", "use the engine openvino")
         try:
-            self._session = _open(ort, path if opened is None else opened, threads, self.optimized)
+            self._session = self._open(ort, path if opened is None else opened, threads)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
             raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}") from error
         self._session.disable_fallback()
@@ -113,6 +113,33 @@ class OrtCpuSession:
             raise
         finally:
             timer.cancel()
+
+    @classmethod
+    def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
+        """Open a session, with other options where the first break the graph; their error is the one that is told."""
+        ways = cls._ways(ort, threads)
+        try:
+            return _session(ort, model, ways[0])
+        except Exception:
+            for way in ways[1:]:
+                with contextlib.suppress(Exception):
+                    return _session(ort, model, way)
+            raise
+
+    @staticmethod
+    def _ways(ort: Any, threads: int | None) -> list[Any]:
+        """Return the options to try, one after the other.
+
+        Exact products of uint8 activations refuse a graph with int8 ones, which are exact anyway. And ONNX Runtime
+        (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type.
+        """
+        saturates = _arithmetic.ort_product(ort) != _arithmetic.WANTED
+        entries = [*([_arithmetic.PRECISE] if saturates else []), None, _arithmetic.UNFUSED]
+        ways = [session_options(ort, threads) for _ in entries]
+        for options, entry in zip(ways, entries, strict=True):
+            if entry is not None:
+                options.add_session_config_entry(*entry)
+        return ways
 
     @staticmethod
     def version() -> str:
@@ -201,33 +228,12 @@ def _buffer(node: Any) -> Array | None:
     return np.zeros(node.shape, dtype)
 
 
-def _open(ort: Any, model: Path | bytes, threads: int | None, optimized: bool) -> Any:
-    """Open a session; with other options where these break the graph.
-
-    Exact products of uint8 activations refuse a graph with int8 ones, which are exact anyway. And ONNX Runtime (1.31)
-    takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type. The first
-    error is the one that is told.
-    """
-    saturates = _arithmetic.ort_product(ort) != _arithmetic.WANTED
-    ways = [*([(_arithmetic.PRECISE,)] if saturates else []), (), (("session.disable_quant_qdq", "1"),)]
-    try:
-        return _session(ort, model, _options(ort, threads, optimized, ways[0]))
-    except Exception:
-        for way in ways[1:]:
-            with contextlib.suppress(Exception):
-                return _session(ort, model, _options(ort, threads, optimized, way))
-        raise
-
-
-def _options(ort: Any, threads: int | None, optimized: bool, entries: Iterable[tuple[str, str]]) -> Any:
+def session_options(ort: Any, threads: int | None) -> Any:
+    """Return what every session of ONNX Runtime is opened with; the cores that this process may use when None."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
     options.inter_op_num_threads = 1
-    if not optimized:
-        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    for entry in entries:
-        options.add_session_config_entry(*entry)
     return options
 
 
