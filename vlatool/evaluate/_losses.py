@@ -22,9 +22,8 @@ def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
     Discrete: the share of its actions that differ. Continuous: the mean over steps and elements of |difference|, each
     element divided by the standard deviation of what was wanted; elements that never change do not count.
     """
-    count = len(got)
     if action.kind == "discrete":
-        return np.asarray((got.reshape(count, -1) != wanted.reshape(count, -1)).mean(axis=1), np.float64)
+        return np.asarray((~agreeing(got, wanted)).mean(axis=1), np.float64)
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
     spread = spread_of(wanted)
@@ -32,6 +31,13 @@ def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
     if not varied.any():
         return np.asarray(np.abs(got - wanted).mean(axis=(1, 2)))
     return np.asarray((np.abs(got - wanted)[..., varied] / spread[varied]).mean(axis=(1, 2)))
+
+
+def agreeing(got: Array, wanted: Array) -> Array:
+    """Return whether discrete actions are the same, (N, T) bool, for the leading steps that both have."""
+    got, wanted = got.reshape(len(got), -1), wanted.reshape(len(wanted), -1)
+    steps = min(got.shape[1], wanted.shape[1])
+    return np.asarray(got[:, :steps] == wanted[:, :steps])
 
 
 def spread_of(actions: Array) -> Array:
