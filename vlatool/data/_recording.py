@@ -62,8 +62,8 @@ class Recording:
             return ()
         some = "the first one alone is" if steps == 1 else f"the first {steps} alone are"
         return (
-            f"{self.path.name} records {steps} of the {self.chunk} actions of each chunk: {some} held against the expert; "
-            f"record all {self.chunk} that follow each observation to judge the whole chunk",
+            f"{self.path.name} records {steps} of the {self.chunk} actions of each chunk: {some} held against the "
+            f"expert; record all {self.chunk} that follow each observation to judge the whole chunk",
         )
 
     def spread(self, count: int) -> list[int]:
