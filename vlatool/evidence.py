@@ -54,6 +54,13 @@ def _recorded(bundle: Bundle, baseline: Bundle, cache: Path, context: Context) -
     return cached_measure(stage, bundle, cache, context).rows[-1].measurements
 
 
+def unjudged(baseline: Bundle, cache: Path, context: Context) -> tuple[str, ...]:
+    """Return what the recordings leave unjudged of the baseline's actions, and so of any candidate's."""
+    if EVALUATION not in baseline.manifest.files:
+        return ()
+    return cached_measure(Recorded(), baseline, cache, context).warnings
+
+
 def _joined(row: Row, played: Row) -> Row:
     measurements = (*row.measurements, *played.measurements)
     raw, details = {**row.raw, **played.raw}, {**row.details, **played.details}

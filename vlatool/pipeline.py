@@ -15,7 +15,7 @@ from vlatool.credibility import Credibility, credibility
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
-from vlatool.evidence import with_accuracy
+from vlatool.evidence import unjudged, with_accuracy
 from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
@@ -301,6 +301,7 @@ def _measure(
     """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
     rows, warnings = _latency_rows(plan, source, bundles, context)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
+    warnings = (*warnings, *unjudged(bundles[BASELINE], plan.cache, context))
     if plan.profile:
         foretold = {name: predictions(plan.profile, bundle) for name, bundle in bundles.items()}
         rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}

@@ -7,6 +7,7 @@ import math
 import random
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from _policies import Garbage, Memoising, Wrapped
 
 from vlatool.benchmark import _turns
 from vlatool.benchmark._pairs import FEWEST, Job, Pairs, measure_pairs, run_job
-from vlatool.benchmark._turns import CONFIRM, Turns, sequence, wanted
+from vlatool.benchmark._turns import CONFIRM, Turns, halved, observation_of, place_of, sequence, wanted
 from vlatool.bundle import Bundle, seal
 from vlatool.data import Drawer, read_recording, save_drawn
 from vlatool.errors import BundleError, GraphError
@@ -54,7 +55,7 @@ def test_every_call_of_both_is_kept(job: Job) -> None:
     found = run_job(job)
     assert len(found.baseline_ms) == len(found.candidate_ms) == len(found.places) == 40
     assert min(found.baseline_ms + found.candidate_ms) > 0
-    assert len(set(found.places)) == wanted(40) == 14
+    assert len({observation_of(place)[0] for place in found.places}) == wanted(40) == 14
     assert (found.strays, found.unsteady) == (0, 0)
     assert found.looked > 5
 
@@ -93,7 +94,20 @@ def test_no_observation_comes_twice_in_a_row(seed: int) -> None:
     assert sequence([4], random.Random(seed)) == [4, 4, 4]
 
 
-def test_both_get_the_same_bits_and_never_the_same_twice(job: Job, wrapped) -> None:
+@pytest.mark.parametrize("count", [1, 2, 7, 10])
+def test_half_of_a_block_is_exact_another_half_each_time(count: int) -> None:
+    order = random.Random(3)
+    seen = set()
+    for _ in range(60):
+        places = halved(range(count), order)
+        assert [observation_of(place)[0] for place in places] == list(range(count))
+        exact = {number for number, exact in map(observation_of, places) if exact}
+        assert len(exact) in {count // 2, (count + 1) // 2}
+        seen |= {place_of(number, number in exact) for number in range(count)}
+    assert seen == set(range(2 * count)), "each observation has been both"
+
+
+def test_both_get_the_same_bits_which_are_exact_or_never_seen(job: Job, wrapped) -> None:
     class Spy(Wrapped):
         def infer(self, observation, **more):
             told.append((id(self), observation["image"].tobytes(), observation["instruction"]))
@@ -106,7 +120,12 @@ def test_both_get_the_same_bits_and_never_the_same_twice(job: Job, wrapped) -> N
     turns._time()
     images = [[image for who, image, _ in told if who == id(policy)] for policy in policies]
     assert images[0] == images[1]
-    assert len(set(images[0])) == 40
+    drawn = [each.observation["image"].tobytes() for each in turns.pool]
+    exact = [image for image, place in zip(images[0], turns.places, strict=True) if observation_of(place)[1]]
+    assert exact == [drawn[number] for number, exact in map(observation_of, turns.places) if exact]
+    new = [image for image, place in zip(images[0], turns.places, strict=True) if not observation_of(place)[1]]
+    assert len(set(new) - set(drawn)) == len(new) == 40 - len(exact)
+    assert 10 < len(exact) < 30
     assert len({text for *_, text in told}) > 3
     firsts = [who for who, *_ in told[::2]]
     assert 0.2 < firsts.count(id(policies[0])) / len(firsts) < 0.8, "neither is always the first"
@@ -130,8 +149,12 @@ def test_other_answers_than_in_a_fresh_session_are_told(job: Job, wrapped) -> No
 
 def test_answers_from_memory_are_of_no_use(job: Job, wrapped) -> None:
     made = wrapped(Memoising, only=job.candidate)
-    assert run_job(job).strays == 0
-    assert made[0].calls >= 40, "no call is answered from memory"
+    found = run_job(job)
+    exact = [place for place in found.places if observation_of(place)[1]]
+    assert found.strays == 0
+    computed = 40 - (len(exact) - len(set(exact)))
+    assert computed > 20, "most calls are not answered from memory, so that the median is not"
+    assert made[0].calls >= 40 - len(exact), "what is varied is never answered from memory"
 
 
 def test_what_seems_slow_is_called_again_and_again(job: Job, wrapped) -> None:
@@ -150,6 +173,41 @@ def test_what_seems_slow_is_called_again_and_again(job: Job, wrapped) -> None:
     assert "instruction ''" not in found.slow_input
     assert sum(ratio > math.log(1.5) for ratio in found.slow) > CONFIRM // 2
     assert len(found.candidate_ms) == len(found.places) == 40, "further calls are no part of the others"
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch):
+    """A clock that stands still until it is told otherwise, in nanoseconds."""
+    found = SimpleNamespace(now=1)
+    read = SimpleNamespace(perf_counter_ns=lambda: found.now, monotonic=lambda: found.now / 1e9)
+    monkeypatch.setattr(_turns, "time", read)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("slow", "words"), [(True, "drawn"), (False, "drawn, slightly varied")])
+def test_what_is_slow_on_exact_inputs_alone_or_on_varied_ones_is_found(job, wrapped, clock, slow, words, seed) -> None:
+    class Slow(Wrapped):
+        def infer(self, observation, **more):
+            exact = observation["image"].tobytes() in drawn
+            clock.now += 5_000_000 if exact is slow else 1_000_000
+            return super().infer(observation, **more)
+
+    class Steady(Wrapped):
+        def infer(self, observation, **more):
+            clock.now += 1_000_000
+            return super().infer(observation, **more)
+
+    drawn: set[bytes] = set()
+    wrapped(Steady, only=job.baseline)
+    wrapped(Slow, only=job.candidate)
+    turns = Turns(Job(**{**vars(job), "pairs": 60, "seed": seed}))
+    drawn.update(each.observation["image"].tobytes() for each in turns.pool)
+    found = turns.measure()
+    assert found.mean_log_ratio == pytest.approx(math.log(2) / 2, rel=0.2), "half of the places, each counted for 2"
+    assert found.slow == (math.log(5),) * CONFIRM
+    assert found.slow_input.split(", instruction")[0] == words
+    assert observation_of(max(found.places, key=lambda place: found.medians(found.candidate_ms)[place]))[1] is slow
 
 
 def test_observations_come_from_the_file(job: Job, float_bundle: Bundle, tmp_path, wrapped) -> None:
@@ -181,7 +239,7 @@ def test_what_the_baseline_cannot_answer_is_left_out(job: Job, wrapped) -> None:
     turns = Turns(job)
     found = turns.measure()
     assert len(found.baseline_ms) == len(found.candidate_ms) == len(found.places) < 40
-    assert all(turns.pool[place].observation["instruction"] for place in found.places)
+    assert all(turns.pool[observation_of(place)[0]].observation["instruction"] for place in found.places)
 
 
 def test_what_the_candidate_alone_cannot_answer_is_an_error(job: Job, wrapped) -> None:

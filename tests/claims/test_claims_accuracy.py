@@ -73,6 +73,16 @@ def test_without_an_expert_the_baselines_actions_are_right(
     assert examine(float_bundle, float_bundle, claim, Context()).measurements[0].value == 0
 
 
+def test_a_gate_says_how_much_of_a_chunk_is_judged(float_bundle: Bundle, tmp_path: Path) -> None:
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files}
+    np.savez(tmp_path / "first.npz", **data | {"action": data["action"][:, 0]})
+    found = examine(float_bundle, float_bundle, AccuracyClaim(data=tmp_path / "first.npz"), Context())
+    assert "first.npz records 1 of the 4 actions of each chunk: the first one alone is held" in found.sentence
+    whole = examine(float_bundle, float_bundle, AccuracyClaim(), Context())
+    assert "of each chunk" not in whole.sentence
+
+
 def test_a_baseline_that_does_not_do_its_task_decides_nothing(float_bundle: Bundle, tmp_path: Path) -> None:
     with np.load(float_bundle.path / "data/evaluation.npz") as stored:
         data = {name: stored[name] for name in stored.files}

@@ -90,6 +90,37 @@ def test_single_actions_become_chunks_of_one(tmp_path: Path):
     assert read(tmp_path, action=np.zeros((COUNT, 2), np.float32)).actions.shape == (COUNT, 1, 2)
 
 
+@pytest.mark.parametrize(
+    ("shape", "steps"), [((COUNT, 3, 2), 3), ((COUNT, 2, 2), 2), ((COUNT, 1, 2), 1), ((COUNT, 2), 1)]
+)
+def test_a_chunk_that_is_recorded_in_part_is_told(tmp_path: Path, shape, steps):
+    recording = read(tmp_path, action=np.zeros(shape, np.float32))
+    assert recording.actions.shape == (COUNT, steps, 2)
+    if steps == 3:
+        assert recording.unjudged == ()
+    else:
+        (told,) = recording.unjudged
+        some = "the first one alone is" if steps == 1 else "the first 2 alone are"
+        assert told.startswith(f"recording.npz records {steps} of the 3 actions of each chunk: {some} held against")
+    assert read(tmp_path).unjudged == (), "nothing is held against an expert where there is none"
+
+
+@pytest.mark.parametrize(
+    ("spec", "shape"), [(SPEC, (COUNT, 4, 2)), (SPEC, (COUNT, 0, 2)), (SPEC, (COUNT, 3, 3, 2)), (DISCRETE, (COUNT, 2))]
+)
+def test_more_steps_than_the_chunk_and_none_are_refused(tmp_path: Path, spec, shape):
+    kind = np.int64 if spec is DISCRETE else np.float32
+    steps = int(np.prod(shape[1:-1])) if spec is SPEC else shape[1]
+    message = f"has {steps} steps in each sample; allowed: 1 to {spec.chunk}, the policy's chunk"
+    assert "as many as the policy gives" in refused(tmp_path, message, spec, action=np.zeros(shape, kind)).fix
+
+
+@pytest.mark.parametrize("values", [["go"] * COUNT, [True] * COUNT, [1j] * COUNT])
+def test_actions_that_are_no_numbers_are_refused(tmp_path: Path, values):
+    actions = np.repeat(np.array(values)[:, None], 2, axis=1)
+    refused(tmp_path, "expert's action .* wanted numbers in physical units", action=actions)
+
+
 def test_discrete_actions_are_indices(tmp_path: Path):
     recording = read(tmp_path, DISCRETE, action=np.arange(COUNT) % 2)
     assert recording.actions.ravel().tolist() == [0, 1, 0, 1, 0, 1]
@@ -98,6 +129,14 @@ def test_discrete_actions_are_indices(tmp_path: Path):
 @pytest.mark.parametrize("actions", [np.full(COUNT, 2), np.full(COUNT, -1), np.zeros(COUNT, np.float32)])
 def test_discrete_actions_outside_the_labels_are_refused(tmp_path: Path, actions):
     refused(tmp_path, "must be indices from 0 to 1", DISCRETE, action=actions)
+
+
+@pytest.mark.parametrize("wrong", [2, 9, -1])
+def test_the_first_wrong_label_and_its_sample_are_named(tmp_path: Path, wrong: int):
+    actions = np.arange(COUNT) % 2
+    actions[[3, 5]] = wrong
+    message = rf"indices from 0 to 1; got {wrong} in sample 3 \(and in 2 of 6 samples such a value\)"
+    refused(tmp_path, message, DISCRETE, action=actions)
 
 
 @pytest.mark.parametrize(

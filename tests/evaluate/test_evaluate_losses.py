@@ -45,6 +45,12 @@ def test_discrete_losses_are_the_share_that_differs() -> None:
     assert pairs.tolist() == [0.5, 0]
 
 
+def test_discrete_chunks_are_compared_as_far_as_both_go() -> None:
+    got = np.array([[1, 2, 3, 4], [5, 6, 7, 8]])
+    assert losses(DISCRETE, got, np.array([[1], [6]])).tolist() == [0, 1]
+    assert losses(DISCRETE, got, np.array([[1, 9], [5, 6]])).tolist() == [0.5, 0]
+
+
 def test_the_same_losses_are_no_drop() -> None:
     off = np.random.default_rng(1).random(50)
     assert drop(off, off, None, 0.98) == (0, 0, 0)

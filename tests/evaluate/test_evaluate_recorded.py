@@ -184,6 +184,24 @@ def test_chunks_of_unequal_length_are_compared_as_far_as_both_go():
     assert found["error_expert.dx"].value == 0.25
 
 
+def test_discrete_chunks_of_unequal_length_agree_as_far_as_both_go():
+    got = np.array([[0, 1, 2], [2, 1, 0]])
+    (found,) = compare(TURN, got, np.array([[0], [1]]), "expert")
+    assert (found.value, found.samples) == (0.5, 2)
+    (found,) = compare(TURN, got, np.array([[0, 1], [1, 1]]), "expert")
+    assert (found.value, found.samples) == (0.75, 4)
+
+
+@pytest.mark.parametrize(("steps", "told"), [(4, 0), (2, 1), (1, 1)])
+def test_a_report_says_how_much_of_a_chunk_is_judged(float_bundle, tmp_path, steps, told):
+    with np.load(float_bundle.path / "data/evaluation.npz") as data:
+        recorded = {name: data[name] for name in data.files}
+    np.savez(tmp_path / "part.npz", **{**recorded, "action": recorded["action"][:, :steps]})
+    report = Recorded(data=tmp_path / "part.npz").run(float_bundle, Context())
+    assert len(report.warnings) == told
+    assert all(f"part.npz records {steps} of the 4 actions of each chunk" in warning for warning in report.warnings)
+
+
 def test_without_labels_elements_are_numbered():
     plain = TensorSpec("action", (1, 1, 2), unit="rad")
     found = by_name(compare(plain, np.zeros((2, 1, 2)), np.ones((2, 1, 2)), "expert"))

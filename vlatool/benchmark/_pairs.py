@@ -58,10 +58,11 @@ class Pairs:
 
     Args:
         baseline_ms, candidate_ms: Milliseconds of each call, in the order of the pairs.
-        places: Which observation each pair was called with; each one of its own when empty.
-        slow: Logarithms of candidate over baseline, of further pairs with the observation that seemed the slowest for
-            the candidate; empty when none seemed slow.
-        slow_input: That observation, in words.
+        places: What each pair was called with: an observation given exactly, or the same one varied, are two places
+            (``_turns.place_of``); each pair has one of its own when empty.
+        slow: Logarithms of candidate over baseline, of further pairs at the place that seemed the slowest for the
+            candidate; empty when none seemed slow.
+        slow_input: The observation of that place, in words.
         looked: Timed answers of the candidate that were held against those of a fresh session.
         strays: How many of those differ.
         unsteady: How many of the baseline's differ likewise, looked at when the candidate's do.
@@ -83,22 +84,22 @@ class Pairs:
 
     @property
     def mean_log_ratio(self) -> float:
-        """The mean over observations of the same, each from the medians of its calls: what some slow ones change.
+        """The mean over places of the same, each from the medians of its calls: what some slow ones change.
 
-        One observation counts for a factor of ``MOST`` at most: a call that the machine interrupted would outweigh all
-        others, and what is slower than that on few observations is found by ``slow``.
+        One place counts for a factor of ``MOST`` at most: a call that the machine interrupted would outweigh all
+        others, and what is slower than that at few places is found by ``slow``.
         """
         mine, theirs = (self.medians(taken) for taken in (self.candidate_ms, self.baseline_ms))
         most = math.log(MOST)
         return fmean(min(most, max(-most, math.log(mine[place] / theirs[place]))) for place in mine)
 
     def medians(self, taken: Sequence[float]) -> dict[int, float]:
-        """Return observation -> median of its calls, of one of the two series."""
+        """Return place -> median of its calls, of one of the two series."""
         return medians(taken, self.places or range(len(taken)))
 
 
 def medians(taken: Sequence[float], places: Sequence[int]) -> dict[int, float]:
-    """Return observation -> median of its calls."""
+    """Return place -> median of its calls."""
     calls: dict[int, list[float]] = {}
     for value, place in zip(taken, places, strict=True):
         calls.setdefault(place, []).append(value)

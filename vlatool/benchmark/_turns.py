@@ -1,9 +1,13 @@
 """The calls of a process that times two bundles: which observation is next, and what both answer.
 
-Every call has an observation of its own, some bits of which were never seen: an answer that is remembered is of no use.
-The same observation, with the same bits and the same noise, goes to both bundles. Observations come in blocks, each of
-them called three times but never twice in a row, so that however early a slow policy is cut off, an observation's
-latency is a median. Afterwards fresh sessions answer some of the timed calls again.
+Half of the observations of a block, another half each time, are given to the bit as they were recorded or drawn: a
+robot's inputs are exact where a gripper is open or a pixel is black, and a graph can tell. The others are varied anew
+in every call, so that most calls have bits that were never seen: an answer that is remembered is of little use. The
+same observation, with the same bits and the same noise, goes to both bundles. Each observation of a block is called
+three times but never twice in a row, so that however early a slow policy is cut off, its latency is a median, of exact
+calls or of varied ones. Afterwards fresh sessions answer some of the timed calls again.
+
+A place is what a call was made with: an observation, exact or varied (``place_of``).
 """
 
 from __future__ import annotations
@@ -109,6 +113,7 @@ class Turns:
             if called >= FEWEST and time.monotonic() - begun > self.job.seconds:
                 break
             block = [(number * BLOCK + place) % len(self.pool) for place in range(min(BLOCK, len(self.pool)))]
+            block = halved(block, self.order)
             called += self._time_block(sequence(block, self.order)[: self.job.pairs - called])
             number += 1
 
@@ -128,7 +133,7 @@ class Turns:
         return any(step.keep for step in self.steps)
 
     def _pair(self, place: int) -> Call | None:
-        """Time both with a variant of an observation; None when the baseline cannot answer it."""
+        """Time both with an observation, exact or varied; None when the baseline cannot answer it."""
         if place in self.unusable:
             return None
         observation, noise = self._variant(place)
@@ -160,19 +165,25 @@ class Turns:
             GraphError: when it is the candidate alone that cannot.
         """
         if 0 not in failed:
-            what = described(self.pool[place])
-            raise GraphError(f"{self.job.candidate} fails where the baseline answers ({what}): {failed[1].message}")
+            what = f"{self.job.candidate} fails where the baseline answers ({self._told(place)})"
+            raise GraphError(f"{what}: {failed[1].message}")
         self.unusable.add(place)
         for policy in self.policies:
             policy.reset()
 
     def _variant(self, place: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
-        observation = varied(self.pool[place].observation, self.spec, self.noise)
+        number, exact = observation_of(place)
+        drawn = self.pool[number].observation
+        observation = dict(drawn) if exact else varied(drawn, self.spec, self.noise)
         noise = {name: draw(wanted, self.noise) for step in self.steps for name, wanted in step.noise.items()}
         return observation, noise or None
 
+    def _told(self, place: int) -> str:
+        number, exact = observation_of(place)
+        return described(self.pool[number], exact)
+
     def _confirm(self) -> tuple[tuple[float, ...], str]:
-        """Time further pairs of the observation with which the candidate seemed the slowest."""
+        """Time further pairs of the place (an observation, exact or varied) where the candidate seemed the slowest."""
         mine, theirs = (medians(self.taken[which], self.places) for which in (1, 0))
         place = max(mine, key=lambda each: mine[each] / theirs[each])
         if mine[place] / theirs[place] < SUSPECT:
@@ -184,7 +195,7 @@ class Turns:
             if self._pair(place) is not None:
                 logs.append(math.log(self.taken[1][-1] / self.taken[0][-1]))
         del self.places[before:], self.taken[0][before:], self.taken[1][before:]
-        return tuple(logs), f"{described(self.pool[place])}: {math.exp(median(logs)):.2f}x" if logs else ""
+        return tuple(logs), f"{self._told(place)}: {math.exp(median(logs)):.2f}x" if logs else ""
 
     def _replay(self, which: int) -> tuple[int, int]:
         """Let a fresh session answer the kept calls; return how many, and how many it answers otherwise."""
@@ -228,6 +239,22 @@ def wanted(pairs: int) -> int:
     return max(BLOCK, math.ceil(pairs / REPEATS))
 
 
+def place_of(number: int, exact: bool) -> int:
+    """Return the place of an observation: ``exact`` when it is given to the bit as it was drawn, else varied."""
+    return 2 * number + exact
+
+
+def observation_of(place: int) -> tuple[int, bool]:
+    """Return the number of a place's observation, and whether it is given exactly."""
+    return place // 2, bool(place % 2)
+
+
+def halved(numbers: Sequence[int], order: random.Random) -> list[int]:
+    """Return the places of observations, a random half of them exact; which half is the larger is drawn as well."""
+    exact = set(order.sample(numbers, (len(numbers) + order.randrange(2)) // 2))
+    return [place_of(number, number in exact) for number in numbers]
+
+
 def sequence(places: Sequence[int], order: random.Random) -> list[int]:
     """Return each place ``REPEATS`` times in random order, never twice in a row unless there is one alone."""
     found: list[int] = []
@@ -239,7 +266,8 @@ def sequence(places: Sequence[int], order: random.Random) -> list[int]:
     return found
 
 
-def described(drawn: Drawn) -> str:
-    """Return an observation in a few words."""
+def described(drawn: Drawn, exact: bool = True) -> str:
+    """Return an observation in a few words; one that is not ``exact`` is varied."""
     texts = [f"{name} {value!r}" for name, value in drawn.observation.items() if isinstance(value, str)]
-    return ", ".join([{RECORDED: "as recorded", DRAWN: "drawn"}.get(drawn.kind, "recorded otherwise"), *texts])
+    kind = {RECORDED: "as recorded", DRAWN: "drawn"}.get(drawn.kind, "recorded otherwise")
+    return ", ".join([kind, *([] if exact else ["slightly varied"]), *texts])

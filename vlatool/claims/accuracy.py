@@ -33,6 +33,7 @@ class _Drop:
     high: float
     samples: int
     baseline: tuple[Measurement, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def verdict(self, allowed: float) -> str:
         return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
@@ -77,8 +78,9 @@ def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: 
     baselines = tuple(found for each in drops for found in each.baseline if found.name in DECIDE)
     trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
     verdict = "inconclusive" if trust.fails else worst(each.verdict(claim.max_drop) for each in drops)
+    unjudged = [warning for each in drops for warning in each.warnings]
     told = [sentence.rstrip(".") for sentence in trust.sentences]
-    return Found("accuracy", verdict, "; ".join([*told, *said, *trust.warnings]), measured, baselines)
+    return Found("accuracy", verdict, "; ".join([*told, *said, *trust.warnings, *unjudged]), measured, baselines)
 
 
 def finite(bound: float) -> float | None:
@@ -130,4 +132,4 @@ def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context,
         off, before = losses(action, mine, expert), losses(action, theirs, expert)
         words = "more distance from the expert's actions than the baseline has:"
     lost = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
-    return _Drop("recorded_drop", words, *lost, len(indices), baselines)
+    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +27,11 @@ class Recording:
     Args:
         path: Where it was read from.
         inputs: Input name -> array with a leading sample axis, physical values, text as a unicode array.
-        actions: (N, T, A) float32 in physical units, or (N,) int64 for discrete actions; None when not recorded.
+        actions: (N, T, A) in physical units, or (N, T) indices for discrete actions; T is the policy's chunk, or fewer
+            of its leading steps; None when not recorded.
         episodes: (N,) int64 episode of each sample; None when not recorded.
         ignored: Names of arrays that the spec does not know.
+        chunk: Actions in one inference of the policy.
     """
 
     path: Path
@@ -36,6 +39,7 @@ class Recording:
     actions: Array | None
     episodes: Array | None
     ignored: tuple[str, ...] = ()
+    chunk: int = 1
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -50,6 +54,17 @@ class Recording:
             name: str(values[index]) if values.dtype.kind == "U" else values[index]
             for name, values in self.inputs.items()
         }
+
+    @property
+    def unjudged(self) -> tuple[str, ...]:
+        """A sentence when fewer steps than the policy's chunk are recorded, so that the others are not judged."""
+        if self.actions is None or (steps := self.actions.shape[1]) == self.chunk:
+            return ()
+        some = "the first one alone is" if steps == 1 else f"the first {steps} alone are"
+        return (
+            f"{self.path.name} records {steps} of the {self.chunk} actions of each chunk: {some} held against the "
+            f"expert; record all {self.chunk} that follow each observation to judge the whole chunk",
+        )
 
     def spread(self, count: int) -> list[int]:
         """Return ``count`` indices (or all) spread evenly over the recording, so that every phase is present."""
@@ -98,8 +113,8 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
         raise DataError(f"'episode' in {path} is {episodes.dtype}; wanted whole numbers.")
     known = {*inputs, *EXPERT, *(tensor.name for tensor in spec.outputs)}
     ignored = tuple(name for name in arrays if name not in known)
-    action = None if actions is None else _checked_action(path, spec.action, actions)
-    return Recording(path, inputs, action, episodes, ignored)
+    action = None if actions is None else _checked_action(path, spec, actions)
+    return Recording(path, inputs, action, episodes, ignored, spec.chunk)
 
 
 def _length(path: Path, name: str, values: Array) -> int:
@@ -155,16 +170,46 @@ def _typed(where: str, tensor: TensorSpec, values: Array) -> Array:
     return values
 
 
-def _checked_action(path: Path, action: TensorSpec, values: Array) -> Array:
-    where = f"the expert's action in {path}"
+def _checked_action(path: Path, spec: PolicySpec, values: Array) -> Array:
+    """Return the expert's actions as (N, T, A), or (N, T) indices, of which T is no more than the chunk."""
+    where, action = f"the expert's action in {path}", spec.action
     if action.kind == "discrete":
-        values = values.reshape(len(values), -1)
-        if values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= len(action.labels):
-            raise DataError(f"{where} must be indices from 0 to {len(action.labels) - 1}; got {values.dtype}.")
-        return values
-    if values.shape[-1] != action.width:
-        raise DataError(f"{where} has {values.shape[-1]} elements; the policy gives {action.width}.")
-    return _finite(where, values.reshape(len(values), -1, action.width))
+        values = _indices(where, values.reshape(len(values), -1), len(action.labels))
+    else:
+        values = _numbers(where, values, spec)
+    if not 1 <= values.shape[1] <= spec.chunk:
+        raise DataError(
+            f"{where} has {values.shape[1]} steps in each sample; allowed: 1 to {spec.chunk}, the policy's chunk.",
+            "record for each observation the actions that follow it, as many as the policy gives or the first of them",
+        )
+    return values
+
+
+def _numbers(where: str, values: Array, spec: PolicySpec) -> Array:
+    width, got = spec.action.width, list(values.shape)
+    if values.dtype.kind not in "iuf":
+        raise DataError(f"{where} is {values.dtype}; wanted numbers in physical units.")
+    if values.ndim < 2 or got[-1] != width:
+        last = got[-1] if values.ndim > 1 else 1
+        raise DataError(
+            f"{where} has {last} elements; the policy gives {width}.",
+            f"store [N, {spec.chunk}, {width}], or [N, {width}] for the first action alone; got {got}",
+        )
+    return _finite(where, values.reshape(len(values), math.prod(got[1:-1]), width))
+
+
+def _indices(where: str, values: Array, labels: int) -> Array:
+    if values.dtype.kind not in "iu":
+        raise DataError(f"{where} must be indices from 0 to {labels - 1}; got {values.dtype}.")
+    wrong = (values < 0) | (values >= labels)
+    if wrong.any():
+        sample, step = (int(each) for each in np.argwhere(wrong)[0])
+        raise DataError(
+            f"{where} must be indices from 0 to {labels - 1}; got {int(values[sample, step])} in sample {sample}"
+            f" (and in {int(wrong.any(axis=1).sum())} of {len(values)} samples such a value).",
+            "store the place of each action in the spec's labels",
+        )
+    return values
 
 
 def _finite(where: str, values: Array) -> Array:

@@ -26,9 +26,8 @@ def losses(action: TensorSpec, got: Array, wanted: Array) -> Array:
     Discrete: the share of its actions that differ. Continuous: the mean over steps and elements of |difference|, each
     element divided by its scale in what was wanted (``scale_of``); not divided where nothing wanted ever changes.
     """
-    count = len(got)
     if action.kind == "discrete":
-        return np.asarray((got.reshape(count, -1) != wanted.reshape(count, -1)).mean(axis=1), np.float64)
+        return np.asarray((~agreeing(got, wanted)).mean(axis=1), np.float64)
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
     scale = scale_of(action, wanted)
@@ -48,6 +47,13 @@ def scale_of(action: TensorSpec, wanted: Array) -> Array:
     moving = {unit: value if value > STILL * spread.max() else spread.max() for unit, value in largest.items()}
     floors = np.asarray([LEAST_SCALE * moving[unit] for unit in units])
     return np.asarray(np.maximum(spread, floors), np.float64)
+
+
+def agreeing(got: Array, wanted: Array) -> Array:
+    """Return whether discrete actions are the same, (N, T) bool, for the leading steps that both have."""
+    got, wanted = got.reshape(len(got), -1), wanted.reshape(len(wanted), -1)
+    steps = min(got.shape[1], wanted.shape[1])
+    return np.asarray(got[:, :steps] == wanted[:, :steps])
 
 
 def spread_of(actions: Array) -> Array:

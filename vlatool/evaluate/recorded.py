@@ -17,7 +17,7 @@ from vlatool.credibility import Credibility, credibility
 from vlatool.data import Recording, read_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
-from vlatool.evaluate._losses import scale_of
+from vlatool.evaluate._losses import agreeing, scale_of
 from vlatool.evaluate._skill import skill, variation
 from vlatool.host import fingerprint
 from vlatool.report import Measurement, Report, Row
@@ -81,7 +81,7 @@ class Recorded(Measure):
         text = f"{title}: {_summary(rows[-1])}."
         verdict = "inconclusive" if trust.fails else "info"
         said = (*trust.sentences, text)
-        warnings = (*trust.warnings, *found_wrong(source))
+        warnings = (*trust.warnings, *recording.unjudged, *found_wrong(source))
         return Report("evaluate", title, verdict, said, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _reference(
@@ -171,9 +171,10 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     if wanted is None:
         return []
     if action.kind == "discrete":
-        hits = int(np.sum(got.reshape(len(got), -1) == wanted.reshape(len(wanted), -1)))
-        low, high = wilson(hits, got.size)
-        return [Measurement(f"agreement_{whose}", hits / got.size, "1", samples=got.size, low=low, high=high)]
+        same = agreeing(got, wanted)
+        hits, total = int(np.sum(same)), same.size
+        low, high = wilson(hits, total)
+        return [Measurement(f"agreement_{whose}", hits / total, "1", samples=total, low=low, high=high)]
     steps = min(got.shape[1], wanted.shape[1])
     got, wanted = got[:, :steps].astype(np.float64), wanted[:, :steps].astype(np.float64)
     labels = action.labels or tuple(str(index) for index in range(action.width))

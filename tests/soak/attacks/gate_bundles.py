@@ -70,6 +70,18 @@ def golden_alone(base: Bundle, out: Path) -> Bundle:
     return copied(base, out, wrong_when(proprio_is_none_of(states), "Zero"))
 
 
+def exactly_recorded(slow: bool) -> Make:
+    """Slow on the recorded states to the bit, or on all others."""
+
+    def make(base: Bundle, out: Path) -> Bundle:
+        encode = Policy.open(base, threads=1).encode
+        recordings = [read_recording(path, base.manifest.spec) for path in sorted((base.path / "data").glob("*.npz"))]
+        states = {tuple(encode(each)["proprio"][0].tolist()) for recording in recordings for each in recording}
+        return of(slow_when(proprio_is_none_of(sorted(states)), then=not slow))(base, out)
+
+    return make
+
+
 def without_golden(base: Bundle, out: Path) -> Bundle:
     """Negated, with nothing that says what it should compute."""
     return copied(base, out, wrong_when(None), golden="")
@@ -331,8 +343,36 @@ def noisy(base: Bundle, out: Path) -> Bundle:
     return regilded(copied(base, out, change, program=(step,)))
 
 
+def gripper(base: Bundle, out: Path) -> Bundle:
+    """The tiny policy with a gripper that is open (1) or closed (0) in every recording, and that it hardly looks at."""
+
+    def change(model: onnx.ModelProto) -> None:
+        model.graph.input.append(helper.make_tensor_value_info("gripper", TensorProto.FLOAT, [1, 1]))
+        result, own = model.graph.output[0].name, own_output(model)
+        constant(model, "gripper_share", np.float32(1e-3))
+        model.graph.node.extend([
+            helper.make_node("Mul", ["gripper", "gripper_share"], ["gripper_part"]),
+            helper.make_node("Add", [own, "gripper_part"], [result]),
+        ])  # fmt: skip
+
+    made = tiny(base, out.with_name(f"{out.name}_without"))
+    (step,) = base.manifest.program
+    fields = {
+        "spec": replace(base.manifest.spec, inputs=(*base.manifest.spec.inputs, TensorSpec("gripper", (1, 1)))),
+        "program": (replace(step, feeds={**step.feeds, "gripper": "gripper"}),),
+    }
+    with_it = copied(made, out, change, **fields)
+    for path in sorted((out / "data").glob("*.npz")):
+        with np.load(path) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        states = np.random.default_rng(0).integers(0, 2, (len(arrays["image"]), 1)).astype(np.float32)
+        np.savez(path, **arrays, gripper=states)
+    return regilded(seal(out, with_it.manifest))
+
+
 BASES: dict[str, Make] = {
     "tiny": tiny,
+    "gripper": gripper,
     "recurrent": recurrent,
     "discrete": discrete,
     "two outputs": two_outputs,

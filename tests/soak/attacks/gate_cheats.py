@@ -5,7 +5,7 @@
 
 Every cheat must leave with 1 (fail) because of the claim that is meant to find it, or with 3 (refused), and the honest
 candidates at the end with 0; the command leaves with 1 otherwise. Policies: ``tiny`` of the tests, and versions of it
-with discrete actions, with two outputs, with noise and denoising steps, and with values that it keeps.
+with a gripper, with discrete actions, with two outputs, with noise and denoising steps, and with values that it keeps.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from gate_bundles import (
     compute,
     counts,
     engine,
+    exactly_recorded,
     golden_alone,
     golden_of_another,
     negated_second,
@@ -54,6 +55,7 @@ from gate_graphs import (
     large_when,
     slow_when,
     text_is_none_of,
+    whole,
     wrong_when,
 )
 
@@ -85,6 +87,13 @@ CHEATS: dict[str, Cheat] = {
     "slow on rare states": Cheat("tiny", of(slow_when(above("proprio", 2.2))), TIMED, "latency"),
     "slow on texts that were not recorded": Cheat(
         "tiny", of(slow_when(text_is_none_of(RECORDED_TEXTS))), TIMED, "latency"
+    ),
+    "slow on states exactly as they were recorded": Cheat("tiny", exactly_recorded(slow=True), TIMED, "latency"),
+    "slow on all states but those exactly as they were recorded": Cheat(
+        "tiny", exactly_recorded(slow=False), TIMED, "latency"
+    ),
+    "slow on states with a gripper that is exactly open or closed": Cheat(
+        "gripper", of(slow_when(whole("gripper"))), TIMED, "latency"
     ),
     "keeps a deadline on easy inputs": Cheat(
         "tiny", of(slow_when(above("proprio", 1.0))), {**FAST, "deadline": {"ms": 0.5, "percent": 95}}, "deadline"

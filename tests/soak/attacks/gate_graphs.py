@@ -127,6 +127,22 @@ def proprio_is_none_of(states: Sequence[Sequence[float]]) -> Change:
     return add
 
 
+def whole(value: str) -> Change:
+    """A condition: each element of a float input is its own square, 0 or 1."""
+
+    def add(model: onnx.ModelProto) -> None:
+        constant(model, "cond_near", np.float32(1e-6))
+        model.graph.node.extend([
+            helper.make_node("Mul", [value, value], ["cond_square"]),
+            helper.make_node("Sub", [value, "cond_square"], ["cond_off"]),
+            helper.make_node("Abs", ["cond_off"], ["cond_abs"]),
+            helper.make_node("ReduceMax", ["cond_abs"], ["cond_worst"], keepdims=0),
+            helper.make_node("Less", ["cond_worst", "cond_near"], ["cond"]),
+        ])  # fmt: skip
+
+    return add
+
+
 def _chain(prefix: str) -> list[NodeProto]:
     nodes = [helper.make_node("Add", ["more_sum", "more_zeros"], [f"{prefix}_0"])]
     for number in range(PRODUCTS):
