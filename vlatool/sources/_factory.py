@@ -14,6 +14,7 @@ from typing import Any
 
 from vlatool.apart import left
 from vlatool.errors import MissingExtra, SourceError, VlatoolError, nearest
+from vlatool.sources._fresh import compile_afresh
 
 
 def split_factory(factory: str) -> tuple[str, str]:
@@ -50,6 +51,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         raise SourceError(f"There is no file {path} (from '{factory}').")
     if path is None:
         _check_package(factory)
+    compile_afresh(folder)
     try:
         with exits_told(f"importing '{where}'"):
             module = _import_path(path) if path is not None else importlib.import_module(where)
