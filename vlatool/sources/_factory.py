@@ -110,7 +110,8 @@ def exits_told(what: str) -> Iterator[None]:
     except (InputError, MissingExtra, KeyboardInterrupt):
         raise
     except VlatoolError as error:
-        raise SourceError(f"{about} raised {type(error).__name__}: {message_of(error)}.") from error
+        told = message_of(error).partition("\n")[0].rstrip(".")
+        raise SourceError(f"{about} raised {type(error).__name__}: {told}.") from error
     except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything
