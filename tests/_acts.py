@@ -10,6 +10,30 @@ ENDS = {
     "raise": ("raise type('Stop', (BaseException,), {})('enough')", "raised Stop: enough"),
 }
 """Name -> statement that ends the process, and a part of the message."""
+SAY = """\
+import os, stat
+for fd in map(int, os.listdir("/proc/self/fd")):
+    try:
+        if stat.S_ISSOCK(os.fstat(fd).st_mode): os.write(fd, {line!r})
+    except OSError:
+        pass
+"""
+NONSENSE = "answered nonsense"
+FORGES = {
+    "mute": ("class X(Exception):\n    def __str__(self): raise ValueError()\nraise X()", "its text cannot be told"),
+    "mute base": ("class X(BaseException):\n    def __str__(self): raise ValueError()\nraise X()", "raised X"),
+    "verdict": ("import vlatool.errors as e; raise e.GateFailed('slow', '')", "raised GateFailed: slow"),
+    "base": ("import vlatool.errors as e; raise e.VlatoolError('x', 'y')", "raised VlatoolError: x"),
+    "pipe": ("raise BrokenPipeError(32, 'x')", "BrokenPipeError"),
+    "progress_bad_args": (SAY.format(line=b'{"progress": [1, 2, 3, 4]}\n'), NONSENSE),
+    "progress_int": (SAY.format(line=b'{"progress": 3}\n'), NONSENSE),
+    "deep_json": (SAY.format(line=b"[" * 50_000 + b"\n"), NONSENSE),
+    "error_vlatool": (SAY.format(line=b'{"error": "VlatoolError", "message": "x", "fix": ""}\n'), "VlatoolError: x"),
+    "gate": (SAY.format(line=b'{"error": "GateFailed", "message": "x", "fix": ""}\n'), "failed: GateFailed: x"),
+    "ours": (SAY.format(line=b'{"raised": "X", "message": "m", "ours": true}\n'), "failed: X: m"),
+    "broken pipe": (SAY.format(line=b'{"errno": 32, "message": "x", "file": null}\n'), NONSENSE),
+}
+"""Name -> statements that pretend to be vlatool, or have no words, and a part of the message."""
 DISTURBS = """\
 import os, signal, sys, threading, time
 print("printed by the policy")

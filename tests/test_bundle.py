@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from vlatool.bundle import DIGEST, LOCATION, Bundle, _digest, digest_of, hash_file, manifest_bytes, seal
+from vlatool.bundle import DIGEST, LOCATION, Bundle, _digest, digest_of, hash_file, manifest_bytes, seal, write_manifest
 from vlatool.errors import BundleError
-from vlatool.manifest import Graph, Manifest, single_graph
+from vlatool.manifest import FileRecord, Graph, Manifest, single_graph
 from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.written import LEDGER
 
 MANIFEST = Manifest("tiny", "1.0.0", PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0))
 
@@ -228,6 +229,44 @@ def test_what_is_written_about_a_bundle_and_what_desktops_leave_is_no_part_of_it
         (bundle.path / name).touch()
     assert Bundle.open(bundle.path) == bundle
     assert seal(bundle.path, MANIFEST).manifest.files == bundle.manifest.files
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["reports", "reports/report.html", "reports/deep/er", "recipe.yaml", "SIGNATURE", "graphs/.DS_Store", LEDGER],
+)
+def test_no_free_name_is_a_link(tmp_path: Path, bundle, name):
+    (tmp_path / "victim").mkdir()
+    (bundle.path / name).parent.mkdir(parents=True, exist_ok=True)
+    (bundle.path / name).symlink_to(tmp_path / "victim")
+    with pytest.raises(BundleError, match=rf"holds {name}, which is a link"):
+        Bundle.open(bundle.path)
+
+
+@pytest.mark.parametrize("name", ["recipe.yaml/x.py", "graphs/.DS_Store/x.py", "SIGNATURE/x.py"])
+def test_a_directory_of_a_free_name_hides_nothing(bundle, name):
+    (bundle.path / name).parent.mkdir(parents=True)
+    (bundle.path / name).touch()
+    with pytest.raises(BundleError, match=rf"holds {name}, which its manifest does not record"):
+        Bundle.open(bundle.path)
+
+
+def test_a_pipe_in_the_reports_is_refused(bundle):
+    (bundle.path / "reports").mkdir()
+    os.mkfifo(bundle.path / "reports/report.html")
+    with pytest.raises(BundleError, match=r"holds reports/report.html"):
+        Bundle.open(bundle.path)
+
+
+def test_more_bytes_than_a_bundle_may_have_are_refused_before_one_is_read(bundle):
+    size = 1 << 43
+    (bundle.path / "graphs/z.bin").touch()
+    os.truncate(bundle.path / "graphs/z.bin", size)
+    records = {**bundle.manifest.files, "graphs/z.bin": FileRecord("0" * 64, size)}
+    write_manifest(bundle.path, replace(bundle.manifest, files=records))
+    with pytest.raises(BundleError, match=rf"has {size + 702} bytes; the limit 'bundle_bytes' allows") as caught:
+        Bundle.open(bundle.path)
+    assert f"VLATOOL_LIMITS=bundle_bytes={size + 702}" in caught.value.fix
 
 
 def test_a_linked_directory_is_refused_at_every_level(tmp_path: Path, bundle):

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import OutputError
-from vlatool.outputs import refuse_inputs, refuse_replacing
+from vlatool.outputs import BUNDLE, REPORT, kind_of, refuse_inputs, refuse_replacing
 from vlatool.writing import writing
 
 
@@ -89,3 +89,46 @@ def test_a_directory_that_holds_an_input_file_is_never_the_output(tmp_path: Path
 def test_a_name_that_is_no_file_is_no_input(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refuse_inputs(Path("raspberry-pi-5"), ["raspberry-pi-5", "", None])
+
+
+CONTENT = {BUNDLE: ("manifest.json", "manifest.sha256"), REPORT: ("report.json", "report.html"), "": ("policy.py",)}
+
+
+def written(place: Path, kind: str) -> Path:
+    with writing(place, force=True) as draft:
+        for name in CONTENT[kind]:
+            (draft / name).write_text(kind)
+    return place
+
+
+@pytest.mark.parametrize(
+    ("there", "new", "says"),
+    [
+        (BUNDLE, REPORT, "it is a bundle, not a report"), (REPORT, BUNDLE, "it is a report, not a bundle"),
+        (BUNDLE, "", "it is a bundle and nothing of that is to be"), (REPORT, "", "it is a report and nothing of that"),
+    ],
+)  # fmt: skip
+def test_one_kind_does_not_replace_another(tmp_path: Path, there: str, new: str, says: str):
+    place = written(tmp_path / "out", there)
+    with pytest.raises(OutputError, match=says) as caught:
+        refuse_replacing(place, force=True, kind=new)
+    assert "give another -o" in caught.value.fix
+    with pytest.raises(OutputError, match=says):
+        written(place, new)
+    assert kind_of(place) == there
+    assert [each.name for each in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("kind", CONTENT)
+def test_each_kind_replaces_itself(tmp_path: Path, kind: str):
+    place = written(tmp_path / "out", kind)
+    refuse_replacing(place, force=True, kind=kind)
+    assert kind_of(written(place, kind)) == kind
+
+
+def test_a_bundle_with_reports_in_it_is_a_bundle(tmp_path: Path):
+    place = written(tmp_path / "out", BUNDLE)
+    for name in ("report.json", "reports/report.json"):
+        (place / name).parent.mkdir(exist_ok=True)
+        (place / name).touch()
+    assert kind_of(place) == BUNDLE

@@ -1,6 +1,6 @@
 import pytest
 
-from vlatool.printable import one_line, printable
+from vlatool.printable import message_of, one_line, printable
 
 
 @pytest.mark.parametrize(
@@ -19,3 +19,14 @@ def test_what_moves_the_cursor_or_hides_text_is_written_out(text: str, shown: st
 def test_a_line_is_one_line_of_a_bounded_length() -> None:
     assert one_line(" a\n\n b\t\x1b") == "a b \\x1b"
     assert len(one_line("x " * 10_000, 50)) == 50
+
+
+class _Mute(Exception):
+    def __str__(self) -> str:
+        raise ValueError("no")
+
+
+def test_an_exception_without_a_text_is_told():
+    assert message_of(ValueError("a")) == "a"
+    assert message_of(ValueError("\udcff")) == "?"
+    assert message_of(_Mute()) == "(its text cannot be told: ValueError)"

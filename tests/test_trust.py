@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
+import py_compile
 import shutil
 import stat
 from dataclasses import replace
@@ -225,7 +227,7 @@ def test_the_hash_is_of_all_that_may_hold_code(tmp_path: Path, monkeypatch: pyte
     assert len(hashes) == 5
     (tmp_path / "data.npz").write_text("any")
     (tmp_path / "__pycache__").mkdir()
-    (tmp_path / "__pycache__/a.pyc").write_text("any")
+    (tmp_path / "__pycache__/a.cpython-311.pyc").write_text("any")
     assert trust.content(tmp_path) in hashes
     os.rename(tmp_path / "a.py", tmp_path / "z.py")
     assert trust.content(tmp_path) not in hashes
@@ -245,3 +247,109 @@ def test_trust_of_a_copy_is_asked_again(vlatool, mine, bundle, tmp_path: Path) -
     (bundle.path / LOCATION).write_text(json.dumps({"folder": str(moved)}))
     assert vlatool("export", bundle.path, "-o", tmp_path / "out")[0] == 3
     assert not ran(moved)
+
+
+ENVIRONMENT_THAT_IMPORTS = """\
+import importlib.util, os, subprocess, sys
+here = os.path.dirname(__file__)
+sys.path[:0] = [os.path.join(here, "lib"), os.path.realpath(os.path.join(here, "away"))]
+import helper, linked, distant
+spec = importlib.util.spec_from_file_location("loaded", os.path.join(here, "loaded.py"))
+spec.loader.exec_module(importlib.util.module_from_spec(spec))
+subprocess.run([sys.executable, "-c", "import child"], cwd=here, check=True)
+"""
+MODULES = {"helper": "", "loaded": "", "child": "", "linked": "lib", "distant": "away"}
+
+
+@pytest.fixture
+def linking(mine: Path, tmp_path: Path) -> Path:
+    """A policy whose environment imports its neighbours in every way, two of them behind links to directories."""
+    for name, place in MODULES.items():
+        folder = tmp_path / f"beside-{place}" if place else mine
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.py").write_text("X = 1\n")
+        if place:
+            (mine / place).symlink_to(folder)
+    file = mine / "environment.py"
+    file.write_text(file.read_text().replace("import numpy", ENVIRONMENT_THAT_IMPORTS + "import numpy", 1))
+    assert "import helper" in file.read_text()
+    return mine
+
+
+def test_bytecode_beside_a_trusted_policy_is_not_run(
+    vlatool, linking: Path, float_bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(linking)
+    episodes = ("evaluate", "closed-loop", float_bundle.path, "--episodes", 2)
+    status, _, err = vlatool(*episodes, "--trust", linking)
+    assert status == 0, err
+    evil, mark = tmp_path / "evil.py", tmp_path / "ran"
+    for name, place in MODULES.items():
+        evil.write_text(f"open({str(mark)!r}, 'a').write({name!r} + ' ')\nX = 1\n")
+        cache = importlib.util.cache_from_source(str((linking / place).resolve() / f"{name}.py"))
+        for target in {cache, importlib.util.cache_from_source(str(linking / place / f"{name}.py"))}:
+            Path(target).parent.mkdir(exist_ok=True)
+            py_compile.compile(
+                str(evil), cfile=target, doraise=True, invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH
+            )
+    (linking / "ran").unlink()
+    status, _, err = vlatool(*episodes)
+    assert status == 0, err
+    assert ran(linking)
+    assert not mark.exists(), mark.read_text()
+    status, _, err = vlatool(*episodes, "--policy", linking)
+    assert status == 0, err
+    assert not {"helper", "loaded", "linked"} & set(mark.read_text().split() if mark.exists() else ())
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["lib/linked.py", "sourceless.pyc", "__pycache__/sourceless.pyc", "__pycache__/new.py", ".venv/lib/a.py",
+     "node_modules/a.js", "lib/new.so"],
+)  # fmt: skip
+def test_all_that_can_be_imported_is_in_the_hash(linking: Path, name: str) -> None:
+    before = trust.content(linking)
+    (linking / name).parent.mkdir(parents=True, exist_ok=True)
+    (linking / name).write_bytes(b"X = 2")
+    assert trust.content(linking) != before
+
+
+def test_what_python_caches_is_not_in_the_hash(linking: Path) -> None:
+    before = trust.content(linking)
+    (linking / "__pycache__").mkdir(exist_ok=True)
+    (linking / "__pycache__/helper.cpython-399.opt-1.pyc").write_bytes(b"X = 2")
+    (linking / ".git").mkdir()
+    (linking / ".git/index").write_bytes(b"X = 2")
+    assert trust.content(linking) == before
+
+
+def test_links_in_a_circle_end_and_where_they_lead_is_in_the_hash(linking: Path, tmp_path: Path) -> None:
+    (linking / "a").mkdir()
+    (linking / "b").mkdir()
+    (linking / "circle").symlink_to(linking)
+    (linking / "turn").symlink_to("a")
+    before = trust.content(linking)
+    (linking / "turn").unlink()
+    (linking / "turn").symlink_to("b")
+    assert trust.content(linking) != before
+
+
+def test_a_folder_of_too_many_files_is_not_trusted(linking: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trust, "MOST_FILES", 20)
+    (linking / ".venv").mkdir()
+    for number in range(20):
+        (linking / f".venv/{number}.py").touch()
+    with pytest.raises(UsageError, match="more than 20 files, too many to trust") as caught:
+        trust.trust(linking)
+    assert "name a smaller directory" in caught.value.fix
+
+
+def test_a_folder_that_cannot_be_read_is_not_trusted(linking: Path) -> None:
+    (linking / "unreadable").symlink_to("unreadable")
+    trust.content(linking)  # a link to nowhere is no file
+    (linking / "closed.py").write_text("")
+    (linking / "closed.py").chmod(0)
+    if os.access(linking / "closed.py", os.R_OK):
+        pytest.skip("this user may read everything")
+    with pytest.raises(UsageError, match=r"closed.py cannot be read"):
+        trust.content(linking)

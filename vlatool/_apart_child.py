@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import gc
 import importlib
 import json
@@ -22,7 +23,9 @@ from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 from vlatool import trust
+from vlatool._apart_answers import ENDINGS
 from vlatool.errors import VlatoolError
+from vlatool.printable import message_of
 from vlatool.processes import die_with_parent
 
 FDS = 3
@@ -143,13 +146,14 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
     try:
         return {"result": _function(request["call"])(request["job"], tell)}
     except VlatoolError as error:
-        return {"error": type(error).__name__, "message": error.message, "fix": error.fix}
+        return {"error": type(error).__name__, "message": str(error.message), "fix": str(error.fix)}
     except MemoryError:
         return {"memory": True}
     except OSError as error:
-        if error.errno is None:
+        if error.errno not in errno.errorcode or error.errno in ENDINGS:
             return _raised(error)
-        return {"errno": error.errno, "message": error.strerror, "file": error.filename and str(error.filename)}
+        named = None if error.filename is None else str(error.filename)
+        return {"errno": error.errno, "message": str(error.strerror), "file": named}
     except BaseException as error:  # the seam: a user's code may raise anything
         return _raised(error)
 
@@ -157,7 +161,7 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
 def _raised(error: BaseException) -> dict[str, Any]:
     if os.environ.get("VLATOOL_DEBUG"):
         traceback.print_exc()
-    told = str(error).strip().splitlines()
+    told = message_of(error).strip().splitlines()
     return {"raised": type(error).__name__, "message": told[0] if told else "", "ours": isinstance(error, Exception)}
 
 

@@ -12,20 +12,19 @@ import contextlib
 import json
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
 import threading
-import unicodedata
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from typing import Any
 
-from vlatool import errors, trust
-from vlatool.errors import SourceError, VlatoolError
+from vlatool import trust
+from vlatool._apart_answers import ended, plain, read, result
+from vlatool.errors import SourceError
 from vlatool.processes import SINGLE, import_path, python_command
 
 Tell = Callable[[str, float | None], None]
@@ -146,12 +145,12 @@ class Apart:
         while True:
             for line in self._lines():
                 if "progress" in line:
-                    tell(*line["progress"])
+                    tell(plain(line["progress"][0]), line["progress"][1])
                 elif "warning" in line:
                     warnings.warn(str(line["warning"]), UserWarning, stacklevel=2)
                 else:
                     self._print()
-                    return _result(line, self.about)
+                    return result(line, self.about)
 
     def _send(self, line: Mapping[str, Any]) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # how it ended is found by reading
@@ -166,10 +165,10 @@ class Apart:
             self._receive()
         *whole, self._received = self._received.split(b"\n")
         if whole:
-            return [_read(line, self.about) for line in whole]
+            return [read(line, self.about) for line in whole]
         if self._status in ready and not (self._talk in self._open and self._receive()):
             self._print(last=True)
-            raise _ended(_received(self._status), self.about)
+            raise ended(_received(self._status), self.about)
         if not ready:
             raise SourceError(f"{self.about} closed what its process answers with.", "let it close its own files alone")
         return []
@@ -267,72 +266,9 @@ class _Said:
             sys.stderr.flush()
 
 
-def plain(text: str) -> str:
-    """Return a text without what would steer a terminal."""
-    return "".join(each if unicodedata.category(each)[0] != "C" else " " for each in text).rstrip()
-
-
 def _received(stream: socket.socket) -> bytes:
     """Return what there is to read, nothing at the end."""
     try:
         return stream.recv(BLOCK, socket.MSG_DONTWAIT)
     except (BlockingIOError, ConnectionResetError):
         return b""
-
-
-def _read(line: bytes, about: str) -> dict[str, Any]:
-    try:
-        return dict(json.loads(line))
-    except (ValueError, TypeError) as error:
-        raise SourceError(f"{about}: the process that runs it answers what is no answer.") from error
-
-
-def _result(line: Mapping[str, Any], about: str) -> Any:
-    """Return the result that a line holds, or raise what it says that was raised."""
-    if "result" in line:
-        return line["result"]
-    told = plain(str(line.get("message", "")))
-    if "error" in line:
-        kind = getattr(errors, str(line["error"]), SourceError)
-        typed = isinstance(kind, type) and issubclass(kind, VlatoolError)
-        raise (kind if typed else SourceError)(str(line.get("message", "")), str(line.get("fix", "")))
-    if line.get("memory"):
-        raise MemoryError
-    if "errno" in line:
-        raise OSError(line["errno"], told, line.get("file"))
-    name = str(line.get("raised", "nothing that is known"))
-    if line.get("ours"):
-        raise RuntimeError(f"{name}: {told}")
-    raise left(about, name, told)
-
-
-def left(about: str, name: str, told: str) -> SourceError:
-    """Return the error for code that raises what is no ``Exception``."""
-    if name == "SystemExit":
-        return SourceError(f"{about} called sys.exit({told}).", "raise an exception that says what is wrong instead")
-    return SourceError(f"{about} raised {name}{told and ': '}{told}.", "raise an Exception that says what is wrong")
-
-
-def _ended(status: bytes, about: str) -> BaseException:
-    """Return the error of a child that ended without an answer."""
-    text = status.decode("ascii", "replace").strip()
-    if not text.lstrip("-").isdigit():
-        return SourceError(f"{about}: the process that ran it was lost.", "run the command again")
-    code = int(text)
-    if code == -signal.SIGINT:
-        return KeyboardInterrupt()
-    if code >= 0:
-        return SourceError(
-            f"{about} ended its process with exit code {code} before it was done (os._exit, or a library's exit).",
-            "let it raise an exception that says what is wrong instead",
-        )
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = f"signal {-code}"
-    if code == -signal.SIGKILL:
-        return SourceError(
-            f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
-            "where memory ran out, use a machine with more of it",
-        )
-    return SourceError(f"{about} crashed its process ({name}) before it was done.", "look for a library that crashes")

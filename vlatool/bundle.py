@@ -22,7 +22,8 @@ MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
 """The SHA-256 of the manifest, as ``sha256sum`` writes it: what protects everything that the manifest says."""
 LOCATION = "location.json"
-UNRECORDED = ("reports", "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
+REPORTS = "reports"
+UNRECORDED = (REPORTS, "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
 """Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
 ASSETS = "assets"
 
@@ -67,7 +68,9 @@ class Bundle:
             SpecError: for an impossible spec or program.
         """
         root = Path(path)
-        return cls(root, Manifest.from_dict(_read_manifest(root)))
+        bundle = cls(root, Manifest.from_dict(_read_manifest(root)))
+        check("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
+        return bundle
 
     def verify(self, prefix: str = "") -> None:
         """Check every file that was not verified by reading it, and that nothing else is there.
@@ -90,13 +93,15 @@ class Bundle:
         """
         check_files(self.manifest)
         try:
-            stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED)
+            stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
         except OSError as error:
             raise BundleError(f"{self.path} cannot be read: {error.strerror}.") from error
+        if stranger and (self.path / stranger).is_symlink():
+            raise BundleError(f"The bundle {self.path} holds {stranger}, which is a link; a bundle has none.", FIX)
         if stranger:
             raise BundleError(
                 f"The bundle {self.path} holds {stranger}, which its manifest does not record.",
-                f"remove it, or put it into {self.path / 'reports'}; or copy or export the bundle again",
+                f"remove it, or put it into {self.path / REPORTS}; or copy or export the bundle again",
             )
 
     def read(self, name: str, allowed: str = "") -> bytes:

@@ -33,6 +33,7 @@ class Limit:
 LIMITS = {
     "manifest_bytes": Limit(4 * MIB, "bytes", "manifest.json"),
     "files": Limit(10_000, "files", "files of a bundle"),
+    "bundle_bytes": Limit(64 * GIB, "bytes", "all recorded files of a bundle together"),
     "graphs": Limit(256, "graphs", "graphs of a bundle"),
     "json_depth": Limit(64, "levels", "lists and mappings inside each other in a JSON file"),
     "graph_depth": Limit(100, "levels", "messages inside each other in a graph (a subgraph takes three)"),
@@ -43,6 +44,8 @@ LIMITS = {
     "arrays": Limit(4096, "arrays", "arrays in one .npz file"),
     "statistics_bytes": Limit(16 * MIB, "bytes", "a file of normalisation statistics"),
     "tokenizer_bytes": Limit(64 * MIB, "bytes", "a tokenizer or vocabulary"),
+    "tokenizer_growth": Limit(10_000, "characters", "what a tokenizer may make of one character of a text"),
+    "text_characters": Limit(1 << 22, "characters", "a text, as its tokenizer may lengthen it"),
     "elements": Limit(1 << 26, "elements", "one value of a program, or one input or output of a spec"),
     "state_elements": Limit(1 << 27, "elements", "all noise and kept values of a program together"),
     "tokens": Limit(1 << 20, "tokens", "the ids of one text"),

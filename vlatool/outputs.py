@@ -14,16 +14,28 @@ from vlatool.written import LEDGER, refuse_foreign
 RECIPE = "recipe.yaml"
 WRITTEN = (LEDGER, "manifest.json", "report.json")
 """Names that tell of a directory which a program wrote: another file in it would make it another one."""
+BUNDLE, REPORT = "a bundle", "a report"
+KINDS = {BUNDLE: ("manifest.json", "manifest.sha256"), REPORT: ("report.json",)}
+"""What a directory that vlatool wrote is -> the files that all of its kind hold; the first that fits it is."""
 EXISTS = "choose another output, or pass --force to replace it"
 
 
-def refuse_replacing(final: Path, *, force: bool, further: Mapping[str, Path] | None = None) -> None:
+def kind_of(directory: Path) -> str:
+    """Return what a directory that vlatool wrote is: ``BUNDLE``, ``REPORT``, or nothing for all others."""
+    fits = (kind for kind, names in KINDS.items() if all((directory / name).is_file() for name in names))
+    return next(fits, "")
+
+
+def refuse_replacing(
+    final: Path, *, force: bool, further: Mapping[str, Path] | None = None, kind: str | None = None
+) -> None:
     """Refuse a place where something is that may not be replaced.
 
     Args:
         final: Where a directory is to be written.
         force: Whether a directory that vlatool wrote may be replaced.
         further: Directories that are never replaced, beside the current and the home directory, by what they are.
+        kind: What is to be written, as ``kind_of`` says it; None where that is not known yet.
 
     Raises:
         OutputError: naming what is in the way.
@@ -42,6 +54,10 @@ def refuse_replacing(final: Path, *, force: bool, further: Mapping[str, Path] | 
         raise OutputError(f"{final} is no directory, so --force does not replace it.", "choose another output")
     if os.path.ismount(final):
         raise OutputError(f"{final} is a file system of its own.", "name a directory on it")
+    there = kind_of(final)
+    if kind is not None and there and there != kind:
+        wanted = f", not {kind}" if kind else " and nothing of that is to be written"
+        raise OutputError(f"{final}: it is {there}{wanted}.", "give another -o, or remove it yourself")
     refuse_foreign(final)
 
 

@@ -26,6 +26,16 @@ def one_line(text: str, longest: int = 400) -> str:
     return " ".join(printable(text[: 4 * longest]).split())[:longest]
 
 
+def message_of(error: BaseException) -> str:
+    """Return the text of an exception of somebody else's class, which may fail to have one."""
+    try:
+        return str(error).encode("utf-8", "replace").decode()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as another:  # the seam: it is code of the user
+        return f"(its text cannot be told: {type(another).__name__})"
+
+
 def _written(character: str) -> str:
     if character in KEPT or unicodedata.category(character) not in HIDDEN:
         return character

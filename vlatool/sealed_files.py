@@ -138,13 +138,14 @@ def open_folder(root: Path, folder: str) -> Iterator[int]:
         os.close(handle)
 
 
-def unlisted(root: Path, listed: set[str], free: tuple[str, ...]) -> str:
+def unlisted(root: Path, listed: set[str], free: tuple[str, ...], folder: str) -> str:
     """Return a file, link or other thing below ``root`` that is not listed, or nothing.
 
     Args:
         root: The directory.
         listed: Relative paths that may be there.
-        free: Names at the top that may be there with whatever is in them.
+        free: Names at the top of regular files that may be there as well.
+        folder: A directory at the top that may hold regular files and directories of any name.
     """
     pending, seen = [""], 0
     while pending:
@@ -153,12 +154,17 @@ def unlisted(root: Path, listed: set[str], free: tuple[str, ...]) -> str:
             for entry in entries:
                 name = f"{inside}/{entry.name}" if inside else entry.name
                 seen += 1
-                if name in listed or entry.name in LITTER or (not inside and name in free):
-                    continue
-                if not entry.is_dir(follow_symlinks=False) or seen > 2 * limit("files"):
+                if seen > 2 * limit("files"):
                     return name
-                pending.append(name)
+                if entry.is_dir(follow_symlinks=False):
+                    pending.append(name)
+                elif name not in listed and not (entry.is_file(follow_symlinks=False) and _is_free(name, free, folder)):
+                    return name
     return ""
+
+
+def _is_free(name: str, free: tuple[str, ...], folder: str) -> bool:
+    return name in free or name.startswith(f"{folder}/") or name.rpartition("/")[2] in LITTER
 
 
 @contextlib.contextmanager

@@ -22,10 +22,13 @@ from vlatool.errors import OutputError, SourceError, UsageError
 
 PLACE = "VLATOOL_TRUST"
 SCHEMA = 1
-DATA = (".safetensors", ".npz", ".npy", ".onnx", ".pyc", ".png", ".jpg", ".mp4")
+DATA = (".safetensors", ".npz", ".npy", ".onnx", ".png", ".jpg", ".mp4")
 """Endings of files that hold no code, whatever reads them."""
-SKIPPED = ("__pycache__", ".git", ".venv", "node_modules")
+HISTORY = ".git"
+CACHE = "__pycache__"
+"""Where Python keeps ``module.TAG.pyc``: the policy's code is not read from there (``sources/_fresh.py``)."""
 MOST_FILES = 20_000
+SMALLER = "name a smaller directory"
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,11 @@ def name(folder: Path, description: Path | None = None, factory: str = "") -> No
     """Note that the user named a folder: code in it may run in this process."""
     where = str(folder.resolve())
     _named[where] = Named(where, str(description.resolve()) if description else "", factory)
+
+
+def is_named(folder: Path) -> bool:
+    """Say whether the user named a folder in this command."""
+    return str(folder.resolve()) in _named
 
 
 def named_so_far() -> list[list[Any]]:
@@ -129,24 +137,46 @@ def place() -> Path:
 
 
 def content(folder: Path) -> str:
-    """Return the hash of all files of a folder that could hold code: names and bytes.
+    """Return the hash of all files of a folder that could hold code: names and bytes; links are followed.
 
     Raises:
-        UsageError: when there are too many.
+        UsageError: when there are too many, or one cannot be read.
     """
     found = hashlib.sha256()
-    for count, path in enumerate(_files(folder)):
+    for count, (name, path) in enumerate(_files(folder)):
         if count >= MOST_FILES:
-            raise UsageError(f"{folder} has more than {MOST_FILES:,} files, too many to trust.", "name a smaller one")
-        found.update(json.dumps([path.relative_to(folder).as_posix(), hash_file(path)]).encode())
+            raise UsageError(
+                f"{folder} has more than {MOST_FILES:,} files, too many to trust.",
+                f"{SMALLER}; installed packages (.venv, node_modules) and data belong elsewhere",
+            )
+        try:
+            found.update(json.dumps([name, hash_file(path) if isinstance(path, Path) else f"is {path}"]).encode())
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER) from error
     return f"sha256:{found.hexdigest()}"
 
 
-def _files(folder: Path) -> Iterator[Path]:
-    for root, folders, names in os.walk(folder):
-        folders[:] = sorted(set(folders).difference(SKIPPED))
-        paths = (Path(root) / each for each in sorted(names))
-        yield from (path for path in paths if path.suffix not in DATA and path.is_file())
+def _files(folder: Path) -> Iterator[tuple[str, Path | str]]:
+    """Yield name and path of each file; for a directory that was seen before, the name under which it was."""
+    seen: dict[tuple[int, int], str] = {}
+
+    def unreadable(error: OSError) -> None:
+        raise UsageError(f"{error.filename} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER)
+
+    for root, folders, names in os.walk(folder, followlinks=True, onerror=unreadable):
+        here = Path(root).relative_to(folder)
+        about = os.stat(root)
+        first = seen.setdefault((about.st_dev, about.st_ino), here.as_posix())
+        if first != here.as_posix():
+            folders[:] = []
+            yield here.as_posix(), first
+            continue
+        folders[:] = sorted(set(folders) - {HISTORY})
+        for name in sorted(names):
+            path = Path(root, name)
+            cached = here.name == CACHE and name.endswith(".pyc") and name.count(".") > 1
+            if not cached and path.suffix not in DATA and path.is_file():
+                yield (here / name).as_posix(), path
 
 
 def _read() -> dict[str, str]:

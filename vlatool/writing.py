@@ -24,7 +24,7 @@ from pathlib import Path
 
 from vlatool.errors import OutputError
 from vlatool.moves import exchange, move_new
-from vlatool.outputs import output_errors, refuse_replacing
+from vlatool.outputs import kind_of, output_errors, refuse_replacing
 from vlatool.written import note, prune
 
 MARKER = "vlatool-draft.json"
@@ -189,7 +189,7 @@ def _move(draft: _Draft, final: Path, force: bool, damaged: bool) -> None:
             if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
                 raise
         if not damaged:
-            refuse_replacing(final, force=force)
+            refuse_replacing(final, force=force, kind=kind_of(draft.content))
         with contextlib.suppress(FileNotFoundError):  # another writer takes it away just now
             _replace(draft, final)
             break

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from _acts import DISTURBS, ENDS, POLICY_YAML, environment, policy
+from _acts import DISTURBS, ENDS, FORGES, POLICY_YAML, environment, policy
 
 from vlatool.cli import main
 
@@ -88,6 +88,27 @@ def test_no_command_takes_it_for_its_own_end(vlatool, folder, plain, tmp_path: P
     assert (status, out) == (3, "")
     assert "policy.py" in err
     assert re.search(says, err), err
+
+
+@pytest.mark.parametrize("act", FORGES)
+def test_what_a_policy_raises_or_forges_does_not_decide_the_exit_code(
+    vlatool, folder, tmp_path: Path, act: str
+) -> None:
+    code, says = FORGES[act]
+    status, out, err = vlatool("export", folder(in_make=code), "-o", tmp_path / "out", "--json")
+    assert (status, out) == (3, ""), err
+    assert re.search(says, err), err
+    assert "internal error" not in err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("where", ["in_make", "in_reset", "in_step"])
+@pytest.mark.parametrize("act", ["mute", "verdict", "ours"])
+def test_what_an_environment_raises_or_forges_does_not_either(vlatool, folder, plain, where: str, act: str) -> None:
+    line = ["evaluate", "closed-loop", plain, "--policy", folder({where: FORGES[act][0]}), "--episodes", 2]
+    status, out, err = vlatool(*line, "--workers", 1, "--json")
+    assert (status, out) == (3, ""), err
+    assert "internal error" not in err
 
 
 @pytest.mark.parametrize("where", ["at_import", "in_make", "in_reset", "in_step"])

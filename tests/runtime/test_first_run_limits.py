@@ -23,6 +23,12 @@ BILLION = """g (float[1,2] x) => (float[N,2] y) <int64[2] k = {800000000, 1}, in
 INNER = """g (float[1,2] x) => (float[1,2] y) <int64[2] s = {800000000, 1}, int64[1] a = {0}> {
     t = Expand(x, s)  u = Neg(t)  v = ReduceMax<keepdims = 1>(u, a)  y = Identity(v) }"""
 
+ONE_NODE = """g (float[1,2] x) => (float[1,2] y) <int64[4] s = {1, 1, 4096, 4096}, float z = {0}> {
+    big = ConstantOfShape(s)  m = ReduceMax<keepdims = 0>(x)  in = Add(big, m)
+    p = MaxPool<kernel_shape = [2047, 2047], strides = [1, 1]>(in)
+    q = ReduceMax<keepdims = 0>(p)  w = Mul(q, z)  y = Add(x, w) }"""
+"""One node that takes hours."""
+
 
 def test_a_graph_without_end_is_stopped(tmp_path: Path):
     bundle = written(tmp_path, ENDLESS, golden=GOLDEN)
@@ -122,6 +128,14 @@ def test_the_probe_says_what_a_good_bundle_needs(tmp_path: Path):
 def test_the_probe_stops_what_never_ends(tmp_path: Path, engine):
     with pytest.raises(GraphError, match=r"longer than 0\.5 s"):
         load(written(tmp_path, ENDLESS, golden=GOLDEN).path, engine=engine, threads=1, first_run_s=0.5, probe=True)
+
+
+def test_the_probe_kills_one_node_that_takes_hours(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("vlatool.runtime.probe.START_S", 4.0)
+    bundle = written(tmp_path, ONE_NODE, golden=GOLDEN)
+    with pytest.raises(GraphError, match=r"no first action after 5 s, so the process was ended") as caught:
+        load(bundle.path, threads=1, first_run_s=1, probe=True)
+    assert "first_run_s" in caught.value.fix
 
 
 @pytest.mark.parametrize("text", [BILLION, INNER], ids=["output", "inside"])

@@ -15,7 +15,7 @@ from vlatool.finish import save_npz
 from vlatool.manifest import Graph, Manifest, single_graph
 from vlatool.runtime import Policy, load
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
-from vlatool.runtime.policy import relative_error
+from vlatool.runtime.policy import refuse_findings, relative_error
 from vlatool.spec import PolicySpec, TensorSpec
 
 LOGITS = TensorSpec("logits", (1, 3), kind="discrete", labels=("left", "right", "forward"))
@@ -260,3 +260,12 @@ def test_an_unknown_word_warns_the_controller(float_bundle, observation):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         policy.infer({**observation, "instruction": "fetch"})
+
+
+def test_what_a_manifest_says_is_wrong_is_told_without_control_characters(float_bundle):
+    findings = ({"name": "\x1b[31mred", "message": "\x1b]0;title\x07 and \u202e"},)
+    wrong = Bundle(float_bundle.path, replace(float_bundle.manifest, findings=findings))
+    with pytest.raises(GraphError, match=r"\(\\x1b\[31mred\): \\x1b\]0;title\\x07 and \\u202e") as caught:
+        refuse_findings(wrong)
+    assert "\x1b" not in str(caught.value)
+    refuse_findings(wrong, ["\x1b[31mred"])

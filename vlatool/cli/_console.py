@@ -18,7 +18,7 @@ import typer
 
 from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.host import cache_directory
-from vlatool.outputs import refuse_inputs, refuse_replacing
+from vlatool.outputs import REPORT, refuse_inputs, refuse_replacing
 from vlatool.printable import one_line, printable
 from vlatool.report import Report
 from vlatool.stage import Context, Tell
@@ -115,13 +115,16 @@ def plain_warnings() -> Iterator[None]:
         warnings.showwarning = elsewhere
 
 
-def refuse_existing(out: Path | None, force: bool, *inputs: str | os.PathLike[str] | None) -> None:
+def refuse_existing(
+    out: Path | None, force: bool, *inputs: str | os.PathLike[str] | None, kind: str | None = REPORT
+) -> None:
     """Say before the work, not after it, that the output cannot be written.
 
     Args:
         out: The output, None when there is none.
         force: Whether what vlatool wrote there may be replaced.
         inputs: What the command reads.
+        kind: What is written: only the same is replaced (None: whatever is there).
 
     Raises:
         OutputError: when it is, holds or lies in an input, exists (and not ``force``), or is not vlatool's to replace.
@@ -129,7 +132,7 @@ def refuse_existing(out: Path | None, force: bool, *inputs: str | os.PathLike[st
     if out is None:
         return
     refuse_inputs(out, inputs)
-    refuse_replacing(out, force=force, further={"the cache": cache_directory()})
+    refuse_replacing(out, force=force, further={"the cache": cache_directory()}, kind=kind)
     if not os.path.lexists(out):
         _refuse_unwritable(out)
 

@@ -15,6 +15,7 @@ from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.launch import cache_directory, run_transform
+from vlatool.outputs import BUNDLE
 from vlatool.report import Report
 from vlatool.stage import Context, Measure, Stage, Transform
 
@@ -67,7 +68,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     from vlatool.pipeline import exported, source_stage, sourced
 
     bundle: Bundle | None
-    refuse_existing(out, force, source, *named_files(stage))
+    refuse_existing(out, force, source, *named_files(stage), kind=BUNDLE)
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)

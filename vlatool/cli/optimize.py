@@ -11,6 +11,7 @@ import typer
 
 from vlatool.cli._console import default_workers, emit, file_or_none, leave, progress, refuse_existing, terminal_text
 from vlatool.errors import UsageError
+from vlatool.outputs import BUNDLE
 
 
 def optimize(
@@ -56,7 +57,7 @@ def optimize(
     from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
 
     if not dry_run:
-        refuse_existing(output, force, source, recipe, file_or_none(profile), cache)
+        refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
     board = load_profile(profile) if profile else None
     given = {"episodes": episodes, "iterations": iterations, "threads": threads}
     effort = {name: value for name, value in given.items() if value is not None}

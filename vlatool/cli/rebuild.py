@@ -11,6 +11,7 @@ import typer
 from vlatool.bundle import Bundle
 from vlatool.cli._console import emit, progress, refuse_existing
 from vlatool.errors import GateFailed, UsageError
+from vlatool.outputs import BUNDLE
 
 if TYPE_CHECKING:
     from vlatool.rebuild import Rebuilt
@@ -42,7 +43,7 @@ def rebuild(
 
     if not check and output is None:
         raise UsageError("rebuild has nothing to do.", "pass --check to compare, -o OUT to keep the bundle, or both")
-    refuse_existing(output, force, bundle, source, *(file or ()))
+    refuse_existing(output, force, bundle, source, *(file or ()), kind=BUNDLE)
     opened = Bundle.open(bundle)
     versions = version_changes(build_record(opened))
     if versions and not as_json:

@@ -36,7 +36,7 @@ def make(
     known = [entry.replace("_", "-") for entry in registry.names("samples")]
     if name.replace("_", "-") not in known:
         raise UsageError(f"There is no sample '{name}'; {nearest(name, known)}.")
-    refuse_existing(output, force)
+    refuse_existing(output, force, kind="")
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)
     try:

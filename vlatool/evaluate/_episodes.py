@@ -17,6 +17,7 @@ from vlatool.bundle import Bundle
 from vlatool.errors import DataError, VlatoolError
 from vlatool.evaluate._controls import Array, Blind, answers_of
 from vlatool.evaluate._success import Success
+from vlatool.printable import message_of
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import Policy
 from vlatool.sources._factory import call_factory, exits_told
@@ -162,6 +163,6 @@ def _episode(environment: Any, queue: ChunkQueue | Blind, task: str, seed: int, 
         raise
     except Exception as error:  # the seam: a user's environment may raise anything
         raise DataError(
-            f"The environment of task '{task}' failed at seed {seed}: {type(error).__name__}: {error}."
+            f"The environment of task '{task}' failed at seed {seed}: {type(error).__name__}: {message_of(error)}."
         ) from error
     raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.")

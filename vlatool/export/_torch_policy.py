@@ -11,6 +11,7 @@ import numpy as np
 from vlatool.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
 from vlatool.manifest import ProgramStep
+from vlatool.printable import message_of
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.sources._factory import exits_told
@@ -112,7 +113,7 @@ class TorchSession:
             shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
             raise SourceError(
                 f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
-                f"{str(error).splitlines()[0] if str(error) else ''} (given {shapes})."
+                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes})."
             ) from error
         outputs = list(given) if isinstance(given, tuple | list) else [given]
         if len(outputs) != len(self.step.gives):

@@ -21,6 +21,7 @@ from vlatool.errors import GraphError, SourceError, require, require_present
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
+from vlatool.printable import message_of
 from vlatool.runtime.contract import Outputs, check_chunk
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
@@ -135,7 +136,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
         raise
     except Exception as error:  # the seam: the exporter raises many foreign types
         raise_interrupt(error)
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:400]
+        reason = (message_of(error).strip() or type(error).__name__).splitlines()[0][:400]
         raise GraphError(
             f"torch cannot export the graph '{step.graph}': {reason}.",
             "keep data-dependent control flow, and what depends on the values of weights, out of forward(); see "

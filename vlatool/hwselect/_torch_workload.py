@@ -19,6 +19,7 @@ from vlatool.errors import SourceError, require
 from vlatool.hwselect._stored import from_values, to_values
 from vlatool.hwselect._workload import GraphWorkload, Tally, Workload, part_named
 from vlatool.manifest import ProgramStep
+from vlatool.printable import message_of
 from vlatool.sources._faked import faked_modules, run_faked
 
 PRODUCTS = {"mm": 0, "bmm": 0, "addmm": 1, "baddbmm": 1}
@@ -73,7 +74,7 @@ def torch_workload(bundle: Bundle) -> Workload:
     except SourceError:
         raise
     except Exception as error:  # the seam: a policy's forward raises what it likes
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+        reason = (message_of(error).strip() or type(error).__name__).splitlines()[0][:300]
         raise SourceError(
             f"The policy cannot be run without its weights: {type(error).__name__}: {reason}.",
             "export it first, and name the bundle: vlatool export SOURCE -o BUNDLE",

@@ -10,7 +10,7 @@ from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError
 from vlatool.host import cache_directory as cache_directory
 from vlatool.launch._inside import run_apart
-from vlatool.outputs import refuse_replacing
+from vlatool.outputs import BUNDLE, refuse_replacing
 from vlatool.report import REPORT, Report, read_report
 from vlatool.stage import Context, Measure, Stage, Transform
 from vlatool.writing import writing
@@ -35,7 +35,7 @@ def run_transform(
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
     """
     if not damaged:
-        refuse_replacing(out, force=force)
+        refuse_replacing(out, force=force, kind=BUNDLE)
     stage.check(source, None)
     with writing(out, force=force, damaged=damaged) as draft:
         if stage.runs(source):

@@ -39,12 +39,15 @@ def load(
         golden_tolerance: Largest relative L2 difference between the recorded golden action and this machine's, as the
             graphs give it and in physical units; what was measured of each when the bundle was made when None.
         accept: Names of findings in the manifest that are overruled, see ``vlatool inspect``.
-        first_run_s: Seconds that an inference of the warm-up may take before it is stopped. (Opening a graph cannot be
-            stopped, nor can OpenVINO inside of a loop: it goes on until the process ends; ``probe`` can.)
+        first_run_s: Seconds that an inference of the warm-up may take before it is stopped. Inside this process ONNX
+            Runtime can be stopped between two nodes of a graph alone: one node that takes hours is waited for, by
+            Ctrl-C as well. OpenVINO is not waited for, but may compute on until the process ends. The opening of a
+            graph cannot be stopped.
         memory_mb: Most that inputs and outputs of a graph may declare, and that the probe may take, in 10^6 bytes;
             2,000 and eight times the size of the graphs when None.
         probe: Do the first run in a child process, limited in time and memory, before this process opens a graph: for
-            bundles of others. Takes as long as loading twice and starting Python.
+            bundles of others. Whatever the child does, it is killed after ``first_run_s`` and 60 s for its start. Takes
+            as long as loading twice and starting Python.
 
     Raises:
         BundleError: the directory is missing, incomplete, changed or too new.

@@ -18,6 +18,7 @@ from vlatool.errors import BundleError, DataError, GraphError, UsageError, neare
 from vlatool.limits import check
 from vlatool.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.npz_files import open_npz
+from vlatool.printable import printable
 from vlatool.runtime.assets import Assets
 from vlatool.runtime.contract import (
     Outputs,
@@ -276,9 +277,10 @@ def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
     allowed = set(accept)
     for finding in bundle.manifest.findings:
         if finding["name"] not in allowed:
+            name, message = printable(finding["name"]), printable(finding["message"])
             raise GraphError(
-                f"{bundle.path} was found to be wrong when it was made ({finding['name']}): {finding['message']}",
-                f"make it in another way; to use it all the same, accept the finding by name: {finding['name']}",
+                f"{bundle.path} was found to be wrong when it was made ({name}): {message}",
+                f"make it in another way; to use it all the same, accept the finding by name: {name}",
             )
 
 

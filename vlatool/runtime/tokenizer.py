@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError, SpecError, VlatoolError, require
 from vlatool.json_files import read_json
+from vlatool.limits import check
 from vlatool.runtime.assets import read_asset
+from vlatool.runtime.token_growth import growth
 
 Encode = Callable[[str], list[int]]
 
@@ -29,7 +31,7 @@ class Tokenizer:
         content: What the file holds; it is read from ``path`` when None.
 
     Raises:
-        SpecError: when the file is missing or is neither of the two.
+        SpecError: when the file is missing or is neither of the two, or may lengthen a text beyond limits.
     """
 
     remembered = 64
@@ -37,6 +39,7 @@ class Tokenizer:
     def __init__(self, path: Path, max_tokens: int, name: str, content: bytes | None = None) -> None:
         self.max_tokens = max_tokens
         self.name = name
+        self._growth = 1
         self._cache: dict[str, NDArray[np.int64]] = {}
         content = _content(path, name) if content is None else content
         data = read_json(content, f"The tokenizer {path} of '{name}'", SpecError)
@@ -45,6 +48,7 @@ class Tokenizer:
         if data.get("kind") == "words":
             self.pad, self._encode = _words(data, path, name)
         elif "model" in data:
+            self._growth = growth(data, f"The tokenizer {path} of '{name}'")
             self.pad, self._encode = _library(content, path, name)
         else:
             raise SpecError(
@@ -61,6 +65,12 @@ class Tokenizer:
         return known
 
     def _padded(self, text: str) -> NDArray[np.int64]:
+        check(
+            "text_characters",
+            len(text) * self._growth,
+            f"The {self.name}, as its tokenizer may lengthen it,",
+            DataError,
+        )
         found = self._encode(text)
         if len(found) > self.max_tokens:
             warnings.warn(

@@ -12,8 +12,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.apart import left
-from vlatool.errors import MissingExtra, SourceError, VlatoolError, nearest
+from vlatool._apart_answers import left
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, nearest
+from vlatool.printable import message_of
+from vlatool.sources._fresh import compile_afresh
 
 
 def split_factory(factory: str) -> tuple[str, str]:
@@ -50,6 +52,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         raise SourceError(f"There is no file {path} (from '{factory}').")
     if path is None:
         _check_package(factory)
+    compile_afresh(folder)
     try:
         with exits_told(f"importing '{where}'"):
             module = _import_path(path) if path is not None else importlib.import_module(where)
@@ -61,7 +64,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
             _install_hint(str(error.name)),
         ) from error
     except Exception as error:  # the seam: user code may raise anything while it is imported
-        raise SourceError(f"Importing '{where}' failed: {type(error).__name__}: {error}.") from error
+        raise SourceError(f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.") from error
     found = getattr(module, function, None)
     if not callable(found):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
@@ -88,22 +91,31 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
             f"'{factory}' needs the package '{error.name}', which is not installed.", _install_hint(str(error.name))
         ) from error
     except Exception as error:  # the seam: user code may raise anything
-        raise SourceError(f"The factory '{factory}' failed: {type(error).__name__}: {error}.") from error
+        raise SourceError(f"The factory '{factory}' failed: {type(error).__name__}: {message_of(error)}.") from error
 
 
 @contextlib.contextmanager
 def exits_told(what: str) -> Iterator[None]:
     """Turn what a user's code raises beside ``Exception`` (``sys.exit``, classes of its own) into an error.
 
+    Errors of vlatool that say what input was bad, or what package is absent, pass: its functions raise them where the
+    code calls any. A verdict of vlatool's, or its exit code, is not for the code to give.
+
     Raises:
         SourceError: saying what was raised; Ctrl-C stays Ctrl-C.
     """
+    about = what[:1].upper() + what[1:]
     try:
         yield
-    except (Exception, KeyboardInterrupt):
+    except (InputError, MissingExtra, KeyboardInterrupt):
+        raise
+    except VlatoolError as error:
+        told = message_of(error).partition("\n")[0].rstrip(".")
+        raise SourceError(f"{about} raised {type(error).__name__}: {told}.") from error
+    except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything
-        raise left(what[:1].upper() + what[1:], type(error).__name__, str(error)) from error
+        raise left(about, type(error).__name__, message_of(error)) from error
 
 
 def _check_package(factory: str) -> None:

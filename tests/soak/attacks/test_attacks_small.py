@@ -6,6 +6,7 @@ import flips
 import mutants
 import swaps
 import victim
+import walls
 from mutations import mutated, read
 
 
@@ -62,3 +63,10 @@ def test_no_load_takes_what_was_swapped(tmp_path):
     counts = swaps.attack(tmp_path, 40)
     assert not counts[swaps.WRONG]
     assert counts["(swaps)"] > 4
+
+
+def test_links_bombs_and_files_without_end_are_refused(tmp_path):
+    counts = walls.run(tmp_path)
+    assert counts[walls.LOADED] == 0
+    assert counts["refused: BundleError"] == len(walls.FREE) + 1
+    assert counts["refused: SpecError"] == 4
