@@ -99,6 +99,16 @@ def test_without_text_inputs_of_other_samples_come_together(tmp_path: Path) -> N
     assert any(each["a"] != each["b"] for each in others)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_of_eight_drawn_states_each_element_is_at_both_ends(float_bundle: Bundle, seed: int) -> None:
+    tensor = float_bundle.manifest.spec.inputs[1]
+    drawer = Drawer(float_bundle)
+    states = np.stack([each.observation["proprio"] for each in draw(drawer, 8, seed)])
+    normalised = drawer._normalisers[tensor.name].forward(states)
+    assert normalised.max(axis=0) == pytest.approx(EXTREME, abs=1e-3)
+    assert normalised.min(axis=0) == pytest.approx(-EXTREME, abs=1e-3)
+
+
 def test_a_file_gives_back_what_was_drawn(float_bundle: Bundle, recording, tmp_path: Path) -> None:
     drawn = draw(Drawer(float_bundle, [recording]), 12)
     save_drawn(tmp_path / "drawn.npz", drawn)

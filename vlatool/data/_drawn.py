@@ -10,6 +10,7 @@ import json
 import string
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,8 @@ class Drawer:
     def draw(self, count: int, random: np.random.Generator) -> list[Drawn]:
         """Return ``count`` observations of all kinds that can be drawn, in random order."""
         kinds = [PATTERN[number % len(PATTERN)] if self._recordings else DRAWN for number in range(count)]
-        makers = {RECORDED: self._recorded, OTHER: self._other, DRAWN: self._drawn}
+        drawn = partial(self._drawn, structured=Structures(random))
+        makers = {RECORDED: self._recorded, OTHER: self._other, DRAWN: drawn}
         return [Drawn(kinds[place], makers[kinds[place]](random)) for place in random.permutation(count)]
 
     def _recorded(self, random: np.random.Generator) -> dict[str, Any]:
@@ -81,11 +83,11 @@ class Drawer:
             each.name: self._sentence(each, random) for each in self._inputs if each.kind == "text"
         }
 
-    def _drawn(self, random: np.random.Generator) -> dict[str, Any]:
+    def _drawn(self, random: np.random.Generator, structured: Structures) -> dict[str, Any]:
         like = self._recorded(random) if self._recordings else {}
-        return {each.name: self._value(each, like.get(each.name), random) for each in self._inputs}
+        return {each.name: self._value(each, like.get(each.name), random, structured) for each in self._inputs}
 
-    def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator) -> Any:
+    def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator, structured: Structures) -> Any:
         if tensor.kind == "text":
             return self._sentence(tensor, random)
         shape = _shape(tensor, like)
@@ -93,8 +95,8 @@ class Drawer:
         if dtype.kind == "b":
             return random.integers(0, 2, shape).astype(np.bool_)
         if dtype.kind in "iu":
-            return _whole_numbers(tensor, like, shape, random)
-        values = _structured(shape, random)
+            return _whole_numbers(tensor, like, shape, random, structured)
+        values = structured(tensor.name, shape)
         return _physical(values, self._normalisers[tensor.name], like).astype(dtype)
 
     def _sentence(self, tensor: TensorSpec, random: np.random.Generator) -> str:
@@ -130,10 +132,12 @@ def _shape(tensor: TensorSpec, like: Any) -> tuple[int, ...]:
     return tuple(axis if isinstance(axis, int) else 1 for axis in tensor.shape[1:])
 
 
-def _whole_numbers(tensor: TensorSpec, like: Any, shape: tuple[int, ...], random: np.random.Generator) -> Array:
+def _whole_numbers(
+    tensor: TensorSpec, like: Any, shape: tuple[int, ...], random: np.random.Generator, structured: Structures
+) -> Array:
     """Pixels over their range; other whole numbers over that of a recorded sample, else 0, which is always one."""
     if tensor.dtype == "uint8":
-        values = _structured(shape, random)
+        values = structured(tensor.name, shape)
         return np.clip(np.rint(127.5 + 127.5 / EXTREME * 2 * values), 0, 255).astype(np.uint8)
     low, high = (0, 0) if like is None or not np.size(like) else (int(np.min(like)), int(np.max(like)))
     return random.integers(low, high + 1, shape).astype(tensor.dtype)
@@ -168,10 +172,33 @@ STRUCTURES: tuple[Callable[[tuple[int, ...], np.random.Generator], Array], ...] 
 )
 
 
-def _structured(shape: tuple[int, ...], random: np.random.Generator) -> Array:
-    """Return noise, one value, ramps, or extremes, about N(0, 1) and never beyond ``EXTREME``."""
-    values = STRUCTURES[int(random.integers(len(STRUCTURES)))](shape, random)
-    return np.asarray(np.clip(values, -EXTREME, EXTREME))
+class Structures:
+    """Values about N(0, 1), never beyond ``EXTREME``: noise, one value, ramps and extremes, each input's in turn.
+
+    Which one an input begins with is drawn. Extremes come in pairs of opposite signs, so that of eight observations one
+    has each element at its highest, and one at its lowest: left to chance, one gate in 25 saw no such thing.
+
+    Args:
+        random: Of all values.
+    """
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self._random = random
+        self._turns: dict[str, int] = {}
+        self._opposite: dict[str, Array] = {}
+
+    def __call__(self, name: str, shape: tuple[int, ...]) -> Array:
+        """Return the next values of an input."""
+        turn = self._turns.get(name, int(self._random.integers(len(STRUCTURES))))
+        self._turns[name] = turn + 1
+        structure = STRUCTURES[turn % len(STRUCTURES)]
+        opposite = self._opposite.pop(name, None) if structure is _extreme else None
+        if opposite is not None and opposite.shape == shape:
+            return opposite
+        values = np.asarray(np.clip(structure(shape, self._random), -EXTREME, EXTREME))
+        if structure is _extreme:
+            self._opposite[name] = -values
+        return values
 
 
 def _physical(values: Array, normaliser: Normaliser | None, like: Any) -> Array:
