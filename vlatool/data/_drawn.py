@@ -68,6 +68,7 @@ class Drawer:
         """Return ``count`` observations of all kinds that can be drawn, in random order."""
         kinds = [PATTERN[number % len(PATTERN)] if self._recordings else DRAWN for number in range(count)]
         drawn = partial(self._drawn, structured=Structures(random))
+        makers: dict[str, Callable[[np.random.Generator], dict[str, Any]]]
         makers = {RECORDED: self._recorded, OTHER: self._other, DRAWN: drawn}
         return [Drawn(kinds[place], makers[kinds[place]](random)) for place in random.permutation(count)]
 
