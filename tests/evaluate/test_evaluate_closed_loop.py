@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vlatool.errors import DataError, MissingExtra, SourceError, UsageError
-from vlatool.evaluate import _episodes
+from vlatool.data import observations_for
+from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
+from vlatool.evaluate import _controls, _episodes
 from vlatool.evaluate._episodes import Job, Outcome, run_jobs
 from vlatool.evaluate._paired import compare_success, success_row
 from vlatool.evaluate.closed_loop import ClosedLoop
@@ -177,6 +178,19 @@ def test_a_worker_that_dies_is_said(int8_bundle, world):
     stage = ClosedLoop(environment=world("import os; os._exit(1)"), tasks=("reach",), episodes=1)
     with pytest.raises(SourceError, match=r"world.py ended its process with exit code 1 before it was done"):
         stage.run(int8_bundle, Context(workers=2))
+
+
+def test_an_inference_that_takes_too_long_is_stopped(int8_bundle, monkeypatch):
+    worker = _episodes.Worker(str(int8_bundle.path), "")
+    observation = observations_for(int8_bundle, 1)[0]
+    assert worker.queue.act(observation).shape == (2,)
+    worker.queue.reset()
+    monkeypatch.setattr(_episodes, "FIRST_RUN_S", -1.0)
+    monkeypatch.setattr(_controls, "FIRST_RUN_S", -1.0)
+    with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
+        worker.queue.act(observation)
+    with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
+        _controls.answers_of(worker.queue.policy)
 
 
 def test_one_environment_is_open_at_a_time(float_bundle, int8_bundle, world):

@@ -177,7 +177,7 @@ class Structures:
     """Values about N(0, 1), never beyond ``EXTREME``: noise, one value, ramps and extremes, each input's in turn.
 
     Which one an input begins with is drawn. Extremes come in pairs of opposite signs, so that of eight observations one
-    has each element at its highest, and one at its lowest: left to chance, one gate in 25 saw no such thing.
+    has each element at its highest, and one at its lowest: left to chance, some gates would see neither.
 
     Args:
         random: Of all values.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.data import observations_for
-from vlatool.runtime.policy import Policy
+from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.spec import TensorSpec
 
 Array = NDArray[Any]
@@ -21,7 +21,10 @@ ASKED = 32
 def answers_of(policy: Policy) -> Array:
     """Return the actions that a policy gives on recorded (or synthetic) observations: (M, A) float32, or (M,) int64."""
     policy.reset()
-    chunks = [policy.infer(observation).chunk for observation in observations_for(policy.bundle, ASKED)]
+    chunks = []
+    for observation in observations_for(policy.bundle, ASKED):
+        with policy.stopped_after(FIRST_RUN_S):
+            chunks.append(policy.infer(observation).chunk)
     policy.reset()
     return np.concatenate(chunks)
 

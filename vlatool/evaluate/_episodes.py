@@ -19,7 +19,7 @@ from vlatool.evaluate._controls import Array, Blind, answers_of
 from vlatool.evaluate._success import Success
 from vlatool.printable import message_of
 from vlatool.runtime.chunks import ChunkQueue
-from vlatool.runtime.policy import Policy
+from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.sources._factory import call_factory, exits_told
 from vlatool.stage import Context
 
@@ -83,13 +83,26 @@ def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
     return outcomes
 
 
+class BoundedQueue(ChunkQueue):
+    """A queue whose policy is stopped when an inference takes longer than any that a robot could use."""
+
+    def act(self, observation: Mapping[str, Any]) -> Array:
+        """Return the action of this control step.
+
+        Raises:
+            UsageError, DataError, GraphError: as ``ChunkQueue.act`` does, and when an inference takes too long.
+        """
+        with self.policy.stopped_after(FIRST_RUN_S):
+            return super().act(observation)
+
+
 class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
         policy = Policy.open(Bundle.open(Path(path)), engine=engine, threads=1, seed=0)
         policy.warm_up(1)
-        self.queue = ChunkQueue(policy)
+        self.queue = BoundedQueue(policy)
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
         self._environment: Any = None

@@ -237,8 +237,7 @@ class Outputs:
         """
         for name, shape, dtype, floating, tensor in self._wanted:
             array = values[name]
-            known = array.dtype is dtype or array.dtype == dtype  # numpy has one object for each of its own dtypes
-            if not known or (array.shape != shape and (shape or not _fits(array, tensor))):
+            if array.dtype != dtype or (array.shape != shape and (shape or not _fits(array, tensor))):
                 raise _misfit(array, tensor, who)
             if floating and not all_finite(array):
                 raise not_finite(name)

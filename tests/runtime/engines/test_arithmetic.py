@@ -17,6 +17,7 @@ from vlatool.runtime.engines._arithmetic import (
     PRECISE,
     SATURATING,
     SHAPE,
+    UNKNOWN,
     WANTED,
     model,
     operand,
@@ -103,6 +104,25 @@ def test_where_products_saturate_the_option_is_set(tmp_path: Path, saturating):
     assert OrtCpuSession.arithmetic() == EXACT_BY_OPTION
     saturating[True] = SATURATED
     assert OrtCpuSession.arithmetic() == SATURATING
+
+
+def test_a_build_that_cannot_compute_the_product_opens_float32_all_the_same(tmp_path: Path, monkeypatch):
+    ort_product.cache_clear()
+    monkeypatch.setattr(_arithmetic, "model", lambda written=False: b"no model")
+    try:
+        assert np.isnan(ort_product(onnxruntime))
+        assert {OrtCpuSession.arithmetic(), ReferenceSession.arithmetic()} == {UNKNOWN}
+        for engine in (OrtCpuSession, ReferenceSession):
+            session = engine(integer_product(tmp_path / "product.onnx", TensorProto.INT8), threads=1)
+            assert (session.run({"a": np.full(SHAPE, 127, np.int8)})["y"] == 127 * 127 * 64).all()
+    finally:
+        ort_product.cache_clear()
+
+
+def test_openvino_that_cannot_compute_the_product_says_so(monkeypatch):
+    pytest.importorskip("openvino")
+    monkeypatch.setattr(_arithmetic, "model", lambda written=False: b"no model")
+    assert OpenvinoSession.arithmetic() == UNKNOWN
 
 
 def level(session: OrtCpuSession) -> object:

@@ -42,7 +42,8 @@ class ReferenceSession(OrtCpuSession):
 
 
 def _exact(ort: Any) -> str:
-    if _arithmetic.ort_product(ort, written=True) == _arithmetic.WANTED:
-        return _arithmetic.EXACT
+    plain = _arithmetic.said(_arithmetic.ort_product(ort, written=True))
+    if plain != _arithmetic.SATURATING:
+        return plain
     exact = _arithmetic.ort_product(ort, precise=True, written=True) == _arithmetic.WANTED
-    return _arithmetic.EXACT_BY_OPTION if exact else _arithmetic.SATURATING
+    return _arithmetic.EXACT_BY_OPTION if exact else plain

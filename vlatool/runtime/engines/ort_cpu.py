@@ -133,7 +133,7 @@ class OrtCpuSession:
         Exact products of uint8 activations refuse a graph with int8 ones, which are exact anyway. And ONNX Runtime
         (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type.
         """
-        saturates = _arithmetic.ort_product(ort) != _arithmetic.WANTED
+        saturates = _arithmetic.ort_product(ort) < _arithmetic.WANTED
         entries = [*([_arithmetic.PRECISE] if saturates else []), None, _arithmetic.UNFUSED]
         ways = [session_options(ort, threads) for _ in entries]
         for options, entry in zip(ways, entries, strict=True):
@@ -158,10 +158,11 @@ class OrtCpuSession:
             MissingExtra: when onnxruntime is not installed.
         """
         ort = require("onnxruntime", "ort")
-        if _arithmetic.ort_product(ort) == _arithmetic.WANTED:
-            return _arithmetic.EXACT
+        plain = _arithmetic.said(_arithmetic.ort_product(ort))
+        if plain != _arithmetic.SATURATING:
+            return plain
         exact = _arithmetic.ort_product(ort, precise=True) == _arithmetic.WANTED
-        return _arithmetic.EXACT_BY_OPTION if exact else _arithmetic.SATURATING
+        return _arithmetic.EXACT_BY_OPTION if exact else plain
 
 
 class _Bound:
