@@ -36,6 +36,7 @@ def test_a_board_with_onnx_runtime_alone_gets_its_variants() -> None:
         "dynamic_int8",
         "static_int8",
         "static_int8_mse",
+        "static_int8_attention",
     }
     assert set(variants_for(load_profile("raspberry-pi-5"), calibrated=False)) == {"dynamic_int8"}
 

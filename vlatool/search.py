@@ -251,6 +251,7 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
         if calibrated:
             found["static_int8"] = ({"quantize.static_int8": {}},)
             found["static_int8_mse"] = ({"quantize.static_int8": {"method": "mse"}},)
+            found["static_int8_attention"] = ({"quantize.static_int8": {"attention": True}},)
     if "openvino" in engines and importlib.util.find_spec("openvino") is not None:
         found.update(_openvino_variants(processor_has(profile, *BF16), processor_has(profile, *AMX), calibrated))
     return found

@@ -71,6 +71,34 @@ def test_a_product_without_bias_becomes_one_node():
     assert len(made.graph.node[1].input) == 6
 
 
+@pytest.mark.parametrize("rank", [2, 4])
+def test_a_product_of_two_activations_becomes_one_node(rank):
+    shape = helper.make_node("Reshape", ["x", "shape"], ["s"])
+    turn = helper.make_node("Transpose", ["s"], ["st"], perm=[*range(rank - 2), rank - 1, rank - 2])
+    pairs = [
+        helper.make_node(kind, [first, "x_scale", "x_zero"], [to])
+        for value in ("s", "st")
+        for kind, first, to in (("QuantizeLinear", value, f"{value}q"), ("DequantizeLinear", f"{value}q", f"{value}d"))
+    ]
+    product = helper.make_node("MatMul", ["sd", "std"], ["product"], "product")
+    sizes = np.int64([1] * (rank - 2) + [2, 2])
+    made = model(shape, turn, *pairs, product, helper.make_node("Add", ["product", "bias"], ["y"]), shape=sizes,
+                 bias=np.float32([1, 2]))  # fmt: skip
+    assert rewritten(made, 1)[-2:] == ["MatMulIntegerToFloat", "Add"]
+    assert list(made.graph.node[-2].input) == ["sq", "stq", "x_scale", "x_scale", "x_zero", "x_zero"]
+
+
+def test_two_activations_with_a_scale_for_each_channel_stay():
+    turn = helper.make_node("Transpose", ["x"], ["t"])
+    pairs = [
+        helper.make_node("QuantizeLinear", ["t", "scales", "zeros"], ["tq"], axis=0),
+        helper.make_node("DequantizeLinear", ["tq", "scales", "zeros"], ["td"], axis=0),
+    ]
+    made = model(*QUANTIZE[:2], turn, *pairs, helper.make_node("MatMul", ["xd", "td"], ["y"]),
+                 scales=np.float32([0.1, 0.2, 0.3, 0.4]), zeros=np.full(4, 9, np.uint8))  # fmt: skip
+    assert use_integer_matmul(made) == 0
+
+
 def test_two_products_share_the_quantized_input():
     other = [
         helper.make_node("DequantizeLinear", ["v", "w_scale", "w_zero"], ["vd"], axis=1),

@@ -15,7 +15,7 @@ DOMAIN = "com.microsoft"
 
 
 def use_integer_matmul(model: Any) -> int:
-    """Rewrite every MatMul with a quantized input and a constant quantized weight, in place.
+    """Rewrite every MatMul of a quantized input and a quantized weight, or of two quantized inputs, in place.
 
     Args:
         model: An ``onnx.ModelProto`` in QDQ form.
@@ -59,10 +59,14 @@ def _operands(node: Any, producers: dict[str, Any], constants: dict[str, Any]) -
     left, right = producers.get(node.input[0]), producers.get(node.input[1])
     if left is None or right is None or left.op_type != "DequantizeLinear" or right.op_type != "DequantizeLinear":
         return None
-    weight = constants.get(right.input[0])
-    if weight is None or left.input[0] in constants or len(left.input) < 3 or len(right.input) < 3:
+    if left.input[0] in constants or len(left.input) < 3 or len(right.input) < 3:
         return None
     inputs = [left.input[0], right.input[0], left.input[1], right.input[1], left.input[2], right.input[2]]
+    weight = constants.get(right.input[0])
+    if weight is None:  # two activations, as in attention
+        scales = [constants.get(name) for name in (left.input[1], right.input[1])]
+        whole = all(scale is not None and not [axis for axis in scale.dims if axis != 1] for scale in scales)
+        return {"inputs": inputs, "columns": 0} if whole else None
     return {"inputs": inputs, "columns": weight.dims[-1]} if len(weight.dims) == 2 else None
 
 

@@ -15,11 +15,12 @@ from vlatool.quantize._layers import (
     Style,
     convolved,
     hoisted,
+    signed,
 )
 from vlatool.quantize._nodes import read_names
 
 Range = tuple[float, float]
-ACTIVATION = {"uint8": (0, 255, np.uint8), "int8": (-127, 127, np.int8)}
+ACTIVATION = {"uint8": (0, 255, np.uint8), "int8": (-127, 127, np.int8), "int7": (-63, 63, np.int8)}
 INT32 = float(2**31 - 1)
 
 
@@ -57,6 +58,7 @@ class _Writer:
         self.constants = {tensor.name: tensor for tensor in self.graph.initializer}
         self.outputs = {value.name for value in self.graph.output}
         self.convolved = convolved(self.layers.values(), self.moved)
+        self.signed = signed(self.layers.values(), self.style)
 
     def write(self) -> None:
         """Rebuild the list of nodes with the pairs before their first reader."""
@@ -122,15 +124,17 @@ class _Writer:
         if name in self.made:
             return self.made[name]
         low, high = self.ranges[name]
-        kind = self.style.activations
+        kind: str = self.style.activations
         if kind == "symmetric":
             kind = "uint8" if low >= 0 or name in self.convolved else "int8"
-        if kind == "int8":  # its zero point is 0, so that a range to one side would lose half of it
+        if name in self.signed:
+            kind = "int7"
+        if kind != "uint8":  # its zero point is 0, so that a range to one side would lose half of it
             low, high = -max(-low, high), max(-low, high)
         lowest, highest, dtype = ACTIVATION[kind]
         scale = (high - low) / (highest - lowest) if high > low else 1.0
         scale = float(np.float32(scale)) or 1.0
-        zero = 0 if kind == "int8" else int(np.clip(round(-low / scale), lowest, highest))
+        zero = 0 if kind != "uint8" else int(np.clip(round(-low / scale), lowest, highest))
         parts = [
             self._constant(f"{name}.scale", np.array(scale, np.float32)),
             self._constant(f"{name}.zero", np.array(zero, dtype)),

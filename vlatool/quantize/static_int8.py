@@ -11,6 +11,8 @@ from pydantic import Field
 from vlatool.bundle import Bundle
 from vlatool.errors import RecipeError, nearest, require
 from vlatool.quantize._calibration import Calibrated
+from vlatool.quantize._early import quantize_early
+from vlatool.quantize._frames import fold_frames
 from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, read, save
 from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.quantize._layers import (
@@ -81,7 +83,10 @@ class StaticInt8(Calibrated):
             kind = self.activations
         elif own and not self.convolutions:
             kind = "symmetric"
-        return Style(kind, self.per_channel, self.reduce_range, fused_convolutions=not own, hoist=own)
+        second = self.layout == "ort" and kind == "uint8"
+        return Style(
+            kind, self.per_channel, self.reduce_range, fused_convolutions=not own, hoist=own, signed_second=second
+        )
 
     def used_packages(self) -> tuple[str, ...]:
         """OpenVINO too, where it runs the graphs."""
@@ -110,12 +115,16 @@ class StaticInt8(Calibrated):
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
+            pixels: dict[str, Range] = {}
             if self.layout == "ort":
                 split_gemm(model)
+                if self.style.activations == "uint8":
+                    pixels = fold_frames(model, {layer.name for layer in layers[name]})
             chosen = self._rewritten(model, layers[name])
             unsigned = convolved(chosen, hoisted(model, chosen, self.style))
-            insert_qdq(model, chosen, self.ranges(found[name], unsigned), self.style)
+            insert_qdq(model, chosen, {**self.ranges(found[name], unsigned), **pixels}, self.style)
             if self.layout == "ort":
+                quantize_early(model)
                 use_integer_matmul(model)
             if self.layout == "openvino":
                 keep_axes(model)

@@ -1,0 +1,182 @@
+"""Fold the normalisation of a camera frame into the convolution that reads it.
+
+``(pixel - mean) / std`` in front of a convolution without padding is the convolution with other weights and another
+bias. Over a whole frame those products and sums cost more than they look, and quantizing their result costs accuracy:
+the pixels themselves are uint8 already. One level, near the mean of all channels, stays subtracted: it is the zero
+point of the quantized frame. Without it each weight's rounding error would be multiplied by the mean of the frame.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import require
+from vlatool.quantize._nodes import reads
+
+Array = NDArray[Any]
+ARITHMETIC = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide}
+UNEVEN = 4.0
+"""Largest ratio of two channels' scales: beyond it their weights would need different steps."""
+
+
+def fold_frames(model: Any, convolutions: Collection[str]) -> dict[str, tuple[float, float]]:
+    """Fold normalisations in place, where a frame of uint8 reaches a convolution through nothing else.
+
+    Args:
+        model: An ``onnx.ModelProto``.
+        convolutions: Names of the nodes that may be changed.
+
+    Returns:
+        Value that such a convolution reads -> its range, which is that of pixels: 255 steps of 1.
+    """
+    folder = _Folder(model)
+    found: dict[str, tuple[float, float]] = {}
+    for node in list(model.graph.node):
+        zero = folder.fold(node) if node.op_type == "Conv" and node.name in convolutions else None
+        if zero is not None:
+            found[node.input[0]] = (0.0 - zero, 255.0 - zero)
+    return found
+
+
+class _Folder:
+    def __init__(self, model: Any) -> None:
+        self.onnx = require("onnx", "build")
+        self.graph = model.graph
+        self.constants = {tensor.name: tensor for tensor in model.graph.initializer}
+        self.producers = {name: node for node in model.graph.node for name in node.output}
+        self.readers = Counter(name for node in model.graph.node for name in reads(node))
+        self.outputs = {value.name for value in model.graph.output}
+        self.frames = {
+            value.name: [axis.dim_value for axis in value.type.tensor_type.shape.dim]
+            for value in model.graph.input
+            if value.type.tensor_type.elem_type == self.onnx.TensorProto.UINT8
+        }
+
+    def fold(self, convolution: Any) -> int | None:
+        """Fold what is before a convolution; return the level that stays subtracted, None when it cannot be folded."""
+        chain = self._chain(convolution)
+        arithmetic = [node for node in chain if node.op_type in ARITHMETIC]
+        found = self._affine(chain) if arithmetic and self._plain(convolution) else None
+        if found is None:
+            return None
+        weight = self._array(convolution.input[1]).astype(np.float64)
+        scale, shift = found
+        if len(scale) != weight.shape[1]:
+            return None
+        zero = int(np.clip(np.rint(np.mean(-shift / scale)), 0, 255))
+        self._rewrite(convolution, weight, scale, shift + scale * zero)
+        for node in arithmetic:
+            self._bypass(node)
+        self._subtract(chain[0], zero, convolution.name)
+        return zero
+
+    def _chain(self, convolution: Any) -> list[Any]:
+        """Return the nodes from a frame's Cast to a convolution; none when others read what is between."""
+        found: list[Any] = []
+        value = convolution.input[0]
+        while True:
+            node = self.producers.get(value)
+            if node is None or self.readers[value] != 1 or value in self.outputs:
+                return []
+            found.append(node)
+            if node.op_type == "Cast":
+                return found[::-1] if node.input[0] in self.frames else []
+            if node.op_type in ARITHMETIC:
+                value = self._varying(node)
+            elif node.op_type == "Transpose":
+                value = node.input[0]
+            else:
+                return []
+
+    def _varying(self, node: Any) -> str:
+        """Return the operand that is no constant; nothing when both are none, or a constant is divided."""
+        left, right = node.input
+        if right in self.constants:
+            return str(left)
+        return str(right) if left in self.constants and node.op_type in ("Add", "Mul") else ""
+
+    def _plain(self, convolution: Any) -> bool:
+        """Say whether a convolution has constant weights of one group and never reads beyond the frame's edge."""
+        attributes = {item.name: self.onnx.helper.get_attribute_value(item) for item in convolution.attribute}
+        padded = any(attributes.get("pads", ())) or attributes.get("auto_pad", b"NOTSET") not in (b"NOTSET", b"VALID")
+        constant = all(name in self.constants for name in convolution.input[1:] if name)
+        return constant and not padded and attributes.get("group", 1) == 1
+
+    def _affine(self, chain: list[Any]) -> tuple[Array, Array] | None:
+        """Return scale and shift of each channel, float64 (C,), when the chain does the same to all its pixels."""
+        shape = self.frames[chain[0].input[0]]
+        if len(shape) != 4 or not all(shape) or chain[0].output[0] in self.outputs:
+            return None
+        black, white = (self._through(chain[1:], np.full(shape, level, np.float64)) for level in (0.0, 1.0))
+        if black is None or white is None:
+            return None
+        per_channel = [np.moveaxis(each, 1, 0).reshape(each.shape[1], -1) for each in (white - black, black)]
+        if any(np.ptp(each, axis=1).any() for each in per_channel):
+            return None
+        scale, shift = (each[:, 0] for each in per_channel)
+        sizes = np.abs(scale)
+        even = np.isfinite(sizes).all() and np.isfinite(shift).all() and sizes.min() > 0
+        return (scale, shift) if even and sizes.max() <= UNEVEN * sizes.min() else None
+
+    def _through(self, nodes: list[Any], values: Array) -> Array | None:
+        for node in nodes:
+            if node.op_type == "Transpose":
+                axes = {item.name: list(item.ints) for item in node.attribute}.get("perm")
+                values = values.transpose(axes)
+                continue
+            first, second = (self._array(name) if name in self.constants else values for name in node.input)
+            before = values.shape
+            with np.errstate(all="ignore"):
+                values = ARITHMETIC[node.op_type](first, second)
+            if values.shape != before:
+                return None
+        return values
+
+    def _rewrite(self, convolution: Any, weight: Array, scale: Array, shift: Array) -> None:
+        """Give a convolution weights and bias of its own that read pixels."""
+        spread = (1, -1, *[1] * (weight.ndim - 2))
+        bias = (weight * shift.reshape(spread)).sum(axis=tuple(range(1, weight.ndim)))
+        if len(convolution.input) > 2 and convolution.input[2]:
+            bias = bias + self._array(convolution.input[2]).astype(np.float64)
+        name = convolution.name
+        inputs = [
+            convolution.input[0],
+            self._constant(f"{name}.pixels.weight", weight * scale.reshape(spread)),
+            self._constant(f"{name}.pixels.bias", bias),
+        ]
+        del convolution.input[:]
+        convolution.input.extend(inputs)
+
+    def _bypass(self, node: Any) -> None:
+        """Let the one reader of a node read what the node reads."""
+        self._replace(node.output[0], self._varying(node))
+        self.graph.node.remove(node)
+
+    def _replace(self, old: str, new: str) -> None:
+        for reader in self.graph.node:
+            for index, name in enumerate(reader.input):
+                if name == old:
+                    reader.input[index] = new
+
+    def _subtract(self, cast: Any, zero: int, name: str) -> None:
+        """Subtract a level from a frame, for the one reader that it has."""
+        pixels, centred = cast.output[0], f"{name}.pixels"
+        self._replace(pixels, centred)
+        inputs = [pixels, self._constant(f"{name}.pixels.zero", np.array(zero))]
+        place = list(self.graph.node).index(cast) + 1
+        self.graph.node.insert(place, self.onnx.helper.make_node("Sub", inputs, [centred], name=f"{name}/pixels"))
+
+    def _array(self, name: str) -> Array:
+        found: Array = self.onnx.numpy_helper.to_array(self.constants[name])
+        return found
+
+    def _constant(self, name: str, values: Array) -> str:
+        tensor = self.onnx.numpy_helper.from_array(values.astype(np.float32), name)
+        self.constants[name] = tensor
+        self.graph.initializer.append(tensor)
+        return name
