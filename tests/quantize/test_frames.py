@@ -75,6 +75,23 @@ def test_a_normalisation_becomes_weights_and_one_level(way):
     assert (low, high) == (-level, 255 - level)
 
 
+@pytest.mark.parametrize("pads", [[1, 1, 1, 1], [3, 0, 0, 2], [0, 2, 0, 0], [0, 1, 2, 3]], ids=str)
+@pytest.mark.parametrize("way", WAYS)
+def test_padding_becomes_a_border_of_pixels(way, pads):
+    """The mean is no whole pixel, so that the border is off by half a pixel at most, as quantized zeros would be."""
+    made = model(*WAYS[way], ("Conv", "t w bias", "y", {"strides": [2, 2], "pads": pads}))
+    (before,) = run(made)
+    ((_, (low, high)),) = fold_frames(made, ("make y",)).items()
+    assert high - low == 255
+    (after,) = run(made)
+    assert after.shape == before.shape
+    half = 0 if way == "one for all" else 0.5 / STD.min()
+    assert np.abs(after - before).max() <= half * np.abs(CONSTANTS["w"]).sum(axis=(1, 2, 3)).max() + 1e-3
+    inner = (slice(None), slice(None), slice(2, 3), slice(2, 3))
+    np.testing.assert_allclose(after[inner], before[inner], rtol=1e-4, atol=1e-4)
+    assert not [item for item in made.graph.node[-1].attribute if item.name == "pads"]
+
+
 def test_a_convolution_without_bias_gets_one():
     made = model(*NORMALISE, ("Conv", "t w", "y", {"strides": [4, 4]}))
     assert folded(made)
@@ -82,7 +99,13 @@ def test_a_convolution_without_bias_gets_one():
 
 
 REFUSED = {
-    "padding": [*NORMALISE, ("Conv", "t w bias", "y", {"pads": [1, 1, 1, 1]})],
+    "padding that is no pixel": [
+        CAST,
+        ("Mul", "scale c", "a", {}),
+        ("Add", "a std", "b", {}),
+        TURN,
+        ("Conv", "t w bias", "y", {"pads": [1, 1, 1, 1]}),
+    ],
     "padding that is left to the engine": [*NORMALISE, ("Conv", "t w bias", "y", {"auto_pad": "SAME_UPPER"})],
     "groups": [*NORMALISE, ("Conv", "t each", "y", {"group": 3})],
     "scales that are far apart": [CAST, ("Mul", "c uneven", "b", {}), TURN, PATCHES],

@@ -124,7 +124,15 @@ class _Raiser:
             level = float(taken.reshape(-1)[0]) if taken.size == 1 else -1.0
             node = self.producers.get(node.input[0], node)
         same = zero.dtype == np.uint8 and float(step.max()) == 1 and float(zero.max()) == level
-        return str(node.input[0]) if same and node.op_type == "Cast" and node.input[0] in self.pixels else ""
+        return str(node.input[0]) if same and node.op_type == "Cast" and self._is_pixels(node.input[0]) else ""
+
+    def _is_pixels(self, name: str) -> bool:
+        """Say whether a value is uint8: a frame, a constant of such, or both joined."""
+        if name in self.constants:
+            return bool(self.constants[name].data_type == self.onnx.TensorProto.UINT8)
+        before = self.producers.get(name)
+        joined = before is not None and before.op_type == "Concat" and before.input
+        return name in self.pixels or bool(joined and all(map(self._is_pixels, before.input)))
 
     def _read_pixels(self, frame: str, quantized: str) -> None:
         for node in self.graph.node:

@@ -1,9 +1,12 @@
 """Fold the normalisation of a camera frame into the convolution that reads it.
 
-``(pixel - mean) / std`` in front of a convolution without padding is the convolution with other weights and another
-bias. Over a whole frame those products and sums cost more than they look, and quantizing their result costs accuracy:
-the pixels themselves are uint8 already. One level, near the mean of all channels, stays subtracted: it is the zero
-point of the quantized frame. Without it each weight's rounding error would be multiplied by the mean of the frame.
+``(pixel - mean) / std`` in front of a convolution is the convolution with other weights and another bias. Over a whole
+frame those products and sums cost more than they look, and quantizing their result costs accuracy: the pixels
+themselves are uint8 already. One level, near the mean of all channels, stays subtracted: it is the zero point of the
+quantized frame. Without it each weight's rounding error would be multiplied by the mean of the frame.
+
+Where the convolution pads, the frame gets a border of pixels that are what zeros are after the normalisation: each
+channel's mean, rounded to a whole pixel as quantizing it would.
 """
 
 from __future__ import annotations
@@ -61,18 +64,22 @@ class _Folder:
         """Fold what is before a convolution; return the level that stays subtracted, None when it cannot be folded."""
         chain = self._chain(convolution)
         arithmetic = [node for node in chain if node.op_type in ARITHMETIC]
-        found = self._affine(chain) if arithmetic and self._plain(convolution) else None
-        if found is None:
+        pads = self._pads(convolution)
+        found = self._affine(chain) if arithmetic and pads is not None else None
+        if found is None or pads is None:
             return None
         weight = self._array(convolution.input[1]).astype(np.float64)
         scale, shift = found
-        if len(scale) != weight.shape[1]:
+        border = np.rint(-shift / scale)
+        if len(scale) != weight.shape[1] or (any(pads) and not ((border >= 0) & (border <= 255)).all()):
             return None
         zero = int(np.clip(np.rint(np.mean(-shift / scale)), 0, 255))
         self._rewrite(convolution, weight, scale, shift + scale * zero)
         for node in arithmetic:
             self._bypass(node)
         self._subtract(chain[0], zero, convolution.name)
+        if any(pads):
+            self._surround(chain, pads, border, convolution)
         return zero
 
     def _chain(self, convolution: Any) -> list[Any]:
@@ -100,12 +107,14 @@ class _Folder:
             return str(left)
         return str(right) if left in self.constants and node.op_type in ("Add", "Mul") else ""
 
-    def _plain(self, convolution: Any) -> bool:
-        """Say whether a convolution has constant weights of one group and never reads beyond the frame's edge."""
+    def _pads(self, convolution: Any) -> list[int] | None:
+        """Return the padding of a convolution with constant weights of one group, two axes; None of any other."""
         attributes = {item.name: self.onnx.helper.get_attribute_value(item) for item in convolution.attribute}
-        padded = any(attributes.get("pads", ())) or attributes.get("auto_pad", b"NOTSET") not in (b"NOTSET", b"VALID")
         constant = all(name in self.constants for name in convolution.input[1:] if name)
-        return constant and not padded and attributes.get("group", 1) == 1
+        told = attributes.get("auto_pad", b"NOTSET") in (b"NOTSET", b"VALID")
+        pads = list(attributes.get("pads", (0, 0, 0, 0)))
+        plain = constant and told and attributes.get("group", 1) == 1
+        return pads if plain and len(pads) == 4 and min(pads) >= 0 else None
 
     def _affine(self, chain: list[Any]) -> tuple[Array, Array] | None:
         """Return scale and shift of each channel, float64 (C,), when the chain does the same to all its pixels."""
@@ -171,12 +180,50 @@ class _Folder:
         place = list(self.graph.node).index(cast) + 1
         self.graph.node.insert(place, self.onnx.helper.make_node("Sub", inputs, [centred], name=f"{name}/pixels"))
 
+    def _surround(self, chain: list[Any], pads: list[int], border: Array, convolution: Any) -> None:
+        """Join a frame with a border of pixels, and let the convolution pad no more.
+
+        Args:
+            chain: From the Cast to the convolution.
+            pads: Rows and columns before, rows and columns after.
+            border: A pixel, (C,).
+            convolution: Its padding is taken away.
+        """
+        axes = np.arange(4)  # which axis of the frame each axis of what the convolution reads is
+        for node in (node for node in chain if node.op_type == "Transpose"):
+            axes = axes[{item.name: list(item.ints) for item in node.attribute}.get("perm", [3, 2, 1, 0])]
+        value, shape = chain[0].input[0], list(self.frames[chain[0].input[0]])
+        place = list(self.graph.node).index(chain[0])
+        pixel = np.moveaxis(border.reshape(-1, 1, 1, 1), 0, axes[1])
+        for number, axis in enumerate(axes[2:]):
+            parts = [value]
+            for where, size in (("before", pads[number]), ("after", pads[number + 2])):
+                if size:
+                    sizes = [size if each == axis else length for each, length in enumerate(shape)]
+                    name = f"{convolution.name}.pixels.{where}.{number}"
+                    filled = self._constant(name, np.broadcast_to(pixel, sizes), np.uint8)
+                    parts = [filled, *parts] if where == "before" else [*parts, filled]
+            if len(parts) == 1:
+                continue
+            value, shape[axis] = (
+                f"{convolution.name}.pixels.wide.{number}",
+                shape[axis] + pads[number] + pads[number + 2],
+            )
+            name = f"{convolution.name}/pixels.wide.{number}"
+            made = self.onnx.helper.make_node("Concat", parts, [value], name=name, axis=int(axis))
+            self.graph.node.insert(place, made)
+            place += 1
+        chain[0].input[0] = value
+        kept = [item for item in convolution.attribute if item.name not in ("pads", "auto_pad")]
+        del convolution.attribute[:]
+        convolution.attribute.extend(kept)
+
     def _array(self, name: str) -> Array:
         found: Array = self.onnx.numpy_helper.to_array(self.constants[name])
         return found
 
-    def _constant(self, name: str, values: Array) -> str:
-        tensor = self.onnx.numpy_helper.from_array(values.astype(np.float32), name)
+    def _constant(self, name: str, values: Array, dtype: type = np.float32) -> str:
+        tensor = self.onnx.numpy_helper.from_array(np.ascontiguousarray(values, dtype), name)
         self.constants[name] = tensor
         self.graph.initializer.append(tensor)
         return name
