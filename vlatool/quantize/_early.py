@@ -14,6 +14,7 @@ import numpy as np
 
 from vlatool.errors import require
 from vlatool.quantize._nodes import read_names, reads
+from vlatool.quantize._value_types import inferred_values
 
 MOVES = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten")
 """Operators that give all values that they take, each once."""
@@ -37,9 +38,9 @@ class _Raiser:
         self.readers = Counter(name for node in model.graph.node for name in reads(node))
         self.producers = {name: node for node in model.graph.node for name in node.output}
         self.places = {node.name: (number, 1) for number, node in enumerate(model.graph.node)}
-        self.pixels = {
-            value.name for value in model.graph.input if value.type.tensor_type.elem_type == self.onnx.TensorProto.UINT8
-        }
+        uint8 = self.onnx.TensorProto.UINT8
+        self.pixels = {tensor.name for tensor in model.graph.initializer if tensor.data_type == uint8}
+        self.pixels |= {value.name for value in inferred_values(model) if value.type.tensor_type.elem_type == uint8}
 
     def run(self) -> None:
         """Raise each quantizer until it can go no further."""
@@ -124,15 +125,7 @@ class _Raiser:
             level = float(taken.reshape(-1)[0]) if taken.size == 1 else -1.0
             node = self.producers.get(node.input[0], node)
         same = zero.dtype == np.uint8 and float(step.max()) == 1 and float(zero.max()) == level
-        return str(node.input[0]) if same and node.op_type == "Cast" and self._is_pixels(node.input[0]) else ""
-
-    def _is_pixels(self, name: str) -> bool:
-        """Say whether a value is uint8: a frame, a constant of such, or both joined."""
-        if name in self.constants:
-            return bool(self.constants[name].data_type == self.onnx.TensorProto.UINT8)
-        before = self.producers.get(name)
-        joined = before is not None and before.op_type == "Concat" and before.input
-        return name in self.pixels or bool(joined and all(map(self._is_pixels, before.input)))
+        return str(node.input[0]) if same and node.op_type == "Cast" and node.input[0] in self.pixels else ""
 
     def _read_pixels(self, frame: str, quantized: str) -> None:
         for node in self.graph.node:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import require
 from vlatool.quantize._nodes import reads
+from vlatool.quantize._value_types import inferred_values
 
 Array = NDArray[Any]
 ARITHMETIC = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide}
@@ -46,6 +47,14 @@ def fold_frames(model: Any, convolutions: Collection[str]) -> dict[str, tuple[fl
     return found
 
 
+def _frames(model: Any, uint8: int) -> dict[str, list[int]]:
+    """Return the shapes of the values of type uint8, 0 for a size that is not fixed."""
+    kinds = {value.name: value.type.tensor_type for value in inferred_values(model)}
+    return {
+        name: [axis.dim_value for axis in kind.shape.dim] for name, kind in kinds.items() if kind.elem_type == uint8
+    }
+
+
 class _Folder:
     def __init__(self, model: Any) -> None:
         self.onnx = require("onnx", "build")
@@ -54,11 +63,7 @@ class _Folder:
         self.producers = {name: node for node in model.graph.node for name in node.output}
         self.readers = Counter(name for node in model.graph.node for name in reads(node))
         self.outputs = {value.name for value in model.graph.output}
-        self.frames = {
-            value.name: [axis.dim_value for axis in value.type.tensor_type.shape.dim]
-            for value in model.graph.input
-            if value.type.tensor_type.elem_type == self.onnx.TensorProto.UINT8
-        }
+        self.frames = _frames(model, self.onnx.TensorProto.UINT8)
 
     def fold(self, convolution: Any) -> int | None:
         """Fold what is before a convolution; return the level that stays subtracted, None when it cannot be folded."""
@@ -174,11 +179,11 @@ class _Folder:
 
     def _subtract(self, cast: Any, zero: int, name: str) -> None:
         """Subtract a level from a frame, for the one reader that it has."""
-        pixels, centred = cast.output[0], f"{name}.pixels"
+        pixels, centred = cast.output[0], f"{name}.frame"
         self._replace(pixels, centred)
-        inputs = [pixels, self._constant(f"{name}.pixels.zero", np.array(zero))]
+        inputs = [pixels, self._constant(f"{name}.pixels.level", np.array(zero))]
         place = list(self.graph.node).index(cast) + 1
-        self.graph.node.insert(place, self.onnx.helper.make_node("Sub", inputs, [centred], name=f"{name}/pixels"))
+        self.graph.node.insert(place, self.onnx.helper.make_node("Sub", inputs, [centred], name=f"{name}/frame"))
 
     def _surround(self, chain: list[Any], pads: list[int], border: Array, convolution: Any) -> None:
         """Join a frame with a border of pixels, and let the convolution pad no more.
