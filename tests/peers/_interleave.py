@@ -29,6 +29,7 @@ class Contestant:
         name: What the table calls it.
         opens: What the worker is told to open.
         failed: Why it has no figures; empty when it has.
+        engine: What runs it: ``ort_cpu``, ``openvino``, empty for others.
         group: Contestants of one group took turns; the reference is in each.
         rounds: Clock -> median milliseconds of each round.
         reference: Clock -> the reference's, in the same rounds.
@@ -40,6 +41,7 @@ class Contestant:
     error: float = float("nan")
     peak_mb: float = float("nan")
     load_s: float = float("nan")
+    engine: str = ""
     group: int = -1
     rounds: dict[str, list[float]] = field(default_factory=lambda: {clock: [] for clock in CLOCKS})
     reference: dict[str, list[float]] = field(default_factory=lambda: {clock: [] for clock in CLOCKS})
@@ -177,6 +179,7 @@ class Contest:
         if self._expected is None:
             self._expected = outputs
         contestant.error = mean_error(outputs, self._expected)
+        contestant.engine = engine_of(contestant)
         contestant.peak_mb = peak
         self.tell(f"  {contestant.name}: error {contestant.error:.4f}, {contestant.peak_mb:.0f} MB")
         return worker
@@ -205,6 +208,14 @@ class Contest:
                 for clock in CLOCKS:
                     worker.contestant.rounds[clock].append(medians[worker.contestant.name][clock])
                     worker.contestant.reference[clock].append(medians[REFERENCE][clock])
+
+
+def engine_of(contestant: Contestant) -> str:
+    """Return what runs a contestant."""
+    if not contestant.ours:
+        return {"ort": "ort_cpu", "openvino": "openvino", "nncf": "openvino"}.get(contestant.name.partition(":")[0], "")
+    manifest = json.loads(Path(contestant.opens.removeprefix(MARK), "manifest.json").read_text(encoding="utf-8"))
+    return str(manifest.get("engine") or "ort_cpu")
 
 
 def resident_mb(worker: Worker) -> float:
