@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
-from vlatool.quantize._nodes import read_names, reads
+from vlatool.quantize._nodes import name_nodes, read_names, reads
 from vlatool.quantize._value_types import inferred_values
 
 MOVES = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten")
@@ -26,6 +26,7 @@ def quantize_early(model: Any) -> None:
     Args:
         model: An ``onnx.ModelProto`` whose quantizers are made (``insert_qdq``).
     """
+    name_nodes(model)
     _Raiser(model).run()
 
 
