@@ -109,6 +109,13 @@ class BoardSet:
             f"ratio between the two engines is given.{self._gains_less()}",
         )
 
+    def about_errors(self) -> tuple[str, ...]:
+        """Say what errors alone are those of, where OpenVINO is or can be confined to the board's set."""
+        if self.confined or self.to_set:
+            told = f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}"
+            return (f"{told}: its answers are of that set.",)
+        return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.alike else ()
+
     def warnings(self) -> tuple[str, ...]:
         """Say where this host's figures are not those of the board's set, what that means, and what to do."""
         if not self.wanted or self.confined or self.alike:
