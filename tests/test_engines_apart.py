@@ -35,7 +35,7 @@ def baseline(predicted: float | None = 20.0, reference: float | None = 25.0) -> 
 
 
 def choose(*items: Judged, small: bool = False) -> Judged:
-    found = [item for item in choose_apart(list(items), ENGINES, BOARD, small) if item.row.role == "chosen"]
+    found = [item for item in choose_apart(list(items), ENGINES, BOARD, SET, small) if item.row.role == "chosen"]
     assert len(found) == 1
     return found[0]
 
@@ -45,13 +45,17 @@ def test_what_is_slower_in_milliseconds_wins_where_the_board_says_so():
     best = choose(baseline(), judged("ort", 5.0, 10.0, 15.0), judged("fast", 20.0, 40.0, 30.0))
     assert best.row.name == "fast"
     said = " ".join(best.sentences)
-    assert f"2.00x as fast as {IN_OPENVINO} (20 ms instead of 40 ms" in said
+    assert f"2.00x as fast as {IN_OPENVINO} (20 ms instead of 40 ms" in best.sentences[0]
+    assert best.sentences[1] == "That is a ratio of the instruction set of old (AVX2), on another core."
     assert "predictions for the board decided (fast 12.5 ms, ort 15 ms, float32 20 ms" in said
 
 
 def test_a_fast_host_does_not_speak_for_the_other_engine():
     best = choose(baseline(), judged("ort", 1.0, 10.0, 9.0), judged("fast", 20.0, 40.0, None))
     assert best.row.name == "ort"
+    assert (
+        best.sentences[1] == "That is a ratio of this host's own instruction set (AVX512_CORE_VNNI), not of old (AVX2)."
+    )
     assert not any("OpenVINO" in each and "1.00x" in each for each in best.sentences)
 
 

@@ -49,7 +49,9 @@ def _told(row: Row, what: str) -> tuple[Measurement, ...]:
 
 
 def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
-    """Return the rows with OpenVINO's measurements placed where they were taken: on a host that is confined."""
+    """Return the rows with OpenVINO's measurements placed where they were taken, if that is a host that is confined."""
+    if not where.confined:
+        return dict(rows)
 
     def moved(each: Measurement) -> Measurement:
         return replace(each, where=where.where) if each.origin == "measured" else each
@@ -60,13 +62,16 @@ def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet)
     }  # fmt: skip
 
 
-def choose_apart(judged: list[Judged], engines: Mapping[str, str], board: Sequence[str], small: bool) -> list[Judged]:
+def choose_apart(
+    judged: list[Judged], engines: Mapping[str, str], board: Sequence[str], where: BoardSet, small: bool = False
+) -> list[Judged]:
     """Mark one row as chosen: the best of each engine by its own float32, and of those the one that is predicted best.
 
     Args:
         judged: The baseline first.
         engines: Name -> engine of each candidate.
         board: The board's engines, the preferred one first: they decide where predictions are missing.
+        where: The set that OpenVINO is confined to.
         small: Whether memory was asked for, as for ``choose``.
     """
     base = judged[0]
@@ -87,7 +92,9 @@ def choose_apart(judged: list[Judged], engines: Mapping[str, str], board: Sequen
         best = firsts[min(firsts, key=lambda engine: rank.get(engine, len(rank)))]
         how = "Its engine is the one that the board's profile names first: between the engines nothing was measured."
     if best is not base:
-        return _marked(judged, best, replace(best, sentences=(*best.sentences, how)), best.row.reason)
+        first, *rest = best.sentences
+        sentences = (first, _of_which(engines[best.row.name], where), *rest, how)
+        return _marked(judged, best, replace(best, sentences=sentences), best.row.reason)
     told = "no candidate is predicted to be faster"
     return _marked(judged, base, replace(base, sentences=(f"{base.row.name} was kept: {told}.", how)),
                    f"{told}; {base.row.reason}")  # fmt: skip
@@ -121,6 +128,13 @@ def _reference(base: Judged, engine: str) -> Judged:
     return replace(base, row=row)
 
 
+def _of_which(engine: str, where: BoardSet) -> str:
+    """Say which instruction set a measured ratio is one of."""
+    if engine == ENGINE:
+        return f"That is a ratio of {where.ratio}."
+    return f"That is a ratio of {OWN_SET} ({where.host}), not of {where.board} ({where.wanted})."
+
+
 def on_board(row: Row, base: Row, engines: Mapping[str, str]) -> float:
     """Return the ms that a plan is expected to take on the board, infinite when there is no ground for it.
 
@@ -134,7 +148,11 @@ def on_board(row: Row, base: Row, engines: Mapping[str, str]) -> float:
 
 def _by_prediction(times: Mapping[str, float], engines: Mapping[str, str]) -> str:
     told = ", ".join(f"{name} {times[name]:.3g} ms" for name in sorted(times, key=lambda name: times[name]))
-    by = f"; {IN_OPENVINO} is predicted, its plans by their measured speed-ups" if ENGINE in engines.values() else ""
+    by = (
+        f"; {IN_OPENVINO} is predicted, its plans by their measured speed-ups"
+        if any(engines.get(name) == ENGINE for name in times)
+        else ""
+    )
     return f"Between the engines predictions for the board decided ({told}{by}): that was not measured."
 
 

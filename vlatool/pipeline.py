@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from vlatool import apart
-from vlatool.benchmark.latency import Latency
 from vlatool.bundle import Bundle
 from vlatool.choice import choose
 from vlatool.credibility import Credibility, credibility
-from vlatool.engines_apart import REFERENCE, about_int8, choose_apart, joined, placed
+from vlatool.engines_apart import about_int8, choose_apart, placed
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
@@ -22,10 +20,9 @@ from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
 from vlatool.host import MAX_CPU_ISA, fingerprint, matches
-from vlatool.instruction_sets import ENGINE, BoardSet, board_set
+from vlatool.instruction_sets import BoardSet, board_set
 from vlatool.judge import Judged, budget_of, judge
 from vlatool.launch import cached_measure, cached_transform
-from vlatool.predict import predictions
 from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
@@ -36,6 +33,7 @@ from vlatool.sources._description import FILE, read_description
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Stage, Tell, Transform, build_stage
+from vlatool.timings import Timing, engine_of, foretold_by_engine, now
 from vlatool.writing import writing
 
 BASELINE = "float32"
@@ -216,11 +214,6 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     return report
 
 
-def engine_of(bundle: Bundle) -> str:
-    """Return the engine that a bundle was made for."""
-    return bundle.manifest.engine or DEFAULT_ENGINE
-
-
 def judged_rows(
     plan: Plan, rows: dict[str, Row], engines: Mapping[str, str] | None = None
 ) -> tuple[list[Judged], Credibility]:
@@ -235,7 +228,7 @@ def judged_rows(
     judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
     small = plan.recipe.limits.max_memory_mb is not None
     if plan.profile and plan.board_set.confined:
-        judged = choose_apart(judged, engines or {}, tuple(plan.profile.engines), small)
+        judged = choose_apart(judged, engines or {}, tuple(plan.profile.engines), plan.board_set, small)
     else:
         judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
     trust = credibility(rows[BASELINE], BASELINE)
@@ -351,56 +344,15 @@ def _measure(
     plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context
 ) -> tuple[dict[str, Row], tuple[str, ...]]:
     """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
-    rows, warnings = _latency_rows(plan, source, bundles, context)
+    where = plan.board_set
+    rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
-    if plan.board_set.confined:
-        rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, plan.board_set)
+    rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.cache, context))
     if plan.profile:
-        foretold = {name: predictions(plan.profile, bundle) for name, bundle in bundles.items()}
-        if plan.board_set.confined:
-            own = predictions(plan.profile, bundles[BASELINE], ENGINE)
-            foretold[BASELINE] += [replace(each, name=REFERENCE) for each in own if each.name == "latency_p50"]
+        foretold = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}
     return rows, warnings
-
-
-def _latency_rows(
-    plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context
-) -> tuple[dict[str, Row], tuple[str, ...]]:
-    baseline = bundles[BASELINE]
-    if not plan.board_set.confined:
-        torch = [source] if source.manifest.source and source.path != baseline.path else []
-        return _timed(plan, bundles, torch, context)
-    own = {name: bundle for name, bundle in bundles.items() if name != BASELINE and engine_of(bundle) == ENGINE}
-    rest = {name: bundle for name, bundle in bundles.items() if name not in own}
-    rows, told = _timed(plan, rest, [], context)
-    theirs, more = _timed(plan, {BASELINE: baseline, **own}, [], context, ENGINE) if own else ({}, ())
-    return joined(rows, theirs, list(bundles), plan.board_set), tuple(dict.fromkeys((*told, *more)))
-
-
-def _timed(
-    plan: Plan, bundles: Mapping[str, Bundle], torch: list[Bundle], context: Context, engine: str = ""
-) -> tuple[dict[str, Row], tuple[str, ...]]:
-    """Time bundles in one run, float32 first, eager torch last; all in one engine where it is named."""
-    effort = plan.recipe.effort
-    others = [bundle for name, bundle in bundles.items() if name != BASELINE]
-    against = tuple(bundle.path for bundle in [*others, *torch])
-    stage = Latency(
-        against=against, iterations=effort.iterations, threads=effort.threads, duration=0, phase=False, engine=engine
-    )
-    begun = now()
-    report = cached_measure(stage, bundles[BASELINE], plan.cache, context, fresh=plan.fresh)
-    kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)
-    rows = dict(zip(bundles, report.rows, strict=False))
-    named = {name: replace(row, name=name) for name, row in rows.items()}
-    if torch:
-        eager = report.rows[-1].get("latency_p50")
-        if eager is not None:
-            own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
-            named[BASELINE] = replace(named[BASELINE], measurements=(*named[BASELINE].measurements, own))
-    told = ["; ".join(filter(None, (each.reason, each.remedy))) for each in report.findings if each.effect != "note"]
-    return named, (*report.warnings, *told, *(kept if report.created < begun else ()))
 
 
 def _report(
@@ -470,11 +422,6 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
 
 def _options(stage: Stage) -> str:
     return " ".join(f"{key}={value}" for key, value in stage.options().items())
-
-
-def now() -> str:
-    """Return the time in UTC, ISO 8601, to the second."""
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def sourced(source: str, cache: Path, context: Context) -> Bundle:
