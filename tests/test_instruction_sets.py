@@ -8,7 +8,7 @@ import pytest
 
 from vlatool import instruction_sets
 from vlatool.host import ISA_FEATURES, isa
-from vlatool.instruction_sets import RUNGS, BoardSet, board_set, compared, computed_in, rung
+from vlatool.instruction_sets import RUNGS, BoardSet, about_onnx_runtime, board_set, compared, computed_in, rung
 from vlatool.profile import load_profile
 
 NUC = ("avx2", "fma", "f16c", "avx_vnni")
@@ -128,6 +128,24 @@ def test_a_profile_says_its_set_where_it_runs_openvino(monkeypatch: pytest.Monke
     assert board_set(None) == BoardSet()
     monkeypatch.setattr(instruction_sets, "fingerprint", lambda: {"cpu": "13th Gen Intel(R) Core(TM) i7-1360P"})
     assert board_set(nuc) == BoardSet(), "on the board itself"
+
+
+@pytest.mark.parametrize(
+    ("board", "host", "says"),
+    [(OLD, ZEN4, "in this host's own set (AVX512_CORE_BF16), which has it: its speed-ups do not carry over."),
+     (OLD, OLD, "int8 may be slower than float32 there."), (OLD, ARM, "than float32 there."), (NUC, ZEN4, "")],
+)  # fmt: skip
+def test_a_board_of_onnx_runtime_alone_is_told_what_it_lacks(monkeypatch, board, host, says: str):
+    monkeypatch.setattr(instruction_sets, "isa", lambda: list(host))
+    nuc = load_profile("intel-nuc-13-pro")
+    units = {"cpu": nuc.units["cpu"].model_copy(update={"isa": board})}
+    alone = nuc.model_copy(update={"units": units, "engines": {"ort_cpu": nuc.engines["ort_cpu"]}})
+    assert "".join(about_onnx_runtime(alone)).endswith(says)
+    assert bool(about_onnx_runtime(alone)) == bool(says)
+    both = nuc.model_copy(update={"units": units})
+    assert (
+        about_onnx_runtime(both) == about_onnx_runtime(load_profile("raspberry-pi-5")) == about_onnx_runtime(None) == ()
+    )
 
 
 def test_flags_of_every_core_count(tmp_path: Path):

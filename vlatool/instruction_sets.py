@@ -186,6 +186,19 @@ def board_set(profile: Profile | None) -> BoardSet:
     return compared(profile.name, features, isa() or (), onednn_max_cpu_isa() or "")
 
 
+def about_onnx_runtime(profile: Profile | None) -> tuple[str, ...]:
+    """Say of an x86 board without VNNI that runs ONNX Runtime alone that int8 may lose there; else nothing."""
+    if profile is None or profile.engine != "ort_cpu" or ENGINE in profile.engines:
+        return ()
+    if rung(profile.units[profile.engines["ort_cpu"].unit].isa) not in SATURATING:
+        return ()
+    host = rung(isa() or ())
+    first = f"{profile.name} has no VNNI: int8 may be slower than float32 there."
+    if host in ("", *SATURATING):
+        return (first,)
+    return (f"{first} It was timed in this host's own set ({host}), which has it: its speed-ups do not carry over.",)
+
+
 def computed_in() -> str:
     """Return what OpenVINO computes in, in this process: what it is confined to, or the processor's highest set."""
     return onednn_max_cpu_isa() or rung(isa() or ())

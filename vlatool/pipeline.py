@@ -20,7 +20,7 @@ from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
 from vlatool.host import MAX_CPU_ISA, fingerprint, matches
-from vlatool.instruction_sets import BoardSet, board_set
+from vlatool.instruction_sets import BoardSet, about_onnx_runtime, board_set
 from vlatool.judge import Judged, budget_of, judge
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.profile import Profile
@@ -207,7 +207,8 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     chosen = next(item.row for item in judged if item.row.role == "chosen")
     chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
     report = _report(plan, baseline, judged, failures, warnings, trust, context)
-    told = (*about_int8(rows, engines, plan.board_set), *plan.board_set.sentences())
+    where = plan.board_set
+    told = (*about_int8(rows, engines, where), *about_onnx_runtime(plan.profile), *where.sentences())
     report = replace(report, summary=(*report.summary, *told, *_needs(chosen_bundle)))
     _write_bundle(plan, chosen, chosen_bundle, draft)
     write_reports(report, draft / "reports")

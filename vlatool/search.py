@@ -67,7 +67,8 @@ class Trial:
     Args:
         name: Name of the candidate that it may become.
         stages: What makes it.
-        speedup: Against float32 in ONNX Runtime, from a few inferences; 0 when it could not be made.
+        speedup: Against float32 in ONNX Runtime, or in ``engine`` where that is named, from a few inferences; 0 when it
+            could not be made.
         error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
         within: Whether ``error`` keeps to the budget.
         note: Why it could not be made.
