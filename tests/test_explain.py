@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -14,10 +15,11 @@ from vlatool.bundle import Bundle, seal
 from vlatool.cli import app
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, GraphError
-from vlatool.explain import Options, explain, explanation
+from vlatool.explain import Options, _Found, _times, explain, explanation
 from vlatool.explain._islands import QuantizedGraph, fallbacks, timed
 from vlatool.explain._operators import GROUPS, profile, shares
-from vlatool.explain._origin import command, origin
+from vlatool.explain._origin import command, observations_of, origin
+from vlatool.explain._remedy import measure
 from vlatool.launch import run_transform
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -25,6 +27,7 @@ from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.render import render
 from vlatool.render.terminal import TerminalRenderer
 from vlatool.report import Report
+from vlatool.runtime.policy import Policy
 from vlatool.stage import Context
 
 FRAGILE = "blocks.2"
@@ -211,6 +214,29 @@ def test_openvino_is_profiled_by_its_own_counters(fragile, made):
     assert any(row["operator"].startswith("FullyConnected") for row in details(report, "Time by operator"))
     assert details(report, "Layers that cost")[0]["layer"].startswith(FRAGILE)
     assert len(report.rows) == 2
+
+
+def test_where_openvino_is_confined_float32_is_compared_in_it_too(fragile, made, monkeypatch):
+    """A ratio to ONNX Runtime, which cannot be confined, would be one of two instruction sets."""
+    pytest.importorskip("openvino")
+    bundles = made(StaticInt8(samples=16, layout="openvino")), made(StaticInt8(samples=16))
+    opened: list[str] = []
+    start = Policy.__init__
+
+    def noted(self: Policy, bundle: Bundle, program: Any, engine: str) -> None:
+        opened.extend([engine] if bundle.hash == fragile.hash else [])
+        start(self, bundle, program, engine)
+
+    monkeypatch.setattr(Policy, "__init__", noted)
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    for told, wanted in (("", [{"ort_cpu"}, {"ort_cpu"}]), ("AVX2", [{"openvino"}, {"ort_cpu"}])):
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", told)
+        for bundle, engines in zip(bundles, wanted, strict=True):
+            opened.clear()
+            found = _Found(bundle, fragile, origin(bundle), observations_of(bundle, fragile, None, 2))
+            _times(found, Options(runs=2), Context())
+            measure(bundle, fragile, [], found.seen.values, Path(), 1, Context())
+            assert (set(opened), len(opened)) == (engines, 2)
 
 
 def test_attention_that_openvino_fuses_with_a_quantization_counts_as_computation(float_bundle, tmp_path):

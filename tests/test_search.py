@@ -173,3 +173,64 @@ def test_the_plan_of_a_trial_makes_the_bundle_that_was_tried(search, float_bundl
     assert isinstance(stage, StaticInt8)
     made = cached_transform(stage, float_bundle, tmp_path, Context())
     assert run._error(made, Context()) == trial.error
+
+
+@pytest.mark.parametrize(("isa", "tried"), [("[avx2, fma, f16c]", True), ("[avx2, fma, f16c, avx_vnni]", False)])
+def test_a_board_without_vnni_also_tries_products_that_do_not_saturate(tmp_path: Path, isa: str, tried: bool) -> None:
+    pytest.importorskip("openvino")
+    text = (Path(__file__).parents[1] / "profiles/intel-nuc-13-pro.yaml").read_text(encoding="utf-8")
+    (tmp_path / "board.yaml").write_text(text.replace("[avx2, fma, f16c, avx_vnni]", isa), encoding="utf-8")
+    found = variants_for(load_profile(tmp_path / "board.yaml"), calibrated=True)
+    assert ("openvino_int8_reduced" in found) is tried
+    assert "openvino_int8" in found, "int8 is tried, though it may lose"
+
+
+def test_engines_that_cannot_be_compared_have_finalists_of_their_own(search) -> None:
+    run = search()
+    run.trials = [
+        Trial("a", BAD, 4.0, 0.04, True, "", "ort_cpu"),
+        Trial("b", BAD, 0.7, 0.03, True, "", "openvino"),
+        Trial("c", BAD, 0.6, 0.09, False, "", "openvino"),
+        Trial("d", BAD, 2.0, 0.05, True, "", "ort_cpu"),
+    ]
+    assert [trial.name for trial in run._finalists()] == ["a", "b"]
+    run._apart = True
+    table = run.tables()["Plans tried by the search"]
+    assert [(each["plan"], each["against float32 in"]) for each in table] == [
+        ("b", "openvino"), ("c", "openvino"), ("a", "ort_cpu"), ("d", "ort_cpu"),
+    ]  # fmt: skip
+
+
+def test_a_plan_is_mended_though_another_engine_is_faster_on_this_host(search, monkeypatch) -> None:
+    mended: list[str] = []
+    monkeypatch.setattr(Search, "_mix", lambda _self, trial, _stage: mended.append(trial.name))
+    for engine, wanted in (("openvino", ["slow"]), ("ort_cpu", [])):
+        run = search()
+        run.trials = [
+            Trial("fast", BAD, 4.0, 0.01, True, "", "ort_cpu"),
+            Trial("slow", BAD, 2.0, 0.5, False, "", engine),
+        ]
+        mended.clear()
+        run._repair()
+        assert mended == wanted
+
+
+def test_a_trial_is_timed_against_float32_in_its_own_engine_where_engines_are_apart(search, monkeypatch) -> None:
+    pytest.importorskip("openvino")
+    seen: dict[str, str] = {}
+    measure = search_module.cached_measure
+
+    def watched(stage: Any, *more: Any) -> Any:
+        if stage.name() == "benchmark.latency":
+            seen[stage.against[0].name.split("-")[0]] = stage.engine
+        return measure(stage, *more)
+
+    monkeypatch.setattr(search_module, "cached_measure", watched)
+    run = search(metric="relative_error", max_metric=0.5)
+    run._apart = True
+    own = run._try("own", ({"quantize.dynamic_int8": {}},))
+    other = run._try("other", ({"quantize.static_int8": {"samples": 8, "layout": "openvino"}},))
+    assert seen == {"quantize.dynamic_int8": "ort_cpu", "quantize.static_int8": "openvino"}
+    assert (own.engine, other.engine) == ("ort_cpu", "openvino")
+    assert own.speedup > 0
+    assert other.speedup > 0

@@ -3,8 +3,11 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from vlatool import __version__, registry
+from vlatool import __version__, instruction_sets, registry
+from vlatool.benchmark.latency import Latency
 from vlatool.errors import RecipeError
+from vlatool.evaluate.recorded import Recorded
+from vlatool.export.onnx import ExportOnnx
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.sources.onnx import OnnxFile
@@ -73,6 +76,21 @@ def test_the_key_follows_options_and_source_and_nothing_else():
     assert len(set(keys)) == 3
     assert DynamicInt8().key("a") == keys[0]
     assert all(len(key) == 16 and int(key, 16) >= 0 for key in keys)
+
+
+def test_the_key_follows_what_openvino_computes_in_and_that_of_an_export_does_not(monkeypatch):
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    stages = (StaticInt8(), Latency(), Recorded(), ExportOnnx())
+    keys: list[list[str]] = []
+    for features, told in (
+        (["avx2", "avx512_vnni"], ""),
+        (["avx2", "avx512_vnni"], "AVX2"),
+        (["avx2", "avx_vnni"], ""),
+    ):
+        monkeypatch.setattr(instruction_sets, "isa", lambda found=features: found)
+        monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", told)
+        keys.append([stage.key("a") for stage in stages])
+    assert [len(set(each)) for each in zip(*keys, strict=True)] == [3, 3, 3, 1]
 
 
 def test_the_key_follows_the_content_of_files_and_not_their_age(tmp_path: Path):

@@ -25,6 +25,7 @@ from typing import Any
 from vlatool import trust
 from vlatool._apart_answers import ended, plain, read, result
 from vlatool.errors import SourceError
+from vlatool.host import MAX_CPU_ISA
 from vlatool.processes import SINGLE, import_path, python_command
 
 Tell = Callable[[str, float | None], None]
@@ -39,13 +40,13 @@ BLOCK = 1 << 16
 class _Server:
     """The process that forks the children."""
 
-    def __init__(self) -> None:
+    def __init__(self, environment: Mapping[str, str]) -> None:
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             quiet = subprocess.DEVNULL
             self.process = subprocess.Popen(
                 python_command("vlatool._apart_child", (str(theirs.fileno()),)),
-                stdin=quiet, stdout=quiet, stderr=quiet, pass_fds=[theirs.fileno()],
+                stdin=quiet, stdout=quiet, stderr=quiet, pass_fds=[theirs.fileno()], env=dict(environment),
             )  # fmt: skip
 
     def fork(self, preload: Sequence[str], fds: list[int]) -> None:
@@ -66,16 +67,19 @@ _servers: dict[tuple[str, ...], _Server] = {}
 _lock = threading.Lock()
 
 
-def _forked(preload: Sequence[str], fds: list[int]) -> None:
-    """Fork a child; start a server when there is none, when it has died, or when its libraries took other threads."""
-    kind = (str(os.getpid()), *(os.environ.get(name, "") for name in SINGLE))
+def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, str]) -> None:
+    """Fork a child; start a server when there is none, when it has died, or when its libraries were loaded otherwise.
+
+    Some variables are read when a library is loaded, as the number of threads and the instruction set are.
+    """
+    kind = (str(os.getpid()), *(environment.get(name, "") for name in (*SINGLE, MAX_CPU_ISA)))
     with _lock:
         if kind in _servers:
             with contextlib.suppress(OSError):
                 _servers[kind].fork(preload, fds)
                 return
             _servers.pop(kind).stop()
-        _servers[kind] = _Server()
+        _servers[kind] = _Server(environment)
         _servers[kind].fork(preload, fds)
 
 
@@ -92,9 +96,10 @@ class Apart:
     Args:
         about: Whose code it runs, for messages: ``policy.py``.
         preload: Modules that the server imports before it forks.
+        environment: Variables that it has beside those of this process.
     """
 
-    def __init__(self, about: str, preload: Sequence[str] = ()) -> None:
+    def __init__(self, about: str, preload: Sequence[str] = (), environment: Mapping[str, str] | None = None) -> None:
         self.about = about
         self._talk, talk = socket.socketpair()
         self._status, status = socket.socketpair()
@@ -102,14 +107,15 @@ class Apart:
         self._open: list[Any] = [self._talk, self._output, self._status]
         self._said = _Said(about)
         self._received = b""
+        variables = {**os.environ, **(environment or {})}
         try:
-            _forked(preload, [talk.fileno(), output, status.fileno()])
+            _forked(preload, [talk.fileno(), output, status.fileno()], variables)
         finally:
             talk.close()
             status.close()
             os.close(output)
         hello = {
-            "folder": os.getcwd(), "environment": dict(os.environ), "path": import_path(),
+            "folder": os.getcwd(), "environment": variables, "path": import_path(),
             "processors": sorted(os.sched_getaffinity(0)), "named": trust.named_so_far(),
         }  # fmt: skip
         self._send(hello)
@@ -199,9 +205,16 @@ class Apart:
             self._said.take(b"\n")
 
 
-def call(function: str, job: Mapping[str, Any], tell: Tell, about: str, preload: Sequence[str] = ()) -> Any:
-    """Call a function in a child of its own; see ``Apart.call``."""
-    with Apart(about, preload) as child:
+def call(
+    function: str,
+    job: Mapping[str, Any],
+    tell: Tell,
+    about: str,
+    preload: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+) -> Any:
+    """Call a function in a child of its own; see ``Apart`` and ``Apart.call``."""
+    with Apart(about, preload, environment) as child:
         return child.call(function, job, tell)
 
 

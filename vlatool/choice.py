@@ -96,7 +96,7 @@ def _times(row: Row, base: Row) -> str:
     return f"{p50(row):.4g} ms instead of {p50(base):.4g} ms, measured on this host"
 
 
-def _speed(row: Row, base: Row) -> str:
+def speed_words(row: Row, base: Row) -> str:
     """Return ``1.32x as fast as float32 (...)``, or that it is not faster, with the numbers for it."""
     times = ratio(row, base)
     speedup = row.get("speedup")
@@ -118,7 +118,7 @@ def _praise(best: Judged, judged: list[Judged], small: bool) -> tuple[str, ...]:
     if not is_faster(row, base):
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
         why = f" It was chosen because {reason}."
-    first = f"{row.name} is {_speed(row, base)}; {size}.{why}{success}"
+    first = f"{row.name} is {speed_words(row, base)}; {size}.{why}{success}"
     return (first, f"{row.reason[:1].upper()}{row.reason[1:]}.")
 
 
@@ -126,7 +126,7 @@ def _float32_kept(judged: list[Judged]) -> tuple[str, ...]:
     base = judged[0].row
     outside = [item for item in judged[1:] if not item.within and is_faster(item.row, base)]
     inside = [item for item in judged[1:] if item.within]
-    told = tuple(f"{item.row.name} is {_speed(item.row, base)}." for item in inside)
+    told = tuple(f"{item.row.name} is {speed_words(item.row, base)}." for item in inside)
     if outside:
         return (
             f"{base.name} was kept: no candidate inside the limits is faster on this host.",

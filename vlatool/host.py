@@ -35,6 +35,8 @@ ISA_FEATURES = (
     *("asimd", "asimdhp", "asimddp", "i8mm", "bf16", "sve", "sve2"),
 )
 """Names of ``/proc/cpuinfo`` that decide how fast a network runs."""
+MAX_CPU_ISA = "ONEDNN_MAX_CPU_ISA"
+"""The variable that confines oneDNN, and so OpenVINO, to an instruction set; read once, when it is loaded."""
 ARM_CORES = {
     ("0x41", "0xd03"): "Cortex-A53",
     ("0x41", "0xd05"): "Cortex-A55",
@@ -144,7 +146,7 @@ def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
 
     What is no name of an instruction set is told as ``?``: it may be anything, and reports are shared.
     """
-    said = variables.get("ONEDNN_MAX_CPU_ISA")
+    said = variables.get(MAX_CPU_ISA)
     return None if not said else said if re.fullmatch(r"[A-Za-z0-9_]{1,32}", said) else "?"
 
 

@@ -210,7 +210,12 @@ def _with_drop(row: Row, baseline: Row) -> Row:
         if own is not None and base is not None and own.known:
             found.append(
                 Measurement(
-                    drop, sign * (own.value - base.value), "1", samples=own.samples, note="recorded observations"
+                    drop,
+                    sign * (own.value - base.value),
+                    "1",
+                    where=own.where,
+                    samples=own.samples,
+                    note="recorded observations",
                 )
             )
     if not found:
@@ -219,7 +224,8 @@ def _with_drop(row: Row, baseline: Row) -> Row:
             agreement = against.name == "agreement_baseline"
             value = 1.0 - against.value if agreement else against.value
             name = "agreement_drop" if agreement else "error_increase"
-            found.append(Measurement(name, value, "1", samples=against.samples, note=AGAINST_FLOAT32))
+            where, count = against.where, against.samples
+            found.append(Measurement(name, value, "1", where=where, samples=count, note=AGAINST_FLOAT32))
     return replace(row, measurements=(*row.measurements, *found))
 
 

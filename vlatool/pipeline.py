@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from vlatool.benchmark.latency import Latency
+from vlatool import apart
 from vlatool.bundle import Bundle
 from vlatool.choice import choose
 from vlatool.credibility import Credibility, credibility
+from vlatool.engines_apart import about_int8, choose_apart, placed
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import EVALUATION, Recorded
@@ -19,20 +19,21 @@ from vlatool.evidence import unjudged, with_accuracy
 from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
-from vlatool.host import fingerprint, matches
+from vlatool.host import MAX_CPU_ISA, fingerprint, matches
+from vlatool.instruction_sets import BoardSet, about_onnx_runtime, board_set
 from vlatool.judge import Judged, budget_of, judge
 from vlatool.launch import cached_measure, cached_transform
-from vlatool.predict import predictions
 from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
-from vlatool.report import Report, Row
+from vlatool.report import Report, Row, read_report
 from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
 from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage import Context, Stage, Transform, build_stage
+from vlatool.stage import Context, Stage, Tell, Transform, build_stage
+from vlatool.timings import Timing, engine_of, foretold_by_engine, now
 from vlatool.writing import writing
 
 BASELINE = "float32"
@@ -54,6 +55,12 @@ class Plan:
     profile: Profile | None
     cache: Path
     fresh: bool = False
+    typed: str = ""
+
+    @property
+    def board_set(self) -> BoardSet:
+        """What OpenVINO computes in on the board, beside what it computes in here."""
+        return board_set(self.profile)
 
     @property
     def board(self) -> str:
@@ -87,6 +94,8 @@ class Plan:
         yield f"limits      {', '.join(_limits(limits))}"
         told = " (predicted, unless this host is that board)" if self.profile else " (measured)"
         yield f"profile     {self.board}{told}"
+        if computed := self.board_set.plan():
+            yield f"computes    {computed}"
         yield f"cache       {self.cache}"
 
 
@@ -144,48 +153,85 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
     for name in candidates:
         if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
             raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
-    return Plan(stage, policy, export, candidates, recipe, profile, cache, fresh)
+    return Plan(stage, policy, export, candidates, recipe, profile, cache, fresh, source)
 
 
 def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) -> Report:
     """Run a plan and write the chosen bundle with reports and the recipe that makes it again.
 
-    Finished stages are kept in the cache, so that an interrupted run continues where it was.
+    Finished stages are kept in the cache, so that an interrupted run continues where it was. Where OpenVINO must be
+    confined to compute as the board does, all of it runs in a process that has the variable from its start.
 
     Returns:
         The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept), ``inconclusive``
         when float32 does no better than actions that do not look at the observation.
     """
     with writing(out, force=force) as draft:
-        source = cached_transform(plan.source, None, plan.cache, context)
-        baseline = _chain(plan.export, source, plan, context)
-        _check_metric(plan, baseline, context)
-        plan, searched = _searched(plan, baseline, context)
-        bundles, failures = _candidates(plan, baseline, context)
-        rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
-        judged, trust = judged_rows(plan, rows)
-        tables = {**searched, **_explained(judged, bundles, baseline, context)}
-        judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
-        chosen = next(item.row for item in judged if item.row.role == "chosen")
-        chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
-        report = _report(plan, baseline, judged, failures, warnings, trust, context)
-        report = replace(report, summary=(*report.summary, *_needs(chosen_bundle)))
-        _write_bundle(plan, chosen, chosen_bundle, draft)
-        write_reports(report, draft / "reports")
+        if confine := plan.board_set.to_set:
+            return _confined(plan, confine, draft, context)
+        return _optimized(plan, draft, context)
+
+
+def _confined(plan: Plan, confine: str, draft: Path, context: Context) -> Report:
+    """Run a plan in a child whose OpenVINO, and that of its own children, is confined to an instruction set."""
+    assert plan.profile is not None
+    job = {
+        "source": plan.typed, "profile": plan.profile.model_dump(mode="json"), "cache": str(plan.cache),
+        "recipe": plan.recipe.model_dump(mode="json", by_alias=True), "fresh": plan.fresh, "draft": str(draft),
+        "workers": context.workers, "command": context.command,
+    }  # fmt: skip
+    about = f"optimize, confined to {confine},"
+    apart.call("vlatool.pipeline:optimize_here", job, context.tell, about, environment={MAX_CPU_ISA: confine})
+    return read_report(draft / "reports")
+
+
+def optimize_here(job: Mapping[str, Any], tell: Tell) -> None:
+    """Run the plan of a job in this process; its report is in the draft."""
+    profile, recipe = Profile.model_validate(job["profile"]), Recipe.model_validate(job["recipe"])
+    plan = make_plan(job["source"], profile, recipe, Path(job["cache"]), fresh=job["fresh"])
+    _optimized(plan, Path(job["draft"]), Context(tell, job["workers"], job["command"]))
+
+
+def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
+    """Run a plan in this process, and write everything into an empty directory."""
+    source = cached_transform(plan.source, None, plan.cache, context)
+    baseline = _chain(plan.export, source, plan, context)
+    _check_metric(plan, baseline, context)
+    plan, searched = _searched(plan, baseline, context)
+    bundles, failures = _candidates(plan, baseline, context)
+    rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
+    engines = {name: engine_of(bundle) for name, bundle in bundles.items()}
+    judged, trust = judged_rows(plan, rows, engines)
+    tables = {**searched, **_explained(judged, bundles, baseline, context)}
+    judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
+    chosen = next(item.row for item in judged if item.row.role == "chosen")
+    chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
+    report = _report(plan, baseline, judged, failures, warnings, trust, context)
+    where = plan.board_set
+    told = (*about_int8(rows, engines, where), *about_onnx_runtime(plan.profile), *where.sentences())
+    report = replace(report, summary=(*report.summary, *told, *_needs(chosen_bundle)))
+    _write_bundle(plan, chosen, chosen_bundle, draft)
+    write_reports(report, draft / "reports")
     return report
 
 
-def judged_rows(plan: Plan, rows: dict[str, Row]) -> tuple[list[Judged], Credibility]:
+def judged_rows(
+    plan: Plan, rows: dict[str, Row], engines: Mapping[str, str] | None = None
+) -> tuple[list[Judged], Credibility]:
     """Hold every row against the limits of the plan, choose one, and say whether float32 does its task.
 
     Args:
         plan: With limits and board.
         rows: Name -> row with everything that was measured and predicted, float32 first.
+        engines: Name -> engine of each candidate; needed where the engines cannot be compared.
     """
     on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
     judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
     small = plan.recipe.limits.max_memory_mb is not None
-    judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+    if plan.profile and plan.board_set.confined:
+        judged = choose_apart(judged, engines or {}, tuple(plan.profile.engines), plan.board_set, small)
+    else:
+        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
     trust = credibility(rows[BASELINE], BASELINE)
     if trust.table:
         judged[0] = _with_tables(judged[0], {"Whether the reference does its task": list(trust.table)})
@@ -299,35 +345,15 @@ def _measure(
     plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context
 ) -> tuple[dict[str, Row], tuple[str, ...]]:
     """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
-    rows, warnings = _latency_rows(plan, source, bundles, context)
+    where = plan.board_set
+    rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
+    rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.cache, context))
     if plan.profile:
-        foretold = {name: predictions(plan.profile, bundle) for name, bundle in bundles.items()}
+        foretold = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}
     return rows, warnings
-
-
-def _latency_rows(
-    plan: Plan, source: Bundle, bundles: dict[str, Bundle], context: Context
-) -> tuple[dict[str, Row], tuple[str, ...]]:
-    effort = plan.recipe.effort
-    torch = [source] if source.manifest.source and source.path != bundles[BASELINE].path else []
-    others = [bundle for name, bundle in bundles.items() if name != BASELINE]
-    against = tuple(bundle.path for bundle in [*others, *torch])
-    stage = Latency(against=against, iterations=effort.iterations, threads=effort.threads, duration=0, phase=False)
-    begun = now()
-    report = cached_measure(stage, bundles[BASELINE], plan.cache, context, fresh=plan.fresh)
-    kept = (f"the latencies were measured before, at {report.created}; --fresh measures again",)
-    rows = dict(zip(bundles, report.rows, strict=False))
-    named = {name: replace(row, name=name) for name, row in rows.items()}
-    if torch:
-        eager = report.rows[-1].get("latency_p50")
-        if eager is not None:
-            own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
-            named[BASELINE] = replace(named[BASELINE], measurements=(*named[BASELINE].measurements, own))
-    told = ["; ".join(filter(None, (each.reason, each.remedy))) for each in report.findings if each.effect != "note"]
-    return named, (*report.warnings, *told, *(kept if report.created < begun else ()))
 
 
 def _report(
@@ -349,7 +375,14 @@ def _report(
     limits |= {"max_latency_ms": wanted.max_latency_ms, "max_memory_mb": wanted.max_memory_mb}
     limits |= {} if wanted.metric else {"max_distance_percent": 100 * wanted.max_distance}
     warnings = tuple(
-        dict.fromkeys([*notes, *trust.warnings, *(warning for item in judged for warning in item.warnings)])
+        dict.fromkeys(
+            [
+                *plan.board_set.warnings(),
+                *notes,
+                *trust.warnings,
+                *(warning for item in judged for warning in item.warnings),
+            ]
+        )
     )
     return Report(
         "optimize",
@@ -390,11 +423,6 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
 
 def _options(stage: Stage) -> str:
     return " ".join(f"{key}={value}" for key, value in stage.options().items())
-
-
-def now() -> str:
-    """Return the time in UTC, ISO 8601, to the second."""
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def sourced(source: str, cache: Path, context: Context) -> Bundle:

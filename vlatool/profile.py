@@ -86,7 +86,8 @@ class Unit(_Strict):
         bandwidth_gb_s: Of its way to memory where that is less than the board's: a processor beside a graphics card,
             a module behind PCI Express.
         peak_tops: dtype -> 10^12 operations per second, dense, where a multiply-accumulate is two operations.
-        isa: Instruction set features that inference libraries use.
+        isa: Instruction set features that inference libraries use, as ``/proc/cpuinfo`` names them. Those of an x86
+            processor say what OpenVINO is confined to when a policy is optimized for it (``vlatool.instruction_sets``).
         absent: Features that a reader might expect and that are not there.
     """
 

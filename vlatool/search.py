@@ -27,12 +27,13 @@ from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.host import isa
+from vlatool.instruction_sets import VNNI, board_set
 from vlatool.judge import budget_of
 from vlatool.launch import cached_measure, cached_transform
 from vlatool.profile import Profile
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.recipe import Limits, StageList, stage_entries
-from vlatool.runtime.policy import refuse_findings
+from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
 from vlatool.stage import Context, Transform, build_stage
 
 if TYPE_CHECKING:
@@ -66,10 +67,12 @@ class Trial:
     Args:
         name: Name of the candidate that it may become.
         stages: What makes it.
-        speedup: Against float32 in ONNX Runtime, from a few inferences; 0 when it could not be made.
+        speedup: Against float32 in ONNX Runtime, or in ``engine`` where that is named, from a few inferences; 0 when it
+            could not be made.
         error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
         within: Whether ``error`` keeps to the budget.
         note: Why it could not be made.
+        engine: What its speed is compared within; empty where all plans are compared with each other.
     """
 
     name: str
@@ -78,6 +81,7 @@ class Trial:
     error: float = math.inf
     within: bool = False
     note: str = ""
+    engine: str = ""
 
 
 @dataclass
@@ -104,6 +108,7 @@ class Search:
         self.trials: list[Trial] = []
         self._seen: dict[str, str] = {}
         self._begun = time.monotonic()
+        self._apart = board_set(self.profile).confined
         self._planned = 1
         self._layers: list[LayerError] | None = None
         self._observations = recorded_observations(self.baseline, 256)
@@ -126,11 +131,12 @@ class Search:
                 {
                     "plan": trial.name,
                     "speed-up": f"{trial.speedup:.2f}x" if trial.speedup else "",
+                    **({"against float32 in": trial.engine} if self._apart else {}),
                     self.budget.name: f"{trial.error:.4g}" if math.isfinite(trial.error) else "",
                     "within": "yes" if trial.within else "no",
                     "note": trial.note,
                 }
-                for trial in sorted(self.trials, key=lambda trial: -trial.speedup)
+                for trial in sorted(self.trials, key=lambda trial: (trial.engine, -trial.speedup))
             ]
         }
         if self._layers:
@@ -157,10 +163,11 @@ class Search:
             twin = self._seen.setdefault(graphs_of(bundle), name)
             if twin != name:  # no product has enough rows to become a convolution, say
                 raise GraphError(f"It has the graphs of {twin}.")
-            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, **QUICK)
+            engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
+            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, engine=engine, **QUICK)
             speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
             error = self._error(bundle, quiet)
-            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value)
+            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine)
         except VlatoolError as failure:
             if failure.exit_code not in (3, 4):
                 raise
@@ -178,7 +185,8 @@ class Search:
     def _repair(self) -> None:
         """Leave sensitive layers in float where a plan is fast enough to be worth it, but outside the budget."""
         for trial in sorted(self.trials, key=lambda trial: -trial.speedup):
-            best = max((other.speedup for other in self.trials if other.within), default=0.0)
+            rivals = [other for other in self.trials if other.within and other.engine == trial.engine]
+            best = max((other.speedup for other in rivals), default=0.0)
             if trial.within or trial.speedup <= 1.05 * best or not math.isfinite(trial.error):
                 continue
             stage = built(trial.stages)[-1]
@@ -227,8 +235,13 @@ class Search:
         return self._layers
 
     def _finalists(self) -> list[Trial]:
-        """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
+        """Return the finalists of all plans that are compared with each other."""
         made = [trial for trial in self.trials if trial.speedup > 0]
+        engines = dict.fromkeys(trial.engine for trial in made)
+        return [each for engine in engines for each in self._finalists_of([t for t in made if t.engine == engine])]
+
+    def _finalists_of(self, made: list[Trial]) -> list[Trial]:
+        """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
         inside = sorted((trial for trial in made if trial.within), key=lambda trial: -trial.speedup)
         if not inside:
             return sorted(made, key=lambda trial: trial.error)[:1]
@@ -254,6 +267,9 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
             found["static_int8_attention"] = ({"quantize.static_int8": {"attention": True}},)
     if "openvino" in engines and importlib.util.find_spec("openvino") is not None:
         found.update(_openvino_variants(processor_has(profile, *BF16), processor_has(profile, *AMX), calibrated))
+        if calibrated and processor_has(profile, "avx2") and not processor_has(profile, *VNNI):
+            reduced = {"layout": "openvino", "reduce_range": True}  # products of 7 bits do not saturate
+            found["openvino_int8_reduced"] = ({"quantize.static_int8": reduced},)
     return found
 
 

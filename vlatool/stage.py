@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from vlatool import __version__, registry
 from vlatool.bundle import Bundle, hash_file
 from vlatool.errors import RecipeError, nearest
+from vlatool.instruction_sets import computed_in
 from vlatool.report import Report
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
+BEFORE_ENGINES = ("sources", "export")
+"""Kinds of stages whose output is the same whatever OpenVINO computes in."""
 RECORD = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
 
@@ -122,10 +125,15 @@ class Stage(BaseModel):
         return self.packages
 
     def key(self, source_hash: str) -> str:
-        """Return the cache key of this stage's output: 16 hex digits."""
+        """Return the cache key of this stage's output: 16 hex digits.
+
+        What OpenVINO answers and how fast it is depends on the instruction set that it computes in, and a bundle
+        records how far its engine is from its graphs.
+        """
         versions = {package: installed_version(package) for package in self.used_packages()}
         files = [_content(path) for path in self.inputs()]
         content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, __version__, RECORD]
+        content += [] if self.name().partition(".")[0] in BEFORE_ENGINES else [computed_in()]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 

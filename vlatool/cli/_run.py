@@ -14,7 +14,9 @@ import typer
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
-from vlatool.launch import cache_directory, run_transform
+from vlatool.host import MAX_CPU_ISA
+from vlatool.instruction_sets import ENGINE, board_set
+from vlatool.launch import cache_directory, measured_with, run_transform
 from vlatool.outputs import BUNDLE
 from vlatool.report import Report
 from vlatool.stage import Context, Measure, Stage, Transform
@@ -43,7 +45,13 @@ TRANSFORM_FLAGS = (
 )
 MEASURE_FLAGS = (
     _flag("out", Path | None, None, "-o", "--output", help="directory for report.html, report.md and report.json"),
-    _flag("profile", str | None, None, "--profile", help="add predictions for this board (see: vlatool profiles list)"),
+    _flag(
+        "profile",
+        str | None,
+        None,
+        "--profile",
+        help="add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set",
+    ),
     _flag(
         "workers",
         int | None,
@@ -172,10 +180,22 @@ def measure(
             from vlatool.launch.ssh import measure_on
 
             context = replace(context, elsewhere=partial(measure_on, target, python=remote_python or ""))
-        report = (stage if board is None else stage.on(board)).run(bundle, context)
+        report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
     show(report, as_json=as_json, out=out, force=force)
+
+
+def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Context) -> Report:
+    """Run a stage here; evaluate a bundle of OpenVINO in the board's instruction set, where this host has that."""
+    engine = getattr(stage, "engine", "") or bundle.manifest.engine
+    if board is None or stage.kind() != "evaluate" or engine != ENGINE:
+        return stage.run(bundle, context)
+    computes = board_set(board)
+    confine = {MAX_CPU_ISA: computes.to_set}
+    report = measured_with(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)
+    summary, warnings = (*report.summary, *computes.about_errors()), (*report.warnings, *computes.warnings())
+    return replace(report, summary=summary, warnings=warnings)
 
 
 def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:

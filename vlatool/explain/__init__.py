@@ -15,7 +15,7 @@ from vlatool.errors import BundleError, VlatoolError
 from vlatool.explain import _tables as tables
 from vlatool.explain._bfloat16 import Phases, phases, told
 from vlatool.explain._islands import Fallback, Island, QuantizedGraph, fallbacks, timed
-from vlatool.explain._operators import Operator, profile, table
+from vlatool.explain._operators import Operator, profile, reference_engine, table
 from vlatool.explain._origin import (
     Observations,
     Origin,
@@ -184,7 +184,8 @@ def _times(found: _Found, options: Options, context: Context) -> None:
     found.operators = profile(found.bundle, values, options.runs, options.threads)
     if found.baseline is not None:
         context.tell("profiling the operators of float32", None)
-        found.before = profile(found.baseline, values, options.runs, options.threads)
+        compared = reference_engine(found.bundle)
+        found.before = profile(found.baseline, values, options.runs, options.threads, compared)
     engine = found.bundle.manifest.engine or DEFAULT_ENGINE
     for name, graph in found.bundle.manifest.graphs.items():
         seen = QuantizedGraph(name, found.bundle.file(graph.file))

@@ -15,6 +15,8 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, require
+from vlatool.host import onednn_max_cpu_isa
+from vlatool.instruction_sets import ENGINE
 from vlatool.runtime.engines.openvino import DEVICE, settings_for
 from vlatool.runtime.policy import DEFAULT_ENGINE, Policy
 from vlatool.runtime.program import Program
@@ -74,15 +76,16 @@ class _Profiled(Protocol):
 
 
 def profile(
-    bundle: Bundle, observations: Sequence[Mapping[str, Any]], runs: int = 20, threads: int = 1
+    bundle: Bundle, observations: Sequence[Mapping[str, Any]], runs: int = 20, threads: int = 1, engine: str = ""
 ) -> list[Operator]:
-    """Run a bundle on its own engine with the engine's profiler on.
+    """Run a bundle with the engine's profiler on.
 
     Args:
         bundle: What is profiled.
         observations: Raw observations, taken in turn.
         runs: Inferences that count; three before them do not.
         threads: Intra-op threads.
+        engine: The bundle's own when empty.
 
     Returns:
         Every operator that ran, the slowest first.
@@ -90,7 +93,7 @@ def profile(
     Raises:
         GraphError: when the engine has no profiler here, or fails.
     """
-    engine = bundle.manifest.engine or DEFAULT_ENGINE
+    engine = engine or bundle.manifest.engine or DEFAULT_ENGINE
     opened = PROFILERS.get(engine)
     if opened is None:
         raise GraphError(f"The engine {engine} cannot be profiled; allowed: ort_cpu, openvino.")
@@ -107,6 +110,14 @@ def profile(
             turns[step.graph] += step.repeat
         found = [each for name, session in sessions.items() for each in _operators(name, session, turns[name], engine)]
     return sorted(found, key=lambda each: -each.ms)
+
+
+def reference_engine(bundle: Bundle) -> str:
+    """Return the engine that float32 runs in when a bundle is compared with it; empty for float32's own.
+
+    Where OpenVINO is confined to an instruction set, a ratio to ONNX Runtime, which cannot be, is one of two sets.
+    """
+    return ENGINE if bundle.manifest.engine == ENGINE and onednn_max_cpu_isa() else ""
 
 
 def _operators(graph: str, session: _Profiled, turns: int, engine: str) -> Iterable[Operator]:

@@ -14,6 +14,7 @@ from vlatool.benchmark._contest import Contestant, run_interleaved
 from vlatool.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.explain._islands import Fallback
+from vlatool.explain._operators import reference_engine
 from vlatool.launch import run_transform
 from vlatool.quantize._sensitivity import LayerError
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -156,7 +157,8 @@ def measure(
         if each.bundle is None:
             continue
         context.tell(f"errors of the candidate: {each.name}", None)
-        policy = Policy.open(each.bundle, threads=threads, seed=0)
+        engine = reference_engine(bundle) if each is base else ""
+        policy = Policy.open(each.bundle, engine=engine, threads=threads, seed=0)
         outputs = _outputs(policy, observations)
         if base is not None:
             reference = reference or outputs

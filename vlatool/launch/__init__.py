@@ -9,6 +9,7 @@ from pathlib import Path
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError
 from vlatool.host import cache_directory as cache_directory
+from vlatool.launch._inside import measured_with as measured_with
 from vlatool.launch._inside import run_apart
 from vlatool.outputs import BUNDLE, refuse_replacing
 from vlatool.report import REPORT, Report, read_report

@@ -1,4 +1,4 @@
-"""A stage that runs a user's code, in a child process: what ``run_transform`` asks for, and what answers there."""
+"""A stage in a child process, for it runs a user's code or needs variables of its own: what asks, and what answers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 from vlatool import apart
 from vlatool.bundle import Bundle
 from vlatool.errors import RecipeError
-from vlatool.stage import Context, Transform, build_stage
+from vlatool.report import Report
+from vlatool.stage import Context, Measure, Transform, build_stage
 
 PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)
 """What such stages need; imported once, by the server that forks the children."""
@@ -38,3 +39,27 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
     made = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"]))
     return {"hash": made.hash}
+
+
+def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:
+    """Run a measuring stage in a child process that has further variables from its start.
+
+    Raises:
+        VlatoolError: what the stage raises.
+    """
+    job = {
+        "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
+        "source": str(source.path.absolute()), "command": context.command,
+    }  # fmt: skip
+    about = f"{stage.name()} with {' '.join(f'{name}={value}' for name, value in environment.items())}"
+    told = apart.call("vlatool.launch._inside:measure", job, context.tell, about, environment=environment)
+    return Report.from_json(str(told))
+
+
+def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
+    """Run the measuring stage of a job in this process; return its report as JSON."""
+    stage = build_stage(job["stage"], job["options"])
+    if not isinstance(stage, Measure):
+        raise RecipeError(f"The stage {job['stage']} makes a bundle; it measures nothing.")
+    source = Bundle.open(Path(job["source"]), verify=False)
+    return stage.run(source, Context(tell, job["workers"], job["command"])).to_json()
