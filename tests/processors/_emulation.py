@@ -34,6 +34,8 @@ SILENT = re.compile(
     re.IGNORECASE,
 )
 """What apt and pip say when a registry does not answer, and not when it answers that it has no such thing."""
+ANSWERED = re.compile(r"hash sum mismatch|hashes|no space left|permission denied|size mismatch", re.IGNORECASE)
+"""What they say when it did answer, whatever else they had to try again before."""
 LIBRARIES = ("onnxruntime/capi/onnxruntime_pybind11_state*.so", "numpy/_core/_multiarray_umath*.so")
 """What has to be in the wheels."""
 LEAST_BYTES = 1_000_000
@@ -234,11 +236,13 @@ def told(words: Sequence[str], registry: str, variables: Mapping[str, str] | Non
     if registry and (line := silent(done.stderr)):
         raise Unreachable(f"{registry} does not answer: {line}")
     lines = [line for line in done.stderr.splitlines() if line.strip()]
-    raise EmulationError(f"{Path(words[0]).name} left with {done.returncode}: {' / '.join(lines[-3:])[:600]}")
+    raise EmulationError(f"{Path(words[0]).name} left with {done.returncode}: {' / '.join(lines[-2:])[-400:]}")
 
 
 def silent(stderr: str) -> str:
-    """Return the line that says that a registry does not answer; empty when there is none."""
+    """Return the line that says that a registry does not answer; empty when there is none, or another says it did."""
+    if ANSWERED.search(stderr):
+        return ""
     return next((line.strip()[:200] for line in stderr.splitlines() if SILENT.search(line)), "")
 
 

@@ -64,6 +64,5 @@ def model(text: str) -> str:
     found = re.search(r"^model name\s*:\s*(.*)$", text, re.MULTILINE)
     wanted = ("amx_int8", "avx512_vnni", "avx_vnni", "avx512_bf16", "avx512f", "avx2")
     has = [flag for flag in wanted if flag in flags(text)]
-    return (
-        f"{found[1].strip() if found else 'a processor without a name'} ({', '.join(has) or 'none of ' + wanted[-1]})"
-    )
+    name = found[1].strip() if found else "a processor without a name"
+    return f"{name} ({', '.join(has) or 'without AVX2'})"

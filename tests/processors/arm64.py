@@ -1,7 +1,7 @@
 """The runtime on emulated 64-bit ARM: does every bundle load there, and answer what it answers here?
 
 Usage: python tests/processors/arm64.py [--sources SOURCE ...] [--cores CORE ...] [--onnxruntime VERSION ...]
-           [--observations COUNT] [-o out/processors]
+           [--newest] [--observations COUNT] [-o out/processors]
 
 Prints a table of agreement with this host, which computes the same observations from the same bundles. Exits 1 when a
 row is above its limit, when a bundle does not load, and when one loads that ARM computes otherwise. Never a timing:
@@ -55,9 +55,13 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--sources", nargs="+", default=SAMPLES, help="what vlatool export takes")
     parser.add_argument("--cores", nargs="+", default=CORES, help="as QEMU calls them")
     parser.add_argument("--onnxruntime", nargs="+", default=(OLDEST, OrtCpuSession.version()), help="versions")
+    parser.add_argument("--newest", action="store_true", help="only the version that this host runs")
     parser.add_argument("--observations", type=int, default=8, help="of each recording, spread evenly; 0: all")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/processors"), help="cache, bundles and answers")
-    return parser.parse_args(arguments)
+    given = parser.parse_args(arguments)
+    if given.newest:
+        given.onnxruntime = (OrtCpuSession.version(),)
+    return given
 
 
 def rows_of(source: str, given: argparse.Namespace, cache: Emulators) -> list[Row]:

@@ -38,6 +38,7 @@ def test_a_registry_that_does_not_answer_is_told_from_one_that_does(stderr):
         "ERROR: No matching distribution found for onnxruntime==9.9.9",
         "E: Unable to locate package qemu-user",
         "E: Failed to fetch http://mirror/qemu.deb  Hash Sum mismatch",
+        f"{PIP}\nERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE.",
         "ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device",
         "",
     ],
