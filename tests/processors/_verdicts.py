@@ -11,6 +11,8 @@ import numpy as np
 
 RIGHT, REFUSED, WARNED, SKIPPED, WRONG, UNTRUE = "ok", "refused", "warned", "not tried", "WRONG", "NOT REFUSED"
 BAD = (WRONG, UNTRUE)
+OF_ONE = 2.0
+"""How many times the limit of all observations a single one may differ: a small action makes a large relative one."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,10 @@ class Difference:
     of_all: float
     others: int
 
+    def within(self, limit: float) -> bool:
+        """Say whether all of them together keep to a limit, and each of them to ``OF_ONE`` times as much."""
+        return self.of_all <= limit and self.worst <= OF_ONE * limit
+
 
 @dataclass(frozen=True)
 class Row:
@@ -36,7 +42,7 @@ class Row:
         where: Words that say which processor, engine and policy.
         bundle: The variant.
         difference: From what the actions should be; None when there are none.
-        limit: Largest ``worst`` that is rounding.
+        limit: Largest difference of all observations together that is rounding.
         refused: With which error ``load`` refuses it; empty when it loads.
         warned: What warns about it before it runs; empty when nothing does.
         must: ``load``: it has to load; ``refuse``: it has to be refused; ``tell``: either of refused, warned or right.
@@ -63,7 +69,7 @@ class Row:
             return REFUSED if self.refused == "GraphError" else UNTRUE
         if self.refused:
             return REFUSED if self.must == "tell" and self.refused != "crash" else WRONG
-        if self.difference is not None and self.difference.worst <= self.limit:
+        if self.difference is not None and self.difference.within(self.limit):
             return RIGHT
         return WARNED if self.warned and self.must == "tell" else WRONG
 

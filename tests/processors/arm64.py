@@ -18,6 +18,7 @@ from pathlib import Path
 from _asked import Answer, ask
 from _emulation import EmulationError, Emulators, Unreachable
 from _planted import plant
+from _rungs import CPUINFO, model
 from _variants import FLOAT, FOR_ARM, SAMPLES, Made, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 
@@ -45,7 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     rows = [row for source in given.sources for row in rows_of(source, given, cache)]
     print("\n".join(table(("core", "onnxruntime", "policy"), rows)))
-    print(f"{summed_up(rows)}; the host: ONNX Runtime {OrtCpuSession.version()} on the processor of this machine")
+    host = model(CPUINFO.read_text())
+    print(f"{summed_up(rows)}; the host: onnxruntime {OrtCpuSession.version()} on {host}")
     return exit_code(rows)
 
 

@@ -3,11 +3,12 @@
 import arm64
 import ladder
 import numpy as np
+import onnxruntime
 import pytest
 from _asked import Answer
 from _emulation import EmulationError, Emulators, Unreachable
 from _rungs import RUNGS
-from _variants import FLOAT, FOR_ARM, FOR_X86, Made, observations
+from _variants import FLOAT, FOR_ARM, FOR_X86, Made, Variant, make, observations
 from arm64 import PLANTED, compared
 
 from vlatool.runtime.engines._arithmetic import EXACT, EXACT_BY_OPTION, SATURATING
@@ -113,3 +114,24 @@ def test_variants_have_names_and_folders_of_their_own_and_every_rung_has_some():
         assert len({variant.name.replace(" ", "-") for variant in variants}) == len(variants)
         assert all(0 < variant.limit <= 0.045 for variant in variants)
     assert all(any(rung.engine in variant.engines for variant in FOR_X86) for rung in RUNGS)
+
+
+def test_a_policy_becomes_bundles_and_what_cannot_be_made_is_told(policy_dir, tmp_path):
+    variants = (
+        FLOAT,
+        Variant("dynamic int8", ("quantize", "dynamic-int8")),
+        Variant("no such", ("quantize", "dynamic-int8", "--bits", "3")),
+    )
+    made = make(str(policy_dir), variants, tmp_path / "out", 2)
+    assert {name: path.name for name, path in made.bundles.items()} == {
+        "float32": "float32", "dynamic int8": "dynamic-int8",
+    }  # fmt: skip
+    assert "--bits" in made.refused["no such"]
+    assert (made.chosen, made.name) == (2, policy_dir.name)
+    with np.load(made.observations, allow_pickle=False) as stored:
+        assert stored["instruction"].dtype.kind == "U"
+
+
+def test_the_newest_is_what_this_host_runs():
+    assert arm64.parsed(["--newest"]).onnxruntime == (onnxruntime.__version__,)
+    assert arm64.parsed([]).onnxruntime == (arm64.OLDEST, onnxruntime.__version__)
