@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+from _variants import VariantError
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle import Bundle
@@ -29,17 +30,23 @@ def plant(source: Path, out: Path) -> Path:
     """Write a bundle that ARM computes otherwise.
 
     Args:
-        source: A float32 bundle of one graph.
+        source: A float32 bundle.
         out: Where the new one goes; what is there is removed.
+
+    Raises:
+        VariantError: when no graph of its last step gives the action.
     """
     shutil.rmtree(out, ignore_errors=True)
-    (out / "graphs").mkdir(parents=True)
     bundle = Bundle.open(source)
-    carry_over(bundle, out)
-    (graph,) = bundle.manifest.graphs.values()
-    model = onnx.load(source / graph.file)
-    convert(model.graph, model.graph.output[0].name)
-    onnx.save(model, out / graph.file)
+    last = bundle.manifest.program[-1]
+    file = bundle.manifest.graphs[last.graph].file
+    outputs = [output for output, value in last.gives.items() if value == bundle.manifest.spec.action.name]
+    if not outputs:
+        raise VariantError(f"The last step of {source} does not give the action, so nothing can be planted there.")
+    carry_over(bundle, out, ("assets", "data", "graphs"))
+    model = onnx.load(source / file)
+    convert(model.graph, outputs[0])
+    onnx.save(model, out / file)
     observations = observations_for(bundle, GOLDEN_COUNT)
     made_by = {"stage": "tests.planted", "options": {}}
     return finish(bundle, out, made_by=made_by, graphs=bundle.manifest.graphs, observations=observations).path

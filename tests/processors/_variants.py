@@ -15,8 +15,12 @@ from vlatool.finish import ROUNDING
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ("sample_models/vln-babyai", "sample_models/vla-metaworld")
-FLOAT_LIMIT = 1e-4
-"""What sums of float32 in another order make; seen up to 3e-6."""
+FLOAT_LIMIT = 1e-5
+"""What sums of float32 in another order make; seen up to 6e-7."""
+INT8_LIMIT = 0.01
+"""What they make where they are rounded to int8 in between; seen up to 1.8e-3 between an ARM and an x86 processor."""
+HALF_LIMIT = 0.02
+"""The same of float16 and int4, whose kernels round otherwise on each processor; seen up to 5.5e-3."""
 STATIC = ("quantize", "static-int8")
 OPENVINO = (*STATIC, "--layout", "openvino")
 
@@ -34,8 +38,12 @@ class Variant:
 
     name: str
     command: tuple[str, ...]
-    limit: float = ROUNDING
+    limit: float = INT8_LIMIT
     engines: tuple[str, ...] = ("ort_cpu",)
+
+
+class VariantError(Exception):
+    """What the user is told instead of a traceback."""
 
 
 BOTH = ("ort_cpu", "openvino")
@@ -47,14 +55,14 @@ FOR_ARM = (
     Variant("ort int8", (*STATIC, "--activations", "int8")),
     Variant("qdq uint8", (*STATIC, "--layout", "qdq")),
     Variant("qdq int8", (*STATIC, "--layout", "qdq", "--activations", "int8")),
-    Variant("int4", ("quantize", "weight-only")),
-    Variant("int4 qdq", ("quantize", "weight-only", "--layout", "qdq")),
-    Variant("float16", ("quantize", "float16"), ROUNDING, BOTH),
+    Variant("int4", ("quantize", "weight-only"), HALF_LIMIT),
+    Variant("int4 qdq", ("quantize", "weight-only", "--layout", "qdq"), ROUNDING),
+    Variant("float16", ("quantize", "float16"), HALF_LIMIT),
 )
 """What ONNX Runtime runs on 64-bit ARM."""
 FOR_X86 = (
     FLOAT,
-    *(Variant(each.name, each.command, each.limit, BOTH) for each in FOR_ARM[1:]),
+    *(Variant(each.name, each.command, ROUNDING, BOTH) for each in FOR_ARM[1:]),
     Variant("openvino", OPENVINO, ROUNDING, BOTH),
     Variant("openvino uint8", (*OPENVINO, "--activations", "uint8"), ROUNDING, BOTH),
     Variant("openvino 7-bit", (*OPENVINO, "--reduce-range"), ROUNDING, BOTH),
@@ -96,11 +104,11 @@ def make(source: str, variants: Sequence[Variant], out: Path, count: int) -> Mad
         count: Observations, spread evenly over the recording; all when 0.
 
     Raises:
-        RuntimeError: when the policy cannot be exported, or has no recorded observations.
+        VariantError: when the policy cannot be exported, or has no recorded observations.
     """
     bundles, refused = {FLOAT.name: out / FLOAT.name}, {}
     if error := vlatool("export", source, "-o", str(out / FLOAT.name)):
-        raise RuntimeError(f"{source} cannot be exported: {error}")
+        raise VariantError(f"{source} cannot be exported: {error}")
     for variant in variants:
         if not variant.command:
             continue
@@ -129,14 +137,14 @@ def observations(bundle: Path, count: int) -> tuple[dict[str, Any], int]:
     """Return recorded observations, input -> array with a leading sample axis, and how many there were.
 
     Raises:
-        RuntimeError: when the bundle carries none.
+        VariantError: when the bundle carries none.
     """
     from vlatool.bundle import Bundle
     from vlatool.data import EVALUATION, read_recording
 
     opened = Bundle.open(bundle)
     if EVALUATION not in opened.manifest.files:
-        raise RuntimeError(f"{bundle} carries no recorded observations.")
+        raise VariantError(f"{bundle} carries no recorded observations.")
     recording = read_recording(opened.path / EVALUATION, opened.manifest.spec)
     rows = recording.spread(count or len(recording))
     return {name: values[rows] for name, values in recording.inputs.items()}, len(recording)

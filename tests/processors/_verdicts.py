@@ -22,12 +22,10 @@ class Difference:
     Args:
         worst: Largest relative L2 difference of one observation.
         of_all: Relative L2 difference of all of them together.
-        others: Observations on which the largest element, a discrete action, is another one.
     """
 
     worst: float
     of_all: float
-    others: int
 
     def within(self, limit: float) -> bool:
         """Say whether all of them together keep to a limit, and each of them to ``OF_ONE`` times as much."""
@@ -82,15 +80,15 @@ def difference(got: Any, wanted: Any) -> Difference:
         wanted: The same.
     """
     if got.shape != wanted.shape:
-        return Difference(math.inf, math.inf, len(wanted))
+        return Difference(math.inf, math.inf)
     count = len(wanted)
     one, other = (np.asarray(each, np.float64).reshape(count, -1) for each in (got, wanted))
     if not np.isfinite(one).all() or not np.isfinite(other).all():
-        return Difference(math.inf, math.inf, count)
+        return Difference(math.inf, math.inf)
     apart, sizes = np.linalg.norm(one - other, axis=1), np.linalg.norm(other, axis=1)
     worst = float((apart / np.where(sizes > 0, sizes, 1)).max())
     total = float(np.linalg.norm(apart)) / (float(np.linalg.norm(sizes)) or 1.0)
-    return Difference(worst, total, int((one.argmax(1) != other.argmax(1)).sum()))
+    return Difference(worst, total)
 
 
 def table(titles: Sequence[str], rows: Iterable[Row]) -> list[str]:

@@ -1,7 +1,7 @@
 """The runtime on emulated 64-bit ARM: does every bundle load there, and answer what it answers here?
 
 Usage: python tests/processors/arm64.py [--sources SOURCE ...] [--cores CORE ...] [--onnxruntime VERSION ...]
-           [--newest] [--observations COUNT] [-o out/processors]
+           [--newest] [--observations COUNT] [--jobs COUNT] [-o out/processors]
 
 Prints a table of agreement with this host, which computes the same observations from the same bundles. Exits 1 when a
 row is above its limit, when a bundle does not load, and when one loads that ARM computes otherwise. Never a timing:
@@ -11,15 +11,18 @@ emulation is some 300 times slower. Where a registry does not answer, says so in
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path
 
 from _asked import Answer, ask
 from _emulation import EmulationError, Emulators, Unreachable
 from _planted import plant
 from _rungs import CPUINFO, model
-from _variants import FLOAT, FOR_ARM, SAMPLES, Made, make
+from _variants import FLOAT, FOR_ARM, SAMPLES, Made, VariantError, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
@@ -37,14 +40,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cache = Emulators(given.output.resolve())
     try:
         cache.folder.mkdir(parents=True, exist_ok=True)
-        cache.python(), [cache.wheels(version) for version in given.onnxruntime]
+        fetch(cache, given.onnxruntime)
+        rows = [row for source in given.sources for row in rows_of(source, given, cache)]
     except Unreachable as error:
         print(f"make arm64: skipped, nothing was tried: {error}")
         return 0
-    except EmulationError as error:
+    except (EmulationError, VariantError) as error:
         print(f"make arm64: {error}", file=sys.stderr)
         return 1
-    rows = [row for source in given.sources for row in rows_of(source, given, cache)]
     print("\n".join(table(("core", "onnxruntime", "policy"), rows)))
     host = model(CPUINFO.read_text())
     print(f"{summed_up(rows)}; the host: onnxruntime {OrtCpuSession.version()} on {host}")
@@ -59,11 +62,21 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--onnxruntime", nargs="+", default=(OLDEST, OrtCpuSession.version()), help="versions")
     parser.add_argument("--newest", action="store_true", help="only the version that this host runs")
     parser.add_argument("--observations", type=int, default=8, help="of each recording, spread evenly; 0: all")
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="boards at the same time")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/processors"), help="cache, bundles and answers")
     given = parser.parse_args(arguments)
     if given.newest:
         given.onnxruntime = (OrtCpuSession.version(),)
     return given
+
+
+def fetch(cache: Emulators, versions: Sequence[str]) -> None:
+    """Fetch what is not in the cache: afterwards nothing is asked of a registry."""
+    cache.folder.mkdir(parents=True, exist_ok=True)
+    cache.qemu("aarch64")
+    cache.board()
+    for version in versions:
+        cache.wheels(version)
 
 
 def rows_of(source: str, given: argparse.Namespace, cache: Emulators) -> list[Row]:
@@ -73,16 +86,23 @@ def rows_of(source: str, given: argparse.Namespace, cache: Emulators) -> list[Ro
     bundles = {**made.bundles, PLANTED: plant(made.bundles[FLOAT.name], cache.folder / "bundles" / name / PLANTED)}
     print(f"{name}: {made.chosen} of {made.recorded} recorded observations", flush=True)
     here = ask([sys.executable], bundles, made.observations, cache.folder / "answers" / name / "host")
-    rows = unmade(made)
-    for core in given.cores:
-        for version in given.onnxruntime:
-            print(f"{name} on {core}, onnxruntime {version}", flush=True)
-            python = [*cache.emulated("aarch64", core), str(cache.python())]
-            path = {"PYTHONPATH": f"{cache.wheels(version)}:{Path(__file__).parents[2]}"}
-            out = cache.folder / "answers" / name / f"{core}-{version}"
-            there = ask(python, bundles, made.observations, out, variables=path)
-            rows += compared((core, version, name), here, there)
-    return rows
+    boards = list(product(given.cores, given.onnxruntime))
+    with ThreadPoolExecutor(given.jobs) as pool:
+        there = pool.map(lambda board: asked(*board, made, bundles, cache), boards)
+    answers = zip(boards, there, strict=True)
+    return unmade(made) + [row for board, each in answers for row in compared((*board, name), here, each)]
+
+
+def asked(core: str, version: str, made: Made, bundles: dict[str, Path], cache: Emulators) -> dict[str, Answer]:
+    """Ask every bundle on an emulated board."""
+    python = [*cache.emulated("aarch64", core), str(cache.python())]
+    path = {"PYTHONPATH": f"{cache.wheels(version)}:{Path(__file__).parents[2]}"}
+    out = cache.folder / "answers" / made.name / f"{core}-{version}"
+
+    def tell(line: str) -> None:
+        print(f"{made.name} on {core}, onnxruntime {version}: {line.strip()}", flush=True)
+
+    return ask(python, bundles, made.observations, out, variables=path, tell=tell)
 
 
 def unmade(made: Made) -> list[Row]:

@@ -21,7 +21,7 @@ import numpy as np
 from _asked import Answer, ask
 from _emulation import EmulationError, Emulators, Unreachable
 from _rungs import CPUINFO, RUNGS, VARIABLE, Rung, flags, model
-from _variants import FOR_X86, SAMPLES, Made, Variant, make
+from _variants import FOR_X86, SAMPLES, Made, Variant, VariantError, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 from answers import actions
 
@@ -41,7 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     text = CPUINFO.read_text()
     cache = Emulators(given.output.resolve())
     rungs = tried(flags(text), cache)
-    rows = [row for source in given.sources for row in rows_of(source, given, cache, rungs)]
+    try:
+        rows = [row for source in given.sources for row in rows_of(source, given, cache, rungs)]
+    except VariantError as error:
+        print(f"make ladder: {error}", file=sys.stderr)
+        return 1
     print("\n".join(table(("engine", "instruction set", "policy"), rows)))
     print(f"{summed_up(rows)}; the host: {model(text)}")
     return exit_code(rows)

@@ -22,7 +22,7 @@ def fails(monkeypatch, error: Exception) -> None:
     def fetch(self, *names):
         raise error
 
-    for name in ("python", "qemu"):
+    for name in ("board", "qemu"):
         monkeypatch.setattr(Emulators, name, fetch)
 
 
