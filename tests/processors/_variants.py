@@ -33,13 +33,15 @@ class Variant:
         name: What the table calls it, and its folder.
         command: Words of ``vlatool`` that make it of the float32 bundle; the float32 bundle itself when empty.
         limit: Largest relative L2 difference of its actions that is rounding.
-        engines: Engines that it is tried with; those that ``load`` would take when empty.
+        engines: Engines that it is tried with.
+        optional: Whether a processor may lack what making it needs.
     """
 
     name: str
     command: tuple[str, ...]
     limit: float = INT8_LIMIT
     engines: tuple[str, ...] = ("ort_cpu",)
+    optional: bool = False
 
 
 class VariantError(Exception):
@@ -67,8 +69,8 @@ FOR_X86 = (
     Variant("openvino uint8", (*OPENVINO, "--activations", "uint8"), ROUNDING, BOTH),
     Variant("openvino 7-bit", (*OPENVINO, "--reduce-range"), ROUNDING, BOTH),
     Variant("openvino convolutions", (*OPENVINO, "--convolutions"), ROUNDING, BOTH),
-    Variant("openvino bfloat16", (*OPENVINO, "--compute", "bfloat16"), ROUNDING, ("openvino",)),
-    Variant("bfloat16", ("quantize", "bfloat16"), ROUNDING, ("openvino",)),
+    Variant("openvino bfloat16", (*OPENVINO, "--compute", "bfloat16"), ROUNDING, ("openvino",), optional=True),
+    Variant("bfloat16", ("quantize", "bfloat16"), ROUNDING, ("openvino",), optional=True),
 )
 """What an x86 host can be given."""
 

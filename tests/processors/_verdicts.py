@@ -43,7 +43,8 @@ class Row:
         limit: Largest difference of all observations together that is rounding.
         refused: With which error ``load`` refuses it; empty when it loads.
         warned: What warns about it before it runs; empty when nothing does.
-        must: ``load``: it has to load; ``refuse``: it has to be refused; ``tell``: either of refused, warned or right.
+        must: ``load``: it has to load; ``refuse``: it has to be refused; ``tell``: right, or refused for what it
+            computes, or warned about.
         note: What else is to be said.
         skipped: Why it was not tried; empty when it was.
     """
@@ -66,7 +67,7 @@ class Row:
         if self.must == "refuse":
             return REFUSED if self.refused == "GraphError" else UNTRUE
         if self.refused:
-            return REFUSED if self.must == "tell" and self.refused != "crash" else WRONG
+            return REFUSED if self.must == "tell" and self.refused == "GraphError" else WRONG
         if self.difference is not None and self.difference.within(self.limit):
             return RIGHT
         return WARNED if self.warned and self.must == "tell" else WRONG

@@ -116,8 +116,14 @@ def climbed(rung: Rung, made: Made, said: Mapping[str, Any], cache: Emulators, e
     found = ask(python, bundles, observations, out, rung.engine, rung.variables)
     where = (rung.engine, rung.name, made.name)
     rows = [row(where, variants[name], answer, said[name], bundles[name]) for name, answer in found.items()]
-    unmade = {name: why for name, why in made.refused.items() if name in variants}
-    return rows + [Row(where, name, None, 0.0, "not made", must="tell", note=why) for name, why in unmade.items()]
+    return rows + [unmade(where, variants[name], why) for name, why in made.refused.items() if name in variants]
+
+
+def unmade(where: tuple[str, ...], variant: Variant, why: str) -> Row:
+    """Return the row of a bundle that could not be made: no fault where the processor may lack what it needs."""
+    if variant.optional:
+        return Row(where, variant.name, None, variant.limit, skipped=f"not made: {why}")
+    return Row(where, variant.name, None, variant.limit, "not made", note=why)
 
 
 def row(where: tuple[str, ...], variant: Variant, answer: Answer, said: Any, bundle: Path) -> Row:

@@ -93,6 +93,12 @@ def test_doctor_warns_of_int8_where_products_saturate(int8_bundle, arithmetic, b
     assert ladder.row(("openvino",), variant, answer, ACTIONS, int8_bundle.path).verdict == verdict
 
 
+def test_what_cannot_be_made_is_wrong_unless_the_processor_may_lack_what_it_needs():
+    verdicts = {each.name: ladder.unmade(("openvino",), each, "no such processor").verdict for each in FOR_X86}
+    assert {name for name, verdict in verdicts.items() if verdict == "not tried"} == {"openvino bfloat16", "bfloat16"}
+    assert {*verdicts.values()} == {"not tried", "WRONG"}
+
+
 def test_doctor_warns_of_no_float32(float_bundle):
     answer = Answer(ACTIONS * 1.2, arithmetic=SATURATING)
     assert ladder.row(("openvino",), FLOAT, answer, ACTIONS, float_bundle.path).verdict == "WRONG"

@@ -45,6 +45,7 @@ def test_another_size_and_what_is_no_number_differ_without_bound(got):
         (row(FAR, "GraphError", must="tell"), "refused"),
         (row(None, "GraphError", must="tell"), "refused"),
         (row(None, "crash", must="tell"), "WRONG"),
+        (row(None, "MissingExtra", must="tell"), "WRONG"),
         (row(CLOSE, warned="doctor: saturates", must="tell"), "ok"),
         (row(FAR, "GraphError", must="refuse"), "refused"),
         (row(FAR, must="refuse"), "NOT REFUSED"),
