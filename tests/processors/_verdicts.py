@@ -43,8 +43,8 @@ class Row:
         limit: Largest difference of all observations together that is rounding.
         refused: With which error ``load`` refuses it; empty when it loads.
         warned: What warns about it before it runs; empty when nothing does.
-        must: ``load``: it has to load; ``refuse``: it has to be refused; ``tell``: right, or refused for what it
-            computes, or warned about.
+        must: ``load``: it has to load; ``refuse``: it has to compute something else and be refused; ``tell``:
+            right, or refused for what it computes, or warned about.
         note: What else is to be said.
         skipped: Why it was not tried; empty when it was.
     """
@@ -65,7 +65,8 @@ class Row:
         if self.skipped:
             return SKIPPED
         if self.must == "refuse":
-            return REFUSED if self.refused == "GraphError" else UNTRUE
+            otherwise = self.difference is not None and not self.difference.within(self.limit)
+            return REFUSED if self.refused == "GraphError" and otherwise else UNTRUE
         if self.refused:
             return REFUSED if self.must == "tell" and self.refused == "GraphError" else WRONG
         if self.difference is not None and self.difference.within(self.limit):

@@ -25,6 +25,7 @@ from _rungs import CPUINFO, model
 from _variants import FLOAT, FOR_ARM, SAMPLES, Made, VariantError, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 
+from vlatool.finish import ROUNDING
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 CORES = ("cortex-a76", "cortex-a72")
@@ -113,16 +114,16 @@ def unmade(made: Made) -> list[Row]:
 
 def compared(where: tuple[str, ...], here: dict[str, Answer], there: dict[str, Answer]) -> list[Row]:
     """Return the rows of one emulated board."""
-    limits = {variant.name: variant.limit for variant in FOR_ARM}
+    limits = {PLANTED: ROUNDING, **{variant.name: variant.limit for variant in FOR_ARM}}
     rows = []
     for name, answer in there.items():
         wanted = here[name].actions
         if here[name].refused or wanted is None:
-            rows.append(Row(where, name, None, limits.get(name, 0.0), here[name].refused, note=here[name].why))
+            rows.append(Row(where, name, None, limits[name], here[name].refused, note=here[name].why))
             continue
         found = None if answer.actions is None else difference(answer.actions, wanted)
         must = "refuse" if name == PLANTED else "load"
-        limit = limits.get(name, 0.0)
+        limit = limits[name]
         rows.append(Row(where, name, found, limit, answer.refused, must=must, note=answer.why))
     return rows
 

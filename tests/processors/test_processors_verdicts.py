@@ -49,6 +49,8 @@ def test_another_size_and_what_is_no_number_differ_without_bound(got):
         (row(CLOSE, warned="doctor: saturates", must="tell"), "ok"),
         (row(FAR, "GraphError", must="refuse"), "refused"),
         (row(FAR, must="refuse"), "NOT REFUSED"),
+        (row(CLOSE, "GraphError", must="refuse"), "NOT REFUSED"),
+        (row(None, "GraphError", must="refuse"), "NOT REFUSED"),
         (row(None, "crash", must="refuse"), "NOT REFUSED"),
         (row(None, "BundleError", must="refuse"), "NOT REFUSED"),
         (row(None, skipped="this host lacks avx_vnni"), "not tried"),
