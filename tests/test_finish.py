@@ -114,8 +114,11 @@ def test_rounding_of_an_action_that_is_near_zero_in_physical_units_is_no_other_a
         load(made.path, threads=1)
 
 
-def test_graphs_in_float16_may_differ_by_what_arithmetic_of_11_bits_does(float_bundle, wrong_engine, tmp_path):
-    half = replace(float_bundle.manifest.graphs["main"], precision={"float16": 1.0})
+@pytest.mark.parametrize("dtype", ["float16", "int4"])
+def test_graphs_whose_kernels_round_otherwise_on_each_processor_may_differ_more(
+    float_bundle, wrong_engine, tmp_path, dtype
+):
+    half = replace(float_bundle.manifest.graphs["main"], precision={dtype: 1.0})
     manifest = replace(float_bundle.manifest, graphs={"main": half})
     made = again(Bundle(float_bundle.path, manifest), tmp_path)
     assert (made.manifest.golden_tolerance, made.manifest.golden_chunk_tolerance) == (0.03, 0.03)

@@ -20,7 +20,8 @@ FLOAT_LIMIT = 1e-5
 INT8_LIMIT = 0.01
 """What they make where they are rounded to int8 in between; seen up to 1.8e-3 between an ARM and an x86 processor."""
 HALF_LIMIT = 0.02
-"""The same of float16 and int4, whose kernels round otherwise on each processor; seen up to 5.5e-3."""
+"""The same of float16, which is computed as such or in float32; seen up to 5.5e-3. What is in int4 is held against
+``ROUNDING``: activations beside it are rounded to int8 on some processors and not on others; seen up to 0.020."""
 STATIC = ("quantize", "static-int8")
 OPENVINO = (*STATIC, "--layout", "openvino")
 
@@ -57,7 +58,7 @@ FOR_ARM = (
     Variant("ort int8", (*STATIC, "--activations", "int8")),
     Variant("qdq uint8", (*STATIC, "--layout", "qdq")),
     Variant("qdq int8", (*STATIC, "--layout", "qdq", "--activations", "int8")),
-    Variant("int4", ("quantize", "weight-only"), HALF_LIMIT),
+    Variant("int4", ("quantize", "weight-only"), ROUNDING),
     Variant("int4 qdq", ("quantize", "weight-only", "--layout", "qdq"), ROUNDING),
     Variant("float16", ("quantize", "float16"), HALF_LIMIT),
 )
