@@ -8,11 +8,13 @@ TORCH := torch==2.13.0
 SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
 BASE ?=
+ARM64 ?=
+LADDER ?=
 
-.PHONY: gate peers python310 help install demo test check robot docs format clean metaworld
+.PHONY: gate peers python310 arm64 ladder help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 $(BIN)/vlatool: pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -54,6 +56,12 @@ python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundl
 	@test -x $(OUT)/python310/venv/bin/python || $(PYTHON310) -m venv $(OUT)/python310/venv
 	$(OUT)/python310/venv/bin/python -m pip install --quiet --disable-pip-version-check -e '.[ort]' onnx onnxscript onnx-ir safetensors
 	$(OUT)/python310/venv/bin/python tests/robot/build_side.py $(OUT)/python310/bundle -o $(OUT)/python310/made
+
+arm64: $(BIN)/vlatool  ## run both samples' bundles on emulated 64-bit ARM and compare with this host (ARM64="--cores cortex-a76": less of it)
+	$(BIN)/python tests/processors/arm64.py -o $(OUT)/processors $(ARM64)
+
+ladder: $(VENV)/.dev  ## hold every layout on every engine and instruction set of this host against what its graphs say
+	$(BIN)/python tests/processors/ladder.py -o $(OUT)/processors $(LADDER)
 
 gate: $(BIN)/vlatool  ## hold the sample policies against those that the commit before makes (BASE=COMMIT names another)
 	$(BIN)/python tests/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate

@@ -110,8 +110,8 @@ class Manifest:
         golden: File with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
         golden_tolerance: Largest relative L2 difference from the golden action with which a machine loads the bundle,
             from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
-        golden_chunk_tolerance: The same for the action in physical units, where a small action makes a large relative
-            difference; ``golden_tolerance`` when 0.
+        golden_chunk_tolerance: The same for the action in physical units, each element from the offset of its
+            statistics and in units of their spread; ``golden_tolerance`` when 0.
         findings: What a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
             and ``gate`` refuse the bundle unless each is overruled by its name.
         accuracy: Measured accuracy: name -> value, interval, samples.

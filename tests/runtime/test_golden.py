@@ -139,6 +139,28 @@ def test_other_statistics_of_the_action_show_in_the_golden_chunk(float_bundle, c
         load(resealed(bundle).path)
 
 
+def test_other_statistics_of_a_small_element_show_beside_a_large_one(float_bundle, copied, resealed):
+    """Millimetres of an arm beside a gripper of 0 to 1."""
+    bundle = copied(float_bundle)
+    file = bundle.path / "assets/statistics.json"
+    table = json.loads(file.read_text())
+    table["action"]["std"] = [0.001, 1.0]
+    file.write_text(json.dumps(table))
+    write_golden(resealed(bundle), [golden[0] for golden in load_goldens(bundle)], bundle.path)
+    right = load(resealed(bundle).path)
+    assert right.golden_chunk_error == pytest.approx(0, abs=1e-4)
+    table["action"]["std"] = [0.002, 1.0]
+    file.write_text(json.dumps(table))
+    with pytest.raises(GraphError, match="another golden action in physical units"):
+        load(resealed(bundle).path)
+
+
+def test_chunks_of_other_sizes_differ_without_bound(float_bundle):
+    policy = load(float_bundle.path)
+    assert policy.chunk_error(np.zeros((4, 2)), np.zeros((3, 2))) == np.inf
+    assert policy.chunk_error(np.full((4, 2), np.nan), np.zeros((4, 2))) != 0
+
+
 def scaled(bundle: Bundle, key: str, factor: float) -> Bundle:
     def change(arrays: dict[str, Any]) -> None:
         arrays[key] = arrays[key] * factor

@@ -231,7 +231,7 @@ class Policy:
                 action = self.infer(observation, noise=noise)
             errors.append(relative_error(action.outputs[self.spec.action.name], expected))
             if chunks:
-                of_chunks.append(relative_error(action.chunk, chunks[number % len(steps)]))
+                of_chunks.append(self.chunk_error(action.chunk, chunks[number % len(steps)]))
         self.reset()
         self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
         self.check_golden(tolerance)
@@ -255,6 +255,24 @@ class Policy:
                     f"allowed {allowed:g}.{cause and ' ' + cause}",
                     remedy or "the engine or processor may lack what this precision needs; run: vlatool doctor",
                 )
+
+    def chunk_error(self, got: Array, wanted: Array) -> float:
+        """Return the relative L2 difference of two chunks in physical units; infinite for other sizes.
+
+        Each element counts from the offset of its statistics, in units of their spread: a gripper near zero is a large
+        offset less a large number, beside which mere rounding would look like another action, and small elements would
+        not show beside large ones.
+
+        Args:
+            got: (T, A) in the units of the spec.
+            wanted: What was recorded of it, the same.
+        """
+        normaliser = self._decode.normaliser
+        if normaliser is None or got.shape != wanted.shape:
+            return relative_error(got, wanted)
+        with np.errstate(over="ignore", invalid="ignore"):
+            spread = [(np.asarray(each, np.float64) - normaliser.offset) / normaliser.scale for each in (got, wanted)]
+            return relative_error(*spread)
 
     @property
     def golden_tolerances(self) -> tuple[float, float]:

@@ -36,6 +36,9 @@ SHAPE = (16, 64)
 WANTED = 255.0 * 127 * SHAPE[1]
 PRECISE = ("session.x64quantprecision", "1")
 """The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``)."""
+SIGNED = ("session.qdqisint8allowed", "1")
+"""The option of ONNX Runtime that leaves int8 activations of quantize/dequantize pairs int8: on x86 it rewrites them to
+uint8 else, with which convolutions saturate where those of int8 are exact."""
 UNFUSED = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
 EXACT = "exact"

@@ -130,11 +130,13 @@ class OrtCpuSession:
     def _ways(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try, one after the other.
 
-        Exact products of uint8 activations refuse a graph with int8 ones, which are exact anyway. And ONNX Runtime
-        (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type.
+        Exact products of uint8 activations refuse a graph with int8 ones, which are exact as long as they stay int8.
+        And ONNX Runtime (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has
+        no such type.
         """
         saturates = _arithmetic.ort_product(ort) < _arithmetic.WANTED
-        entries = [*([_arithmetic.PRECISE] if saturates else []), None, _arithmetic.UNFUSED]
+        first = [_arithmetic.PRECISE, _arithmetic.SIGNED] if saturates else [None]
+        entries = [*first, _arithmetic.UNFUSED]
         ways = [session_options(ort, threads) for _ in entries]
         for options, entry in zip(ways, entries, strict=True):
             if entry is not None:
