@@ -55,6 +55,7 @@ FOR_ARM = (
     FLOAT,
     Variant("dynamic-int8", ("quantize", "dynamic-int8")),
     Variant("ort uint8", STATIC),
+    Variant("ort attention", (*STATIC, "--attention")),
     Variant("ort int8", (*STATIC, "--activations", "int8")),
     Variant("qdq uint8", (*STATIC, "--layout", "qdq")),
     Variant("qdq int8", (*STATIC, "--layout", "qdq", "--activations", "int8")),
