@@ -155,7 +155,7 @@ def test_every_candidate_has_a_row_with_what_was_measured_and_predicted(from_tor
     report = from_torch.report
     names = [row.name for row in report.rows]
     assert names[:3] == ["float32", "dynamic_int8", "static_int8"]
-    assert set(names[3:]) <= {"static_int8_mse"}
+    assert set(names[3:]) <= {"static_int8_mse", "static_int8_attention"}
     assert [row.role for row in report.rows].count("chosen") == 1
     assert report.verdict == "pass"
     assert "float32 succeeds in 80.0% of 10 episodes; actions that do not look" in report.summary[-1]
