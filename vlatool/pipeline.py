@@ -167,16 +167,15 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         when float32 does no better than actions that do not look at the observation.
     """
     with writing(out, force=force) as draft:
-        if confine := plan.board_set.to_set:
-            return _confined(plan, confine, draft, context)
+        if plan.profile and (confine := plan.board_set.to_set):
+            return _confined(plan, plan.profile, confine, draft, context)
         return _optimized(plan, draft, context)
 
 
-def _confined(plan: Plan, confine: str, draft: Path, context: Context) -> Report:
+def _confined(plan: Plan, profile: Profile, confine: str, draft: Path, context: Context) -> Report:
     """Run a plan in a child whose OpenVINO, and that of its own children, is confined to an instruction set."""
-    assert plan.profile is not None
     job = {
-        "source": plan.typed, "profile": plan.profile.model_dump(mode="json"), "cache": str(plan.cache),
+        "source": plan.typed, "profile": profile.model_dump(mode="json"), "cache": str(plan.cache),
         "recipe": plan.recipe.model_dump(mode="json", by_alias=True), "fresh": plan.fresh, "draft": str(draft),
         "workers": context.workers, "command": context.command,
     }  # fmt: skip

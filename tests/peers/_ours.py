@@ -12,6 +12,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "optimize, relative_error 0.04": ("optimize", "{policy}", "--max-drop", "relative_error=0.04"),
     "openvino bf16": OPENVINO,
     "openvino bf16, mse": (*OPENVINO, "--method", "mse"),
+    "openvino bf16, attention": (*OPENVINO, "--attention"),
+    "openvino bf16, mse, attention": (*OPENVINO, "--method", "mse", "--attention"),
     "openvino bf16, elementwise": (*OPENVINO, "--elementwise"),
     "openvino bf16, elementwise, attention": (*OPENVINO, "--elementwise", "--attention"),
     "openvino bf16, convolutions": (*OPENVINO, "--convolutions"),
@@ -19,6 +21,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "static-int8": ("quantize", "static-int8", "{bundle}"),
     "static-int8, attention": ("quantize", "static-int8", "{bundle}", "--attention"),
     "dynamic-int8": ("quantize", "dynamic-int8", "{bundle}"),
+    "bfloat16": ("quantize", "bfloat16", "{bundle}"),
     "bfloat16, convolutions": ("quantize", "bfloat16", "{bundle}", "--convolutions"),
     "float32": (),
 }
