@@ -133,6 +133,8 @@ def test_the_cache_keeps_both_sets_apart_and_exports_once(runs, tmp_path_factory
     full = [each for each in made if not each.manifest.made_by["options"].get("reduce_range")]
     names = [[finding["name"] for finding in each.manifest.findings] for each in full]
     assert sorted(names) == [[], ["engine-difference"]], "the engine is off its graphs in AVX2 alone"
+    (finding,) = (finding for each in full for finding in each.manifest.findings)
+    assert "on this machine (OpenVINO confined to AVX2 by ONEDNN_MAX_CPU_ISA): relative" in finding["message"]
 
 
 @SHOWS
@@ -206,7 +208,10 @@ def test_a_bundle_that_the_board_computes_otherwise_is_refused_when_it_is_evalua
     bundle = run_transform(StaticInt8(samples=8, layout="openvino"), float_bundle, tmp_path / "made", Context())
     assert evaluate(bundle.path) == 0
     assert evaluate(bundle.path, "--profile", old_nuc) == 3
-    assert "another golden action than recorded" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "another golden action than recorded" in told
+    assert "OpenVINO confined to AVX2" in told
+    assert "this processor" not in told, "it has more than AVX2"
 
 
 @SHOWS
