@@ -234,6 +234,7 @@ def test_the_plan_says_what_will_be_computed_in(monkeypatch, capsys, policy_temp
     pytest.importorskip("openvino")
     monkeypatch.delenv(MAX_CPU_ISA, raising=False)
     monkeypatch.setattr(instruction_sets, "isa", lambda: ["avx2", "avx512f", "avx512_vnni"])
+    monkeypatch.setattr(instruction_sets, "fingerprint", lambda: {"cpu": "none of a profile"})
     (line,) = lines(capsys, policy_template, old_nuc)
     assert line.endswith("OpenVINO confined to AVX2, in a process of its own; ONNX Runtime as this host is")
     (line,) = lines(capsys, policy_template, "intel-nuc-13-pro")
@@ -248,6 +249,7 @@ def test_a_host_that_lacks_the_set_computes_as_it_is_and_the_report_warns(
     pytest.importorskip("openvino")
     monkeypatch.delenv(MAX_CPU_ISA, raising=False)
     monkeypatch.setattr(instruction_sets, "isa", lambda: ["avx2", "avx512f", "avx512_vnni"])
+    monkeypatch.setattr(instruction_sets, "fingerprint", lambda: {"cpu": "none of a profile"})
     recipe = tmp_path / "recipe.yaml"
     few = RECIPE.replace("episodes: 4", "episodes: 0").splitlines()
     recipe.write_text("\n".join(line for line in few if not line.startswith(("  full", "  reduced"))))
