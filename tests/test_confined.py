@@ -133,6 +133,8 @@ def test_the_cache_keeps_both_sets_apart_and_exports_once(runs, tmp_path_factory
     full = [each for each in made if not each.manifest.made_by["options"].get("reduce_range")]
     names = [[finding["name"] for finding in each.manifest.findings] for each in full]
     assert sorted(names) == [[], ["engine-difference"]], "the engine is off its graphs in AVX2 alone"
+    (finding,) = (finding for each in full for finding in each.manifest.findings)
+    assert "on this machine (OpenVINO confined to AVX2 by ONEDNN_MAX_CPU_ISA): relative" in finding["message"]
 
 
 @SHOWS
@@ -206,7 +208,10 @@ def test_a_bundle_that_the_board_computes_otherwise_is_refused_when_it_is_evalua
     bundle = run_transform(StaticInt8(samples=8, layout="openvino"), float_bundle, tmp_path / "made", Context())
     assert evaluate(bundle.path) == 0
     assert evaluate(bundle.path, "--profile", old_nuc) == 3
-    assert "another golden action than recorded" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "another golden action than recorded" in told
+    assert "OpenVINO confined to AVX2" in told
+    assert "this processor" not in told, "it has more than AVX2"
 
 
 @SHOWS
@@ -229,6 +234,7 @@ def test_the_plan_says_what_will_be_computed_in(monkeypatch, capsys, policy_temp
     pytest.importorskip("openvino")
     monkeypatch.delenv(MAX_CPU_ISA, raising=False)
     monkeypatch.setattr(instruction_sets, "isa", lambda: ["avx2", "avx512f", "avx512_vnni"])
+    monkeypatch.setattr(instruction_sets, "fingerprint", lambda: {"cpu": "none of a profile"})
     (line,) = lines(capsys, policy_template, old_nuc)
     assert line.endswith("OpenVINO confined to AVX2, in a process of its own; ONNX Runtime as this host is")
     (line,) = lines(capsys, policy_template, "intel-nuc-13-pro")
@@ -243,6 +249,7 @@ def test_a_host_that_lacks_the_set_computes_as_it_is_and_the_report_warns(
     pytest.importorskip("openvino")
     monkeypatch.delenv(MAX_CPU_ISA, raising=False)
     monkeypatch.setattr(instruction_sets, "isa", lambda: ["avx2", "avx512f", "avx512_vnni"])
+    monkeypatch.setattr(instruction_sets, "fingerprint", lambda: {"cpu": "none of a profile"})
     recipe = tmp_path / "recipe.yaml"
     few = RECIPE.replace("episodes: 4", "episodes: 0").splitlines()
     recipe.write_text("\n".join(line for line in few if not line.startswith(("  full", "  reduced"))))

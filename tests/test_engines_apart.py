@@ -132,3 +132,14 @@ def test_a_board_without_vnni_is_told_how_int8_does(p50: float, verdict: str):
 def test_a_board_without_vnni_and_without_a_plan_is_told_too_and_one_with_vnni_nothing():
     assert "no int8 plan of OpenVINO could be made" in about_int8({}, ENGINES, SET)[0]
     assert about_int8({}, ENGINES, compared("nuc", ("avx_vnni",), ("avx_vnni", "avx512f"), "AVX2_VNNI")) == ()
+
+
+@pytest.mark.parametrize(
+    ("host", "told"), [(("avx2", "avx_vnni"), ""), (("avx2", "avx512f", "avx512_vnni"), "AVX512_CORE_VNNI")]
+)
+def test_what_was_timed_in_another_set_does_not_say_how_int8_does_on_the_board(host: tuple[str, ...], told: str):
+    where = compared("old", ("avx2", "avx512f"), host, told)
+    (said,) = about_int8({"fast": judged("fast", 20.0, 40.0, None).row}, ENGINES, where)
+    assert said.startswith("old has no VNNI")
+    assert "wins" not in said
+    assert "2.00x" not in said

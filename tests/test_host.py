@@ -32,7 +32,17 @@ def test_an_empty_tree_has_nothing_and_no_zeros(tmp_path: Path, monkeypatch) -> 
 
 
 @pytest.mark.parametrize(
-    ("said", "told"), [(None, None), ("", None), ("AVX2", "AVX2"), ("/home/me", "?"), ("A" * 99, "?")]
+    ("said", "told"),
+    [
+        (None, None),
+        ("", None),
+        ("AVX2", "AVX2"),
+        ("avx2", "AVX2"),
+        ("default", None),
+        ("ALL", None),
+        ("/home/me", "?"),
+        ("A" * 99, "?"),
+    ],
 )
 def test_what_openvino_is_confined_to_is_recorded(monkeypatch, tmp_path: Path, said, told) -> None:
     monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)

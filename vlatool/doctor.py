@@ -196,9 +196,9 @@ def confined(isa: str | None) -> Iterator[Check]:
     """Whether a variable keeps OpenVINO from instructions that the processor has."""
     if isa is not None:
         finding = (
-            f"ONEDNN_MAX_CPU_ISA={isa} confines OpenVINO to older instructions: it is slower and may round otherwise"
+            f"{host.MAX_CPU_ISA}={isa} confines OpenVINO to older instructions: it is slower and may round otherwise"
         )
-        yield Check("oneDNN", "warn", finding, "unset ONEDNN_MAX_CPU_ISA, unless you mean to try another processor")
+        yield Check("oneDNN", "warn", finding, f"unset {host.MAX_CPU_ISA}, unless you mean to try another processor")
 
 
 def telemetry(root: Path = host.ROOT) -> Iterator[Check]:

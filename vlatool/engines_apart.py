@@ -169,7 +169,10 @@ def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: Board
     told = (
         f"{where.board} has no VNNI: int8 products are added in pairs of 16 bits there, which can saturate, and int8 "
     )
-    told += "may be slower than float32. It was tried all the same: "
+    told += "may be slower than float32. "
+    if not (where.confined or where.alike):
+        return (f"{told}Whether it is was not measured: OpenVINO does not compute in that set here.",)
+    told += "It was tried all the same: "
     tried = {name: found for name, row in rows.items()
              if engines.get(name) == ENGINE and (found := row.get("speedup"))}  # fmt: skip
     if not tried:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vlatool.bundle import Bundle, restate, seal
 from vlatool.manifest import FileRecord, Graph, Manifest
-from vlatool.runtime.engines._arithmetic import SATURATING, is_int8, told
+from vlatool.runtime.engines._arithmetic import SATURATING, is_int8, machine, told
 from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.policy import DEFAULT_ENGINE, Action, Policy, load_golden, relative_error
@@ -120,8 +120,8 @@ def _limit(source: Bundle, made: Bundle, difference: float) -> float:
 
 def _engine_difference(made: Bundle, difference: float, limit: float) -> dict[str, Any]:
     engine = made.manifest.engine or DEFAULT_ENGINE
-    words = f"the engine {engine} computes another action than the graphs say on this machine: relative difference "
-    words += f"{difference:.2g}, allowed {limit:.2g}. Do not trust this bundle; "
+    words = f"the engine {engine} computes another action than the graphs say on this {machine(engine)}: relative "
+    words += f"difference {difference:.2g}, allowed {limit:.2g}. Do not trust this bundle; "
     cause, remedy = told(made.manifest, engine)
     words += remedy or "leave layers out with --exclude, or use another layout or engine"
     words += f". {cause}".rstrip()

@@ -142,12 +142,15 @@ def isa(root: Path = ROOT) -> list[str] | None:
 
 
 def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
-    """The instruction set that ``ONEDNN_MAX_CPU_ISA`` confines oneDNN, and so OpenVINO, to; None when it is not set.
+    """The instruction set that ``ONEDNN_MAX_CPU_ISA`` confines oneDNN, and so OpenVINO, to; None when there is none.
 
-    What is no name of an instruction set is told as ``?``: it may be anything, and reports are shared.
+    oneDNN takes small letters for large ones, and ``ALL`` and ``DEFAULT`` confine it to nothing. What is no name
+    of an instruction set is told as ``?``: it may be anything, and reports are shared.
     """
-    said = variables.get(MAX_CPU_ISA)
-    return None if not said else said if re.fullmatch(r"[A-Za-z0-9_]{1,32}", said) else "?"
+    said = variables.get(MAX_CPU_ISA, "").upper()
+    if said in ("", "ALL", "DEFAULT"):
+        return None
+    return said if re.fullmatch(r"[A-Z0-9_]{1,32}", said) else "?"
 
 
 def board(root: Path = ROOT) -> str | None:

@@ -84,7 +84,11 @@ def ask(
 
 
 def run(words: Sequence[str], variables: Mapping[str, str]) -> tuple[list[dict[str, Any]], str]:
-    """Run the script and return its lines and, where it failed, how it ended."""
+    """Run the script and return its lines and, where it failed, how it ended.
+
+    Raises:
+        KeyboardInterrupt: when it was interrupted, as all processes of a terminal are.
+    """
     place = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1", **variables}
     try:
         done = subprocess.run(words, cwd=ROOT, env=place, capture_output=True, text=True, check=False, timeout=SECONDS)
@@ -92,6 +96,8 @@ def run(words: Sequence[str], variables: Mapping[str, str]) -> tuple[list[dict[s
         printed = late.stdout or b""
         text = printed if isinstance(printed, str) else printed.decode(errors="replace")
         return parsed(text), f"it took more than {SECONDS:g} s"
+    if done.returncode == -signal.SIGINT:
+        raise KeyboardInterrupt
     return parsed(done.stdout), how_it_ended(done.returncode, done.stderr)
 
 

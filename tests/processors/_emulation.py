@@ -16,6 +16,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
@@ -37,7 +38,7 @@ SILENT = re.compile(
 ANSWERED = re.compile(r"hash sum mismatch|hashes|no space left|permission denied|size mismatch", re.IGNORECASE)
 """What they say when it did answer, whatever else they had to try again before."""
 LIBRARIES = ("onnxruntime/capi/onnxruntime_pybind11_state*.so", "numpy/_core/_multiarray_umath*.so")
-"""What has to be in the wheels."""
+"""What is in the wheels and has to be of the board's architecture."""
 LEAST_BYTES = 1_000_000
 """Of a file that an emulator or a library is: less is no whole one."""
 
@@ -133,10 +134,7 @@ class Emulators:
         options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--target", str(draft)]
         wanted = [f"onnxruntime=={onnxruntime}", "numpy"]
         told([sys.executable, "-m", "pip", "install", *options, *kind, *tags, *wanted], "The package registry")
-        for library in (
-            *draft.glob("onnxruntime/capi/onnxruntime_pybind11_state*.so"),
-            *draft.glob("numpy/_core/_multiarray_umath*.so"),
-        ):
+        for library in chain.from_iterable(map(draft.glob, LIBRARIES)):
             check_elf(library, "aarch64")
         code = "import numpy, onnxruntime; print(onnxruntime.__version__)"
         words = [*self.emulated("aarch64", "max"), str(self.python()), "-c", code]

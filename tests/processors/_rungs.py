@@ -7,15 +7,15 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+from vlatool.host import MAX_CPU_ISA
+
 CPUINFO = Path("/proc/cpuinfo")
-VARIABLE = "ONEDNN_MAX_CPU_ISA"
-"""What OpenVINO's oneDNN looks at; what a processor lacks is passed over in silence, and the next lower set taken."""
 AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl")
 
 
 @dataclass(frozen=True)
 class Rung:
-    """A restriction.
+    """A restriction. oneDNN passes over what a processor lacks in silence, and takes the next lower set.
 
     Args:
         name: What the table calls it.
@@ -38,7 +38,7 @@ class Rung:
     @property
     def variables(self) -> dict[str, str]:
         """Variables of the environment."""
-        return {VARIABLE: self.isa} if self.isa else {}
+        return {MAX_CPU_ISA: self.isa} if self.isa else {}
 
 
 RUNGS = (

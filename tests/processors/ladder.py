@@ -20,21 +20,25 @@ from typing import Any
 import numpy as np
 from _asked import Answer, ask
 from _emulation import EmulationError, Emulators, Unreachable
-from _rungs import CPUINFO, RUNGS, VARIABLE, Rung, flags, model
+from _rungs import CPUINFO, RUNGS, Rung, flags, model
 from _variants import FOR_X86, SAMPLES, Made, Variant, VariantError, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 from answers import actions
 
 from vlatool.bundle import Bundle
 from vlatool.finish import reference_policy
+from vlatool.host import MAX_CPU_ISA, architecture
 from vlatool.runtime.engines._arithmetic import SATURATING, is_int8
 from vlatool.runtime.engines._reference import ReferenceSession
+
+X86 = "x86_64"
+"""What can be emulated: QEMU runs the host's own Python on another processor."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make, ask on every rung, compare, and print."""
     given = parsed(arguments)
-    os.environ.pop(VARIABLE, None)
+    os.environ.pop(MAX_CPU_ISA, None)
     if ReferenceSession.arithmetic() == SATURATING:
         print("make ladder: int8 products saturate here, so there is nothing to hold bundles against", file=sys.stderr)
         return 1
@@ -71,10 +75,12 @@ def tried(found: frozenset[str], cache: Emulators) -> dict[Rung, str]:
     for rung in RUNGS:
         lacks = rung.lacking(found)
         rungs[rung] = f"this host lacks {', '.join(lacks)}" if lacks else ""
+        if rung.cpu and architecture() != X86:
+            rungs[rung] = f"this host is {architecture()}"
         try:
-            if rung.cpu:
+            if rung.cpu and not rungs[rung]:
                 cache.folder.mkdir(parents=True, exist_ok=True)
-                cache.qemu(os.uname().machine)
+                cache.qemu(X86)
         except Unreachable as error:
             rungs[rung] = str(error)
         except EmulationError as error:
@@ -110,7 +116,7 @@ def climbed(rung: Rung, made: Made, said: Mapping[str, Any], cache: Emulators, e
     bundles = {name: path for name, path in made.bundles.items() if name in variants}
     python, observations = [sys.executable], made.observations
     if rung.cpu:
-        python = [*cache.emulated(os.uname().machine, rung.cpu), sys.executable]
+        python = [*cache.emulated(X86, rung.cpu), sys.executable]
         observations = some_of(made.observations, emulated)
     out = cache.folder / "answers" / made.name / f"{rung.engine}-{rung.isa or rung.cpu or 'host'}"
     found = ask(python, bundles, observations, out, rung.engine, rung.variables)

@@ -103,6 +103,13 @@ def test_how_a_process_ended_is_told():
     assert how_it_ended(1, "") == "the process left with 1: it said nothing"
 
 
+def test_one_that_was_interrupted_ends_the_whole_run():
+    """Ctrl-C reaches the process that is asked, too: it is no crash, after which the next bundle would be asked."""
+    code = "import os, signal as s; s.signal(s.SIGINT, s.SIG_DFL); os.kill(os.getpid(), s.SIGINT)"
+    with pytest.raises(KeyboardInterrupt):
+        run([sys.executable, "-c", code], {})
+
+
 def test_a_process_that_takes_too_long_is_ended(monkeypatch):
     monkeypatch.setattr("_asked.SECONDS", 1.0)
     lines, ended = run([sys.executable, "-uc", 'import time; print(\'{"bundle": "a"}\'); time.sleep(100)'], {})

@@ -67,13 +67,23 @@ def test_a_bundle_that_was_not_made_is_wrong(tmp_path):
 
 def test_a_rung_that_the_host_lacks_is_named_and_not_tried(monkeypatch, tmp_path):
     monkeypatch.setattr(Emulators, "qemu", lambda self, arch: tmp_path)
+    monkeypatch.setattr(ladder, "architecture", lambda: "x86_64")
     told = {rung.name: why for rung, why in ladder.tried(frozenset({"avx2"}), Emulators(tmp_path)).items()}
     assert told["AVX2"] == ""
     assert told["AVX2_VNNI"] == "this host lacks avx_vnni"
     assert "avx512_vnni" in told["AVX512_CORE_VNNI"]
 
 
+def test_an_x86_processor_is_emulated_on_x86_alone(monkeypatch, tmp_path):
+    """QEMU runs the host's own Python, which elsewhere is of another architecture."""
+    monkeypatch.setattr(ladder, "architecture", lambda: "aarch64")
+    fails(monkeypatch, AssertionError("nothing is fetched"))
+    told = {rung: why for rung, why in ladder.tried(frozenset(), Emulators(tmp_path)).items() if rung.cpu}
+    assert {*told.values()} == {"this host is aarch64"}
+
+
 def test_without_a_mirror_the_emulated_rung_alone_is_not_tried(monkeypatch, tmp_path):
+    monkeypatch.setattr(ladder, "architecture", lambda: "x86_64")
     fails(monkeypatch, Unreachable("Debian's mirror does not answer: timed out"))
     told = ladder.tried(frozenset({"avx2"}), Emulators(tmp_path))
     assert [why for rung, why in told.items() if rung.cpu] == ["Debian's mirror does not answer: timed out"]

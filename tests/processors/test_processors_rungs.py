@@ -1,7 +1,10 @@
 """Which instruction sets a host can be restricted to."""
 
 import pytest
-from _rungs import RUNGS, VARIABLE, flags, model
+from _rungs import RUNGS, flags, model
+
+from vlatool.host import MAX_CPU_ISA
+from vlatool.instruction_sets import RUNGS as SETS
 
 LINES = """\
 processor\t: {number}
@@ -43,9 +46,14 @@ def test_a_rung_is_tried_where_the_host_has_what_it_needs(text, untried):
 
 def test_a_rung_is_a_variable_or_an_emulated_processor_or_the_host():
     for rung in RUNGS:
-        assert rung.variables == ({VARIABLE: rung.name} if rung.name.startswith("AVX") else {})
+        assert rung.variables == ({MAX_CPU_ISA: rung.name} if rung.name.startswith("AVX") else {})
         assert bool(rung.cpu) == ("QEMU" in rung.name)
     assert {rung.engine for rung in RUNGS if rung.name == "host"} == {"ort_cpu", "openvino"}
+
+
+def test_a_set_needs_here_what_it_needs_there():
+    for rung in RUNGS:
+        assert not rung.isa or SETS[rung.isa] in rung.needs
 
 
 def test_a_processor_is_named_with_what_it_has():

@@ -215,3 +215,21 @@ def test_where_openvino_saturates_the_remedy_is_what_was_seen_to_be_right(int8_b
     with pytest.raises(GraphError, match="saturating") as caught:
         policy.warm_up(1, tolerance=-1.0)
     assert {*re.findall(r"--[a-z-]+", caught.value.fix)} == {"--reduce-range", "--layout"}
+
+
+@pytest.mark.parametrize(
+    ("engine", "said", "words"),
+    [
+        ("openvino", "AVX2", r"^This machine \(OpenVINO confined to AVX2 by ONEDNN_MAX_CPU_ISA\) computes another"),
+        ("openvino", "", "^This machine computes another"),
+        ("ort_cpu", "AVX2", "^This machine computes another"),
+    ],
+)
+def test_what_openvino_is_confined_to_is_no_machine(float_bundle, monkeypatch, engine, said, words):
+    """An evaluation for a board runs in a child that is confined to the board's instruction set."""
+    if engine == "openvino":
+        pytest.importorskip("openvino")
+    policy = load(float_bundle.path, engine=engine)
+    monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", said)
+    with pytest.raises(GraphError, match=words):
+        policy.warm_up(1, tolerance=-1.0)

@@ -29,7 +29,7 @@ from vlatool.runtime.contract import (
     not_finite,
     written_as_declared,
 )
-from vlatool.runtime.engines._arithmetic import told
+from vlatool.runtime.engines._arithmetic import machine, told
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
@@ -251,8 +251,8 @@ class Policy:
             if error is not None and not error <= allowed:
                 cause, remedy = told(self.bundle.manifest, self.engine)
                 raise GraphError(
-                    f"This machine computes another golden action{where} than recorded: relative error {error:.3g}, "
-                    f"allowed {allowed:g}.{cause and ' ' + cause}",
+                    f"This {machine(self.engine)} computes another golden action{where} than recorded: relative error "
+                    f"{error:.3g}, allowed {allowed:g}.{cause and ' ' + cause}",
                     remedy or "the engine or processor may lack what this precision needs; run: vlatool doctor",
                 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -153,8 +154,10 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path, monkeypatch) -> None
     assert not caught.value.fix, "what confines OpenVINO has nothing to do with it"
 
 
-@pytest.mark.parametrize(("confined", "fix"), [("SSE41", "unset ONEDNN_MAX_CPU_ISA"), (None, "--layout ort")])
-def test_where_openvino_has_no_kernel_the_error_says_what_to_do(tmp_path: Path, monkeypatch, confined, fix):
+@pytest.mark.parametrize(
+    ("confined", "says"), [("SSE41", "^ONEDNN_MAX_CPU_ISA confines .* SSE41"), (None, "^this proc")]
+)
+def test_where_openvino_has_no_kernel_the_error_says_what_to_do(tmp_path: Path, monkeypatch, confined, says):
     class Refusing:
         def read_model(self, *_):
             raise RuntimeError("bad combination")
@@ -165,4 +168,5 @@ def test_where_openvino_has_no_kernel_the_error_says_what_to_do(tmp_path: Path, 
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", confined)
     with pytest.raises(GraphError, match="bad combination") as caught:
         OpenvinoSession(tmp_path / "any.onnx")
-    assert fix in caught.value.fix
+    assert re.search(says, caught.value.fix)
+    assert "--layout ort" in caught.value.fix, "the variable may stand for a board, so that unsetting it is no remedy"

@@ -43,7 +43,7 @@ UNFUSED = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
 EXACT = "exact"
 EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
-SATURATING = "saturating: this processor adds pairs of int8 products in 16 bits"
+SATURATING = "saturating: they are added in pairs of 16 bits"
 UNKNOWN = "not known: the engine does not compute the product that would show it"
 
 
@@ -123,6 +123,14 @@ def told(manifest: Manifest, engine: str) -> tuple[str, str]:
     if found == EXACT:
         return "", ""
     return f"Its int8 products are {found}.", REMEDY.get(engine, "") if found == SATURATING else ""
+
+
+def machine(engine: str) -> str:
+    """Return what an engine computes on: this "machine", and where OpenVINO is confined on it, what to."""
+    from vlatool.host import MAX_CPU_ISA, onednn_max_cpu_isa  # only where there is something to say: it takes its time
+
+    confined = onednn_max_cpu_isa() if engine == "openvino" else None
+    return f"machine (OpenVINO confined to {confined} by {MAX_CPU_ISA})" if confined else "machine"
 
 
 REMEDY = {

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, nearest, require
+from vlatool.host import MAX_CPU_ISA, onednn_max_cpu_isa
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engines import _arithmetic
-from vlatool.typed import shown
 
 DEVICE = "CPU"
 GRACE_MS = 1000
@@ -187,9 +187,12 @@ def _remedy(error: Exception) -> str:
     """Return what to do where OpenVINO has no kernel for this processor, or for what a variable confines it to."""
     if not any(sign in str(error) for sign in NO_KERNEL):
         return ""
-    if confined := os.environ.get("ONEDNN_MAX_CPU_ISA"):
-        return f"unset ONEDNN_MAX_CPU_ISA, which confines OpenVINO to {shown(confined)}"
-    return "this processor lacks instructions that OpenVINO needs for it: quantize with --layout ort"
+    lacks = "instructions that OpenVINO needs for it: quantize with --layout ort"
+    if confined := onednn_max_cpu_isa():
+        return (
+            f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if it stands for no board"
+        )
+    return f"this processor lacks {lacks}"
 
 
 def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
