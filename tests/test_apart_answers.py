@@ -43,3 +43,9 @@ def test_what_was_raised_is_raised_as_what_a_child_may_raise(told, kind, says: s
     with pytest.raises(kind, match=says) as caught:
         answers.result(told, "policy.py")
     assert type(caught.value) is kind
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_what_fails_in_a_child_of_our_own_code_is_a_bug(ours: bool):
+    with pytest.raises(RuntimeError, match="optimize failed in its process: KeyError: 'a'"):
+        answers.result({"raised": "KeyError", "message": "'a'", "ours": ours}, "optimize", own=True)

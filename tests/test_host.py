@@ -51,6 +51,11 @@ def test_what_openvino_is_confined_to_is_recorded(monkeypatch, tmp_path: Path, s
     assert host.fingerprint(tmp_path)["onednn_max_cpu_isa"] == told
 
 
+def test_the_older_name_of_the_variable_confines_where_the_newer_is_not_set():
+    assert host.onednn_max_cpu_isa({"DNNL_MAX_CPU_ISA": "AVX2"}) == "AVX2"
+    assert host.onednn_max_cpu_isa({"DNNL_MAX_CPU_ISA": "AVX2", "ONEDNN_MAX_CPU_ISA": "AVX512_CORE"}) == "AVX512_CORE"
+
+
 def test_this_machine_is_described_in_json_without_names() -> None:
     found = host.fingerprint()
     text = json.dumps(found)

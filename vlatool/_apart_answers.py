@@ -49,12 +49,17 @@ def _makes_sense(told: Mapping[str, Any]) -> bool:
     return False
 
 
-def result(told: Mapping[str, Any], about: str) -> Any:
+def result(told: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     """Return the result that an answer holds, or raise what it says that was raised.
+
+    Args:
+        told: The answer.
+        about: Whose code the child runs.
+        own: The child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
     Raises:
         InputError, MissingExtra: of the class that is named.
-        SourceError: for everything else that was raised.
+        SourceError: for everything else that was raised; RuntimeError where ``own``.
         OSError, MemoryError: what the child met.
     """
     if "result" in told:
@@ -71,6 +76,8 @@ def result(told: Mapping[str, Any], about: str) -> Any:
     if "errno" in told:
         raise OSError(told["errno"], message, told["file"])
     name = plain(told["raised"])
+    if own:
+        raise RuntimeError(f"{about} failed in its process: {name}: {message}")
     if told["ours"]:
         raise SourceError(
             f"{about}: the process that runs it failed: {name}: {message}.",

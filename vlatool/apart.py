@@ -139,11 +139,18 @@ class Apart:
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
 
-    def call(self, function: str, job: Mapping[str, Any], tell: Tell) -> Any:
+    def call(self, function: str, job: Mapping[str, Any], tell: Tell, *, own: bool = False) -> Any:
         """Call ``module:function`` of vlatool with a job and ``tell``; return its result. All are JSON values.
+
+        Args:
+            function: What is called, with ``job`` and ``tell``.
+            job: Its argument.
+            tell: Gets the child's progress.
+            own: It runs vlatool's code alone, and a policy's in children of its own.
 
         Raises:
             VlatoolError: what it raises, of the same class; SourceError when the child ends without an answer.
+            RuntimeError: where ``own``, for a bug of vlatool.
             OSError, MemoryError: what it meets.
             KeyboardInterrupt: when Ctrl-C ended the child.
         """
@@ -156,7 +163,7 @@ class Apart:
                     warnings.warn(str(line["warning"]), UserWarning, stacklevel=2)
                 else:
                     self._print()
-                    return result(line, self.about)
+                    return result(line, self.about, own=own)
 
     def _send(self, line: Mapping[str, Any]) -> None:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # how it ended is found by reading
@@ -212,10 +219,12 @@ def call(
     about: str,
     preload: Sequence[str] = (),
     environment: Mapping[str, str] | None = None,
+    *,
+    own: bool = False,
 ) -> Any:
     """Call a function in a child of its own; see ``Apart`` and ``Apart.call``."""
     with Apart(about, preload, environment) as child:
-        return child.call(function, job, tell)
+        return child.call(function, job, tell, own=own)
 
 
 def spread(

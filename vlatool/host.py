@@ -37,6 +37,7 @@ ISA_FEATURES = (
 """Names of ``/proc/cpuinfo`` that decide how fast a network runs."""
 MAX_CPU_ISA = "ONEDNN_MAX_CPU_ISA"
 """The variable that confines oneDNN, and so OpenVINO, to an instruction set; read once, when it is loaded."""
+OLDER_MAX_CPU_ISA = "DNNL_MAX_CPU_ISA"
 ARM_CORES = {
     ("0x41", "0xd03"): "Cortex-A53",
     ("0x41", "0xd05"): "Cortex-A55",
@@ -144,10 +145,11 @@ def isa(root: Path = ROOT) -> list[str] | None:
 def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
     """The instruction set that ``ONEDNN_MAX_CPU_ISA`` confines oneDNN, and so OpenVINO, to; None when there is none.
 
-    oneDNN takes small letters for large ones, and ``ALL`` and ``DEFAULT`` confine it to nothing. What is no name
-    of an instruction set is told as ``?``: it may be anything, and reports are shared.
+    oneDNN obeys the older name where the newer one is not set, takes small letters for large ones, and ``ALL`` and
+    ``DEFAULT`` confine it to nothing. What is no name of an instruction set is told as ``?``: it may be anything, and
+    reports are shared.
     """
-    said = variables.get(MAX_CPU_ISA, "").upper()
+    said = (variables.get(MAX_CPU_ISA) or variables.get(OLDER_MAX_CPU_ISA, "")).upper()
     if said in ("", "ALL", "DEFAULT"):
         return None
     return said if re.fullmatch(r"[A-Z0-9_]{1,32}", said) else "?"

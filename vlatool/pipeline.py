@@ -180,7 +180,8 @@ def _confined(plan: Plan, profile: Profile, confine: str, draft: Path, context: 
         "workers": context.workers, "command": context.command,
     }  # fmt: skip
     about = f"optimize, confined to {confine},"
-    apart.call("vlatool.pipeline:optimize_here", job, context.tell, about, environment={MAX_CPU_ISA: confine})
+    confined = {MAX_CPU_ISA: confine}
+    apart.call("vlatool.pipeline:optimize_here", job, context.tell, about, environment=confined, own=True)
     return read_report(draft / "reports")
 
 

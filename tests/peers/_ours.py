@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "openvino bf16, mse, convolutions": (*OPENVINO, "--method", "mse", "--convolutions"),
     "static-int8": ("quantize", "static-int8", "{bundle}"),
     "static-int8, attention": ("quantize", "static-int8", "{bundle}", "--attention"),
+    "static-int8, mse, attention": ("quantize", "static-int8", "{bundle}", "--method", "mse", "--attention"),
     "dynamic-int8": ("quantize", "dynamic-int8", "{bundle}"),
     "bfloat16": ("quantize", "bfloat16", "{bundle}"),
     "bfloat16, convolutions": ("quantize", "bfloat16", "{bundle}", "--convolutions"),
