@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,11 @@ from numpy.typing import NDArray
 
 from vlatool.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.errors import DataError
+from vlatool.errors import DataError, GraphError, require
 from vlatool.manifest import ProgramStep
 from vlatool.quantize._blocks import METHODS
 from vlatool.quantize._compute import figures, piece, records_of, store, stored_meaning, whole_weight
-from vlatool.quantize._gptq import Rounded, awq, gptq
+from vlatool.quantize._gptq import Rounded, awq, gptq, nearest_codes
 from vlatool.quantize._journal import DATA
 from vlatool.quantize._layerwise import Layerwise, Values
 from vlatool.quantize._records import Record, Tools, padded
@@ -73,8 +74,16 @@ class _Walk:
         self._wanted, self._target, self._note = number, data, None
         if self._steps is None:
             self._steps = self._walk(tools)
-        while self._note is None:
-            next(self._steps)
+        for _ in self._steps:
+            if self._note is not None:
+                break
+        if self._note is None:
+            label = self._plan.tasks[number].label
+            raise GraphError(
+                f"The layer '{label}' was never run on the calibration samples, so its weights cannot be rounded by "
+                f"{self._stage.method}.",
+                "leave its graph out with --graphs, or use --method rtn or hqq, which need no activations",
+            )
         return self._note
 
     def _walk(self, tools: Tools) -> Iterator[None]:
@@ -112,8 +121,16 @@ class _Walk:
         return rows @ made.meant.T
 
     def _round(self, weight: Array, rows: Array) -> Rounded:
+        """Round by the method; to nearest where its activations make it lose more than the weights can spare."""
+        torch: Any = require("torch", "build")
         method = gptq if self._stage.method == "gptq" else awq
-        return method(weight, rows, self._stage.form, METHODS[self._stage.choose])
+        form, choose = self._stage.form, METHODS[self._stage.choose]
+        with contextlib.suppress(torch.linalg.LinAlgError):
+            made = method(weight, rows, form, choose)
+            if np.linalg.norm(made.meant - weight) <= SLACK * form.largest_error * np.linalg.norm(weight):
+                return made
+        nearest = nearest_codes(weight, form, choose)
+        return nearest if method is gptq else nearest._replace(inputs=np.ones(weight.shape[1], np.float32))
 
     def _store(self, task: Task, made: Rounded, data: Array) -> None:
         if task.kind == "blocks":

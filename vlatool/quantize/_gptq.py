@@ -67,11 +67,14 @@ def gptq(weight: Array, activations: Array, form: Format, choose: Choose) -> Rou
 
     Returns:
         The weight; scales and zero points of a block are chosen when its turn comes.
+
+    Raises:
+        LinAlgError: when the activations are too large or too much alike for the method.
     """
     import torch
 
     left = torch.from_numpy(weight.copy())
-    upper = _inverse_factor(torch, activations, left)
+    upper = _inverse_factor(torch, activations)
     settled = np.empty_like(weight)
     chosen: list[Chosen] = []
     for number in range(-(-weight.shape[1] // form.block)):
@@ -106,18 +109,20 @@ def _settle(part: Array, factor: Array, chosen: Chosen, form: Format) -> Array:
     return lost
 
 
-def _inverse_factor(torch: Any, activations: Array, weight: Any) -> Any:
+def _inverse_factor(torch: Any, activations: Array) -> Any:
     """Return the upper Cholesky factor of the inverse of the damped second moment of the activations, (rows, rows).
 
-    Inputs that are never active get weight 0 in place.
+    What an input that is never active loses is not moved to others, nor others' loss to it.
     """
     active = torch.from_numpy(activations)
     moment = active.T @ active
     diagonal = moment.diagonal()
     dead = diagonal == 0
-    diagonal[dead] = 1
-    weight[:, dead] = 0
-    diagonal += DAMPING * diagonal.mean()
+    if dead.all():
+        return torch.eye(len(moment))
+    usual = diagonal[~dead].mean()
+    diagonal[dead] = usual
+    diagonal += DAMPING * usual
     factor = torch.linalg.cholesky(moment)
     del moment, diagonal
     inverse = torch.cholesky_inverse(factor)

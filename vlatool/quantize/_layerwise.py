@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from vlatool.errors import GraphError, require
 from vlatool.quantize._compute import as_float32, stored_bytes
 from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import Tools
-from vlatool.quantize._rewrite import Layer
+from vlatool.quantize._rewrite import Layer, read_as_weight, turns_constant
 
 Array = NDArray[Any]
 Values = dict[str, Array]
@@ -44,7 +44,7 @@ class Layerwise:
         """
         graph = self._skeleton.model.graph
         outputs = {value.name for value in graph.outputs}
-        waiting = Counter(value.name for node in graph for value in node.inputs if value is not None)
+        waiting = Counter(value.name for node in graph for value in _values(node))
         for node in graph:
             yield
             if self._is_turned_weight(node):
@@ -53,43 +53,53 @@ class Layerwise:
             if layer is not None:
                 self._multiply(layer, samples, tools)
             else:
-                constants = self._constants(node, samples[0], tools)
-                session, names = self._session(node, {**samples[0], **constants})
-                for values in samples:
-                    feeds = {name: {**values, **constants}[name] for name in names}
-                    given = session.run(None, feeds)
-                    used = [output.name for output in node.outputs if output.name]
-                    values.update(zip(used, given, strict=True))
-            for value in node.inputs:
-                if value is not None:
-                    waiting[value.name] -= 1
-                    if not waiting[value.name] and value.name not in outputs:
-                        for values in samples:
-                            values.pop(value.name, None)
+                self._run_node(node, samples, tools)
+            for value in _values(node):
+                waiting[value.name] -= 1
+                if not waiting[value.name] and value.name not in outputs:
+                    for values in samples:
+                        values.pop(value.name, None)
+        constants = self._constants(graph.outputs, samples[0], tools)
+        for values in samples:
+            values.update(constants)
+
+    def _run_node(self, node: Any, samples: list[Values], tools: Tools) -> None:
+        constants = self._constants(_values(node), samples[0], tools)
+        session, names = self._session(node, {**samples[0], **constants})
+        used = [output.name for output in node.outputs if output.name]
+        for values in samples:
+            feeds = {name: {**values, **constants}[name] for name in names}
+            try:
+                given = session.run(None, feeds)
+            except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
+                raise _refused(node.name, node.op_type, error) from error
+            values.update(zip(used, given, strict=True))
 
     def _is_turned_weight(self, node: Any) -> bool:
-        readers = [reader for output in node.outputs for reader in output.consumers()]
-        return node.op_type == "Transpose" and bool(readers) and all(id(each) in self._layers for each in readers)
+        uses = [use for output in node.outputs for use in output.uses()]
+        return turns_constant(node) and bool(uses) and all(read_as_weight(use, self._layers) for use in uses)
 
     def _multiply(self, layer: Layer, samples: list[Values], tools: Tools) -> None:
         name, out = layer.node.inputs[0].name, layer.node.outputs[0].name
         activations = [np.ascontiguousarray(values[name], np.float32) for values in samples]
         rows = np.concatenate([each.reshape(-1, layer.rows) for each in activations])
         products = self._product(layer, rows, tools)
-        if layer.bias is not None:
-            bias = {**samples[0], **self._constants(layer.node, samples[0], tools, skip=1)}[layer.bias.name]
-            products = products + bias
+        biases = [layer.bias] if layer.bias is not None else []
+        constants = self._constants(biases, samples[0], tools)
         begin = 0
         for values, each in zip(samples, activations, strict=True):
             count = each.size // layer.rows
-            values[out] = products[begin : begin + count].reshape(*each.shape[:-1], layer.columns)
+            made = products[begin : begin + count].reshape(*each.shape[:-1], layer.columns)
+            for bias in biases:
+                made = made + {**values, **constants}[bias.name]
+            values[out] = made
             begin += count
 
-    def _constants(self, node: Any, given: Values, tools: Tools, skip: int | None = None) -> Values:
-        """Return the constants that a node reads, as the graph wants them."""
+    def _constants(self, wanted: Iterable[Any], given: Values, tools: Tools) -> Values:
+        """Return those of some values that are constants, as the graph wants them."""
         found = {}
-        for number, value in enumerate(node.inputs):
-            if value is None or value.name in given or number == skip or not value.is_initializer():
+        for value in wanted:
+            if value.name in given or not value.is_initializer():
                 continue
             tensor = self._skeleton.tensors.get(value.name)
             if tensor is None:
@@ -107,11 +117,14 @@ class Layerwise:
         import onnx
         import onnx_ir
 
-        names = [value.name if value is not None else "" for value in node.inputs]
-        kinds = tuple(str(values[name].dtype) if name else "" for name in names)
+        own = [value.name if value is not None else "" for value in node.inputs]
+        taken = [value.name for value in _values(node)[len([name for name in own if name]) :]]
+        names = own + taken
+        kinds = tuple(str(getattr(values[name], "dtype", type(values[name]))) if name else "" for name in names)
         proto = onnx_ir.to_proto(node)
         attributes = tuple(sorted(each.SerializeToString() for each in proto.attribute))
-        key = (node.op_type, node.domain, kinds, attributes, len(node.outputs), tuple(_first(names)))
+        given = tuple(bool(output.name) for output in node.outputs)
+        key = (node.op_type, node.domain, kinds, attributes, given, tuple(_first(names)), tuple(taken))
         if key not in self._sessions:
             self._sessions[key] = _open(onnx, proto, names, values, self._skeleton.model)
         session, inputs, slots = self._sessions[key]
@@ -137,23 +150,51 @@ class _Renamed:
 
 def _open(onnx: Any, proto: Any, names: list[str], values: Values, model: Any) -> tuple[Any, list[str], list[int]]:
     ort = require("onnxruntime", "ort")
-    helper = onnx.helper
     slots = [number for number, name in enumerate(names) if name and names.index(name) == number]
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    try:
+        single = _single(onnx, proto, {names[slot]: values[names[slot]].dtype for slot in slots}, model)
+        session = ort.InferenceSession(single.SerializeToString(), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
+        raise _refused(proto.name, proto.op_type, error) from error
+    return session, [names[slot] for slot in slots], slots
+
+
+def _single(onnx: Any, proto: Any, dtypes: dict[str, Any], model: Any) -> Any:
+    """Return a model of one node that reads values of those dtypes, of any shape."""
+    helper = onnx.helper
     inputs = [
-        helper.make_tensor_value_info(names[slot], helper.np_dtype_to_tensor_dtype(values[names[slot]].dtype), None)
-        for slot in slots
+        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(dtype), None)
+        for name, dtype in dtypes.items()
     ]
     outputs = [onnx.ValueInfoProto(name=name) for name in proto.output if name]
     opsets = [helper.make_opsetid(domain, version) for domain, version in model.graph.opset_imports.items()]
     graph = helper.make_graph([proto], "node", inputs, outputs)
-    single = helper.make_model(graph, opset_imports=opsets, ir_version=10)
-    options = ort.SessionOptions()
-    options.log_severity_level = 4
-    try:
-        session = ort.InferenceSession(single.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-        raise GraphError(
-            f"ONNX Runtime cannot run the node '{proto.name}' ({proto.op_type}) alone: {str(error).splitlines()[0]}.",
-            "use --method rtn or hqq, which need no activations",
-        ) from error
-    return session, [names[slot] for slot in slots], slots
+    return helper.make_model(graph, opset_imports=opsets, ir_version=10)
+
+
+def _refused(name: str, kind: str, error: Exception) -> GraphError:
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
+    return GraphError(
+        f"ONNX Runtime cannot run the node '{name}' ({kind}) alone: {reason}.",
+        "use --method rtn or hqq, which need no activations",
+    )
+
+
+def _values(node: Any) -> list[Any]:
+    """Return the values that a node reads, and those that the graphs inside it (If, Loop, Scan) take from outside."""
+    return [value for value in node.inputs if value is not None] + list(_taken(node).values())
+
+
+def _taken(node: Any) -> dict[str, Any]:
+    """Return name -> value that the graphs inside a node take from outside."""
+    found: dict[str, Any] = {}
+    for attribute in node.attributes.values():
+        if attribute.type.name not in ("GRAPH", "GRAPHS"):
+            continue
+        for graph in [attribute.value] if attribute.type.name == "GRAPH" else attribute.value:
+            inside = {*graph.inputs, *graph.initializers.values(), *(out for each in graph for out in each.outputs)}
+            read = [*graph.outputs, *(value for each in graph for value in _values(each))]
+            found.update({value.name: value for value in read if value not in inside})
+    return found

@@ -32,9 +32,14 @@ def name_nodes(model: Any) -> None:
     seen = {""}
     for number, node in enumerate(model.graph.node):
         if node.name in seen:
-            name = f"{node.name or node.op_type}_{number}"
-            while name in taken:
-                name += "_"
-            taken.add(name)
-            node.name = name
+            node.name = free_name(node.name or node.op_type, number, taken)
         seen.add(node.name)
+
+
+def free_name(wanted: str, number: int, taken: set[str]) -> str:
+    """Return a name for the node with that place in a graph which is none of those that are taken, and take it."""
+    name = f"{wanted}_{number}"
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -93,16 +93,17 @@ class Task:
 
 
 def layers_of(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Layer]:
-    """Yield the products of a graph whose second operand is a two-dimensional float constant."""
+    """Yield the products of activations with a two-dimensional float constant, their second operand."""
     for node in model.graph:
         if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
+            continue
+        if not _takes_rows(node.inputs[0]):
             continue
         attributes = {name: attribute.value for name, attribute in node.attributes.items()}
         plain = attributes.get("alpha", 1.0) == attributes.get("beta", 1.0) == 1.0 and not attributes.get("transA")
         operand, turned = node.inputs[1], bool(attributes.get("transB"))
-        producer = operand.producer()
-        if producer is not None and producer.op_type == "Transpose" and _swaps(producer):
-            operand, turned = producer.inputs[0], not turned
+        if turns_constant(operand.producer()):
+            operand, turned = operand.producer().inputs[0], not turned
         tensor = tensors.get(operand.name) if operand is not None and operand.is_initializer() else None
         if tensor is None or len(tensor.shape) != 2 or tensor.dtype not in FLOATS or not plain:
             continue
@@ -111,9 +112,31 @@ def layers_of(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Layer]:
         yield Layer(node, operand.name, rows, columns, turned, bias)
 
 
-def _swaps(node: Any) -> bool:
+def _takes_rows(operand: Any) -> bool:
+    """Whether an operand is activations of two axes or more; a product of two constants is computed once."""
+    return not operand.is_initializer() and (operand.shape is None or len(operand.shape) > 1)
+
+
+def turns_constant(node: Any) -> bool:
+    """Whether a node is the transposition of a matrix that is a constant."""
+    if node is None or node.op_type != "Transpose" or not node.inputs[0].is_initializer():
+        return False
     axes = node.attributes.get("perm")
     return axes is None or list(axes.value) == [1, 0]
+
+
+def read_as_weight(use: Any, layers: Container[int]) -> bool:
+    """Whether one of the layers, or a transposition that nothing but their weights read, is what uses a constant.
+
+    Args:
+        use: An ``onnx_ir`` usage.
+        layers: ``id`` of the layers' nodes.
+    """
+    if id(use.node) in layers:
+        return bool(use.idx == 1)
+    if not turns_constant(use.node) or use.node.outputs[0].is_graph_output():
+        return False
+    return all(id(each.node) in layers and each.idx == 1 for each in use.node.outputs[0].uses())
 
 
 def block_task(layer: Layer, source: StoredTensor, form: Format, scaled: bool) -> Task:
@@ -184,7 +207,7 @@ class Rewriter:
         self.model = skeleton.model
         self.graph = skeleton.model.graph
         self._file = file
-        self._made: dict[str, Any] = {}
+        self._made: dict[int, Any] = {}
 
     def place(self, task: Task, offset: int, folder: Path, weight: str) -> list[Any]:
         """Make the initializers of a weight whose record starts at ``offset`` of the data file and return them.
@@ -193,14 +216,21 @@ class Rewriter:
         """
         values = []
         for piece in task.pieces:
-            name = f"{weight}.{piece.name.rpartition('.')[2]}"
-            if name not in self._made:
+            place = offset + piece.offset
+            if place not in self._made:
+                name = self._free(f"{weight}.{piece.name.rpartition('.')[2]}")
                 tensor = self._external(name, piece, offset, folder)
                 value = self._ir.Value(name=name, shape=tensor.shape, type=self._ir.TensorType(tensor.dtype))
                 value.const_value = tensor
-                self._made[name] = value
-            values.append(self._made[name])
+                self._made[place] = value
+            values.append(self._made[place])
         return values
+
+    def _free(self, wanted: str) -> str:
+        """Return that name, or one like it where a weight is stored twice: for each way in which it is read."""
+        taken = {value.name for value in self._made.values()}
+        names = (wanted, *(f"{wanted}.{number}" for number in range(2, len(taken) + len(self.graph.initializers) + 3)))
+        return next(name for name in names if name not in taken and name not in self.graph.initializers)
 
     def _external(self, name: str, piece: Piece, offset: int, folder: Path) -> Any:
         return self._ir.ExternalTensor(
@@ -292,6 +322,8 @@ def _attributes(node: Any) -> Iterator[tuple[str, Any]]:
 
 
 def only_gathered(value: Any) -> bool:
-    """Whether a constant is read by nothing but Gather, as the table of an embedding."""
+    """Whether a constant is read by nothing but Gather, as the table of an embedding, in the graph that holds it."""
     uses = list(value.uses())
-    return bool(uses) and all(use.node.op_type == "Gather" and use.idx == 0 for use in uses)
+    if not uses or value.is_graph_output():
+        return False
+    return all(use.node.op_type == "Gather" and use.idx == 0 and use.node.graph is value.graph for use in uses)

@@ -9,6 +9,7 @@ from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
 from vlatool.quantize._compute import as_float32
 from vlatool.quantize._fake_export import Skeleton, export_skeletons, policy_weights
+from vlatool.quantize._nodes import free_name
 from vlatool.quantize._rewrite import INLINE
 from vlatool.sources._shards import FLOATS, NUMPY_NAMES, StoredTensor, fingerprint, reading, shard_files, stored_array
 
@@ -52,6 +53,7 @@ def _open(path: Path) -> Skeleton:
     ir = require("onnx_ir", "build")
     try:
         model = ir.load(str(path))
+        _name_nodes(model)
         tensors = {}
         for name, value in model.graph.initializers.items():
             tensor = _stored(ir, name, value, path)
@@ -63,6 +65,16 @@ def _open(path: Path) -> Skeleton:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
     return Skeleton(model, tensors, int(model.graph.opset_imports.get("", 0)))
+
+
+def _name_nodes(model: Any) -> None:
+    """Give every node a name of its own, as ``name_nodes`` does."""
+    taken = {node.name for node in model.graph}
+    seen = {"", None}
+    for number, node in enumerate(model.graph):
+        if node.name in seen:
+            node.name = free_name(node.name or node.op_type, number, taken)
+        seen.add(node.name)
 
 
 def _stored(ir: Any, name: str, value: Any, path: Path) -> StoredTensor | None:

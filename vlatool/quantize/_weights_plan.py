@@ -21,6 +21,7 @@ from vlatool.quantize._rewrite import (
     layers_of,
     only_gathered,
     qdq_task,
+    read_as_weight,
 )
 from vlatool.quantize._skeletons import BLOCKED_OPSET
 
@@ -164,11 +165,7 @@ def _kept(skeleton: Skeleton, layers: list[Layer]) -> list[str]:
     kept = []
     for name in skeleton.tensors:
         value = skeleton.model.graph.initializers[name]
-        readers = [node for node in value.consumers() if id(node) not in replaced]
-        turned = [node for node in readers if node.op_type == "Transpose" and len(layers)]
-        gone = [node for node in turned if all(id(each) in replaced for each in node.outputs[0].consumers())]
-        biases = {id(layer.bias) for layer in layers}
-        if len(readers) > len(gone) or id(value) in biases or value.is_graph_output():
+        if value.is_graph_output() or not all(read_as_weight(use, replaced) for use in value.uses()):
             kept.append(name)
     return kept
 

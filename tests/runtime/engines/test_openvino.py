@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,25 @@ def test_outputs_are_named_and_do_not_change_later(session: OpenvinoSession) -> 
     np.testing.assert_array_equal(first["m"], [2, 4])
     assert session.outputs == ["y", "m"]
     assert session.inputs == {"x": ([1, 3], "f32"), "n": ([2], "i64")}
+
+
+ALIASED = """g (float[1,4] z, float[1,4] x) => (float[1,4] y, float[1,4] again) <int64[2] s = {1, 4}>
+{ a = Reshape(z, s)  b = Identity(x)  c = Sub(a, b)  d = Relu(c)  y = Reshape(d, s)  e = Tanh(c)
+again = Identity(e) }"""
+
+
+@pytest.mark.parametrize("shape", ["[1,4]", "[n,4]"])
+def test_ports_have_the_names_of_the_file_where_a_reshape_beside_them_is_removed(tmp_path: Path, shape: str) -> None:
+    path = graph(tmp_path / "aliased.onnx", ALIASED.replace("[1,4]", shape))
+    session = OpenvinoSession(path, threads=1)
+    assert (list(session.inputs), list(session.takes)) == (["z", "x"], ["z", "x"])
+    assert (session.outputs, list(session.gives)) == (["y", "again"], ["y", "again"])
+    fed = {name: np.full((1, 4), value, np.float32) for name, value in (("z", 3), ("x", 2))}
+    for deadline in (None, time.monotonic() + 60):
+        session.deadline = deadline
+        np.testing.assert_array_equal(session.run(fed)["y"], np.ones((1, 4)))
+    with pytest.raises(GraphError, match="the input 'x' is missing"):
+        session.run({"z": fed["z"]})
 
 
 def test_feeds_may_be_strided(session: OpenvinoSession) -> None:

@@ -30,6 +30,9 @@ NO_KERNEL = ("bad combination", "inner product")
 class OpenvinoSession:
     """One ONNX file compiled by OpenVINO for the CPU.
 
+    Inputs and outputs have the names that they have in the file: where compiling removes a Reshape or Identity beside
+    one, OpenVINO (2026.4) gives the port the names of both values, and any of them when asked for one.
+
     Args:
         path: The ONNX file; external data is found beside it.
         threads: Threads; the cores that this process may use when None.
@@ -50,6 +53,7 @@ class OpenvinoSession:
             core = openvino.Core()
             wanted = path if opened is None else opened
             model = core.read_model(io.BytesIO(wanted) if isinstance(wanted, bytes) else str(wanted))
+            declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
             self._compiled = core.compile_model(model, DEVICE, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
@@ -62,11 +66,15 @@ class OpenvinoSession:
                 f"OpenVINO computes {path} in {self.precision} on this processor; wanted {HINTS[compute]}.",
                 "make the bundle for this processor: vlatool optimize",
             )
-        self._outputs = [(output.get_any_name(), number) for number, output in enumerate(self._compiled.outputs)]
-        self.outputs = [name for name, _ in self._outputs]
-        self.inputs = {port.get_any_name(): _described(port) for port in self._compiled.inputs}
-        self.takes = {port.get_any_name(): _port(port) for port in self._compiled.inputs}
-        self.gives = {port.get_any_name(): _port(port) for port in self._compiled.outputs}
+        ports = self._compiled.inputs, self._compiled.outputs
+        self._inputs, outputs = (
+            dict(zip(names, each, strict=True)) for names, each in zip(declared, ports, strict=True)
+        )
+        self.outputs = list(outputs)
+        self._outputs = [(name, number) for number, name in enumerate(outputs)]
+        self.inputs = {name: _described(port) for name, port in self._inputs.items()}
+        self.takes = {name: _port(port) for name, port in self._inputs.items()}
+        self.gives = {name: _port(port) for name, port in outputs.items()}
         self.deadline: float | None = None
         self._buffers = self._bound(openvino)
 
@@ -120,14 +128,14 @@ class OpenvinoSession:
 
         Python's ``infer(feeds)`` checks and wraps every array at every call.
         """
-        ports = self._compiled.inputs
+        ports = self._inputs.values()
         if any(port.partial_shape.is_dynamic or port.element_type.get_type_name() == "bf16" for port in ports):
             return {}
         buffers = {}
-        for port in ports:
+        for name, port in self._inputs.items():
             buffer = np.zeros(tuple(port.shape), port.element_type.to_dtype())
             self._request.set_tensor(port, openvino.Tensor(buffer, shared_memory=True))
-            buffers[port.get_any_name()] = buffer
+            buffers[name] = buffer
         return buffers
 
     def _fill(self, feeds: Mapping[str, Any]) -> bool:
@@ -143,8 +151,8 @@ class OpenvinoSession:
 
     def _check(self, feeds: Mapping[str, Any]) -> None:
         """Refuse what OpenVINO takes: a missing input (an earlier run's is left there), another dtype (it casts)."""
-        for port in self._compiled.inputs:
-            name, wanted = port.get_any_name(), np.dtype(port.element_type.to_dtype())
+        for name, port in self._inputs.items():
+            wanted = np.dtype(port.element_type.to_dtype())
             value = feeds.get(name)
             if not isinstance(value, np.ndarray) or value.dtype != wanted:
                 got = "missing" if value is None else str(getattr(value, "dtype", type(value).__name__))

@@ -1,0 +1,129 @@
+"""What people write in ONNX graphs, alone and drawn at random, through every method; at length: graphs_fuzz.py."""
+
+import numpy as np
+import onnx
+import pytest
+from _graph_trials import METHODS, float_graph, trial
+from _random_graphs import RandomGraph
+
+from vlatool.launch import run_transform
+from vlatool.quantize.weight_only import WeightOnly
+from vlatool.stage import Context
+
+WEIGHTS = ("int4", "int4-qdq", "hqq", "gptq", "gptq-qdq", "awq", "awq-qdq")
+SEEDS = (34, 50)
+
+
+class Written(RandomGraph):
+    """A graph of a few lines instead of a random one."""
+
+    def __init__(self, write, shape=(1, 4, 32), named=True) -> None:
+        self._write, self._shape = write, shape
+        super().__init__(7)
+        self.opset, self.named = 21, named
+
+    def _draw(self) -> None:
+        self.outputs.append(self._write(self, self.given(self._shape)))
+
+
+def linear(g, value):
+    return g.node("MatMul", [value, g.weight(32, 16)], (*g.shapes[value][:-1], 16))
+
+
+def gemm(g, value):
+    return g.node("Gemm", [value, g.weight(16, 32, fan=32), g.constant(np.ones(16))], (1, 16), transB=1)
+
+
+def turned_values(g, value):
+    """The transposition is of activations, not of a weight."""
+    turned = g.node("Transpose", [value], (1, 32, 4), perm=[0, 2, 1])
+    return g.node("MatMul", [turned, g.weight(4, 16)], (1, 32, 16))
+
+
+def of_constants(g, value):
+    made = g.node("MatMul", [g.constant(np.ones((1, 32))), g.weight(32, 32)], (1, 32))
+    return linear(g, g.node("Add", [value, made], g.shapes[value]))
+
+
+def both_ways(g, value):
+    weight = g.weight(32, 24)
+    small = g.node("MatMul", [value, weight], (*g.shapes[value][:-1], 24))
+    turned = g.node("Transpose", [weight], (24, 32), perm=[1, 0])
+    return g.node("MatMul", [g.node("Tanh", [small], g.shapes[small]), turned], g.shapes[value])
+
+
+def twice(g, value):
+    weight = g.weight(32, 32)
+    first = g.node("MatMul", [value, weight], g.shapes[value])
+    return g.node("MatMul", [g.node("Relu", [first], g.shapes[value]), weight], g.shapes[value])
+
+
+def weight_given(g, value):
+    weight = g.weight(32, 16)
+    g.outputs.append(made := g.node("MatMul", [value, weight], (*g.shapes[value][:-1], 16)))
+    g.outputs.append(weight)
+    return g.node("Relu", [made], g.shapes[made])
+
+
+def chosen(g, value):
+    """The graphs inside an If read a value and a weight from around it."""
+    from _random_graphs import _chosen
+
+    return linear(g, g.node("MatMul", [_chosen(g, value), g.weight(16, 32)], g.shapes[value]))
+
+
+def dead_inputs(g, value):
+    """Half of what the layer reads is always zero in the recording."""
+    mask = g.constant(np.arange(32) % 2)
+    return linear(g, g.node("Mul", [value, mask], g.shapes[value]))
+
+
+@pytest.mark.parametrize("word", WEIGHTS)
+@pytest.mark.parametrize(
+    ("write", "shape"),
+    [
+        (linear, (1, 32)),
+        (gemm, (1, 32)),
+        (linear, (1, 4, 32)),
+        (turned_values, (1, 4, 32)),
+        (of_constants, (1, 32)),
+        (both_ways, (1, 32)),
+        (twice, (1, 4, 32)),
+        (weight_given, (1, 32)),
+        (chosen, (1, 4, 32)),
+        (dead_inputs, (1, 32)),
+    ],
+)
+def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_path):
+    graph = Written(write, shape)
+    found = trial(graph, float_graph(graph, tmp_path / "graph"), word)
+    assert (found.verdict, found.words) == ("right", "")
+    assert 0 < found.drift < 0.25
+
+
+def test_nodes_without_names_are_quantized_and_can_be_chosen(tmp_path):
+    source = float_graph(Written(both_ways, (1, 32), named=False), tmp_path / "graph")
+    recording = source.path.parent / "recording.npz"
+    for method in ("gptq", "awq"):
+        stage = WeightOnly(method=method, calibration=recording, exclude=("MatMul_3",))
+        made = run_transform(stage, source, tmp_path / method, Context())
+        kinds = [node.op_type for node in onnx.load(made.path / "graphs/main.onnx").graph.node]
+        assert kinds.count("MatMulNBits") == kinds.count("MatMul") == 1
+
+
+@pytest.mark.parametrize("method", ["gptq", "awq"])
+def test_a_weight_that_is_read_in_two_ways_is_stored_for_each(method, tmp_path):
+    source = float_graph(Written(both_ways, (1, 32)), tmp_path / "graph")
+    stage = WeightOnly(method=method, calibration=source.path.parent / "recording.npz")
+    made = run_transform(stage, source, tmp_path / "out", Context())
+    nodes = [node for node in onnx.load(made.path / "graphs/main.onnx").graph.node if node.op_type == "MatMulNBits"]
+    assert nodes[0].input[1] != nodes[1].input[1]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_method_crashes_on_a_random_graph_and_what_it_gives_is_right(seed, tmp_path):
+    graph = RandomGraph(seed)
+    source = float_graph(graph, tmp_path / "graph")
+    found = {word: trial(graph, source, word) for word in METHODS}
+    assert {word: each for word, each in found.items() if each.verdict in ("crash", "drift")} == {}
+    assert [each.verdict for each in found.values()].count("right") >= 10
