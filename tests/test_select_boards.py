@@ -54,8 +54,8 @@ def test_a_count_is_kept_and_read_again(float_bundle: Bundle) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 3}', b'{"layout": 3, "graphs": 3, "runs": {}}',
-                b'{"layout": 3, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
+    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 4}', b'{"layout": 4, "graphs": 3, "runs": {}}',
+                b'{"layout": 4, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
 )  # fmt: skip
 def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> None:
     wanted = counted(float_bundle, Context())
