@@ -259,14 +259,21 @@ def test_control_flow_on_data_is_told_without_a_traceback(plain, tmp_path: Path)
     body = "if x.sum() > 0:\n    return self.linear(x)\nreturn self.linear(x) * 2"
     with pytest.raises(GraphError, match="torch cannot export the graph 'main': ") as caught:
         export(plain(body), tmp_path / "out")
-    assert "control flow" in caught.value.fix
+    assert "control flow" in caught.value.message
     assert len(caught.value.message.splitlines()) == 1
 
 
 def test_random_numbers_in_forward_are_seen(plain, tmp_path: Path):
-    with pytest.raises(GraphError, match="ONNX Runtime and torch differ on calibration sample 0") as caught:
+    with pytest.raises(GraphError, match="draws random numbers, once an inference") as caught:
         export(plain("return self.linear(x) + torch.rand(1, 2)"), tmp_path / "out")
-    assert "random numbers" in caught.value.fix
+    assert "distribution: uniform" in caught.value.fix
+
+
+def test_state_that_forward_keeps_is_seen(plain, tmp_path: Path):
+    body = "self.linear.turn = getattr(self.linear, 'turn', 0) + 1\nreturn self.linear(x) * self.linear.turn"
+    with pytest.raises(GraphError, match="ONNX Runtime and torch differ on calibration sample 0") as caught:
+        export(plain(body), tmp_path / "out")
+    assert "'keep' in the program" in caught.value.fix
 
 
 def test_a_factory_that_gives_no_module(source, tmp_path: Path):

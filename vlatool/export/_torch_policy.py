@@ -10,6 +10,7 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
+from vlatool.export._failures import remedy_for
 from vlatool.manifest import ProgramStep
 from vlatool.printable import message_of
 from vlatool.runtime.policy import Policy
@@ -103,7 +104,7 @@ class TorchSession:
         torch = require("torch", "build")
         if self.first_feeds is None:
             self.first_feeds = dict(feeds)
-        arguments = [torch.from_numpy(np.ascontiguousarray(feeds[name])) for name in self.step.feeds]
+        arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
         try:
             with torch.inference_mode(), exits_told("the policy's forward()"):
                 given = self.module(*arguments)
@@ -113,7 +114,8 @@ class TorchSession:
             shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
             raise SourceError(
                 f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
-                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes})."
+                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
+                remedy_for(error),
             ) from error
         outputs = list(given) if isinstance(given, tuple | list) else [given]
         if len(outputs) != len(self.step.gives):
@@ -122,5 +124,8 @@ class TorchSession:
             )
         for name, value in zip(self.step.gives, outputs, strict=True):
             if not isinstance(value, torch.Tensor):
-                raise SourceError(f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.")
+                raise SourceError(
+                    f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.",
+                    "return a tensor, or a tuple of tensors in the order of 'gives'",
+                )
         return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}
