@@ -16,6 +16,7 @@ from vlatool.printable import message_of
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.sources._factory import exits_told
+from vlatool.sources._modules import modules_of
 from vlatool.sources._origin import origin_of
 from vlatool.sources._shards import read_header, shard_files
 
@@ -29,21 +30,14 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     Raises:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
-    torch = require("torch", "build")
+    require("torch", "build")
     origin = origin_of(source)
     origin.check()
-    made = origin.made()
-    modules = made if isinstance(made, Mapping) else {"main": made}
-    wanted = {step.graph for step in source.manifest.program}
-    for name in wanted:
-        if name not in modules:
-            raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, modules)}.")
-        if not isinstance(modules[name], torch.nn.Module):
-            raise SourceError(f"The factory gave a {type(modules[name]).__name__} for '{name}'; wanted a torch module.")
+    modules = modules_of(origin.made(), sorted({step.graph for step in source.manifest.program}))
     if origin.weights:
-        for name in wanted:
-            _load_weights(name, modules[name], origin.folder, origin.weights)
-    return {name: modules[name].eval() for name in sorted(wanted)}
+        for name, module in modules.items():
+            _load_weights(name, module, origin.folder, origin.weights)
+    return modules
 
 
 def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:
