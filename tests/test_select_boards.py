@@ -4,7 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import onnx
 import pytest
+from onnx import helper, numpy_helper
 
 from vlatool import select_boards as select_boards_module
 from vlatool.bundle import Bundle
@@ -54,8 +57,8 @@ def test_a_count_is_kept_and_read_again(float_bundle: Bundle) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 3}', b'{"layout": 3, "graphs": 3, "runs": {}}',
-                b'{"layout": 3, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
+    "content", [b"", b"{", b"[]", b"3", b'{"layout": 99}', b'{"layout": 4}', b'{"layout": 4, "graphs": 3, "runs": {}}',
+                b'{"layout": 4, "graphs": {"m": {"colour": 1}}, "runs": {}}', b"\xff\xfe"]
 )  # fmt: skip
 def test_a_damaged_count_is_made_again(float_bundle: Bundle, content: bytes) -> None:
     wanted = counted(float_bundle, Context())
@@ -215,3 +218,20 @@ def test_a_change_that_cannot_be_predicted_is_json_without_nan(float_bundle: Bun
     found = _change(Change("int8 in the place of float32", outcome))
     assert (found["latency_ms"], found["why"]) == (None, outcome.latency.why)
     json.dumps(found, allow_nan=False)
+
+
+def test_a_graph_with_free_axes_is_refused_with_a_remedy_that_works(tmp_path: Path) -> None:
+    model = tmp_path / "free.onnx"
+    weight = numpy_helper.from_array(np.ones((4, 2), np.float32), "w")
+    given, taken = (helper.make_tensor_value_info(name, 1, (1, "rows", size)) for name, size in (("y", 2), ("x", 4)))
+    graph = helper.make_graph([helper.make_node("MatMul", ["x", "w"], ["y"])], "g", [taken], [given], [weight])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=8), model)
+    asked = (str(model), "raspberry-pi-5", None, None, "", Context())
+    with pytest.raises(DataError, match="no static shape") as caught:
+        simulated(*asked)
+    assert "policy.yaml" in caught.value.fix
+    (tmp_path / "policy.yaml").write_text(
+        "name: free\nspec:\n  inputs: [{name: x, shape: [1, 5, 4]}]\n  outputs: [{name: y, shape: [1, 5, 2]}]\n"
+        "  control_hz: 10\n  chunk: 5\n"
+    )
+    assert simulated(*asked)["latency_ms"][0] > 0

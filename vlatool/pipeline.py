@@ -113,6 +113,8 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
     if path.suffix == ".onnx":
         beside = path.parent / FILE if (path.parent / FILE).is_file() else None
         return OnnxFile(model=path, policy=beside), beside
+    if path.is_dir():
+        _refuse_bare(path)
     if path.is_dir() or path.suffix in (".yaml", ".yml"):
         return _torch_source(path), path
     where, _, function = source.rpartition(":")
@@ -124,6 +126,25 @@ def source_stage(source: str) -> tuple[Transform, Path | None]:
     raise SourceError(
         f"'{source}' is no bundle and no policy source.",
         "give a bundle, a directory with a policy.yaml, path/to/policy.py:make, or a .onnx file",
+    )
+
+
+def _refuse_bare(folder: Path) -> None:
+    """Refuse a directory that holds ONNX files and names no factory: the file itself is the source.
+
+    Raises:
+        SourceError: naming the file, or all of them.
+    """
+    files = sorted(folder.glob("*.onnx"))
+    described = (folder / FILE).is_file()
+    if not files or (described and read_description(folder).factory):
+        return
+    names = ", ".join(str(file) for file in files[:4])
+    lacks = f"a {FILE} without a 'source'" if described else f"no {FILE}"
+    beside = "" if described else f"; a {FILE} beside it may describe inputs and outputs"
+    raise SourceError(
+        f"{folder} holds ONNX files ({', '.join(file.name for file in files[:4])}) and {lacks}.",
+        f"name the file: {names if len(files) == 1 else f'one of {names}'}{beside}",
     )
 
 

@@ -20,6 +20,7 @@ from vlatool.launch import run_transform
 from vlatool.pipeline import ROBOT_FOLDERS, source_stage
 from vlatool.sources._description import read_description, read_location
 from vlatool.sources._factory import factory_file
+from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context, Transform, build_stage, installed_version, source_of, stage_class
 from vlatool.writing import writing
@@ -271,6 +272,8 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
             raise SourceError(f"{source} names the factory {stage.factory}; {bundle.path} was made by {factory}.")
         _check_factory(factory, stage, bundle)
         stage = stage.model_copy(update={"factory": factory})
+    if isinstance(stage, OnnxFile) and isinstance(opset := entry.get("options", {}).get("opset"), int):
+        stage = stage.model_copy(update={"opset": opset})
     stage.check(None, None)
     got, recorded = stage.input_hashes(), entry.get("files", {})
     wrong = [

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle import MANIFEST, Bundle
-from vlatool.errors import DataError, OutputError, UsageError, nearest
+from vlatool.errors import DataError, OutputError, SourceError, UsageError, nearest
 from vlatool.export.onnx import ExportOnnx
 from vlatool.host import cache_directory
 from vlatool.hwselect._board import Candidate, outcomes, quantized_as
@@ -117,13 +117,28 @@ def counted(bundle: Bundle, context: Context) -> Workload:
     elif _may_carry(bundle) and (carried := read_workload(_beside(bundle), digest(bundle))) is not None:
         return carried
     elif "factory" in bundle.manifest.source:
-        context.tell("counting the policy's work, without its weights", None)
-        found = counted_apart(bundle, context.tell)
+        found = _counted_source(bundle, context)
     else:
-        found = workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
+        found = _counted_export(bundle, context)
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
         write_workload(file, found)
     return found
+
+
+def _counted_source(bundle: Bundle, context: Context) -> Workload:
+    """Count a policy without its weights; where that cannot be, export it and count its graphs.
+
+    A factory that reads its own weights cannot fill modules that have none, and may look at their values.
+    """
+    context.tell("counting the policy's work, without its weights", None)
+    with contextlib.suppress(SourceError):  # what is wrong with the policy itself, the export says
+        return counted_apart(bundle, context.tell)
+    context.tell("it cannot be counted so; exporting the policy to count its graphs", None)
+    return _counted_export(bundle, context)
+
+
+def _counted_export(bundle: Bundle, context: Context) -> Workload:
+    return workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
 
 
 def carry_count(source: str, context: Context) -> Path:
@@ -189,7 +204,7 @@ def simulated(
     model = shipped().conditioned(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
-        raise DataError(f"{source} on {board}: {outcome.latency.why}.", "try another --engine or --precision")
+        raise DataError(f"{source} on {board}: {outcome.latency.why}.", _fix_of(load))
     phases = bounds(outcome, model.shares)
     return {
         "source": source, "profile": board, "mode": name, "engine": candidate.engine,
@@ -205,6 +220,16 @@ def simulated(
         "timeline": [*timeline(phases)],
         "changes": [_change(change) for change in changes(candidate, load, model)],
     }  # fmt: skip
+
+
+FIXED_SHAPES = (
+    "give every axis a number: write the shapes into the spec of a policy.yaml beside the ONNX file, or export it with "
+    "fixed shapes"
+)
+
+
+def _fix_of(load: Workload) -> str:
+    return FIXED_SHAPES if load.unknown else "try another --engine or --precision"
 
 
 def _part_lines(phases: list[dict[str, Any]]) -> list[str]:

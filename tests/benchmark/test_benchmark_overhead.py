@@ -1,10 +1,14 @@
 from dataclasses import replace
+from pathlib import Path
 
+import onnx.parser
 import pytest
 
 from vlatool.benchmark.overhead import Overhead
-from vlatool.bundle import Bundle
+from vlatool.bundle import Bundle, seal
 from vlatool.errors import UsageError
+from vlatool.manifest import Graph, Manifest, ProgramStep
+from vlatool.spec import PolicySpec, TensorSpec
 from vlatool.stage import Context
 
 
@@ -31,3 +35,22 @@ def test_a_graph_that_runs_twice_has_no_single_bare_call(float_bundle):
         with pytest.raises(UsageError, match="one graph that runs once"):
             Overhead(iterations=100).run(twice, Context())
     Overhead().check(None, None)
+
+
+SUMS = """g (float[1,2] x, float[1,2] memory, float[1,2] noise, float[1] time) => (float[1,2] y, float[1,2] kept)
+    { y = Sum(x, memory, noise, time)  kept = Neg(y) }"""
+
+
+def test_a_policy_that_keeps_draws_and_schedules_has_an_overhead(tmp_path: Path) -> None:
+    step = ProgramStep(
+        "main", {name: name for name in ("x", "memory", "noise", "time")}, {"y": "y", "kept": "memory"},
+        schedule={"time": [0.5]}, noise={"noise": {"shape": [1, 2]}}, keep={"memory": {"shape": [1, 2]}},
+    )  # fmt: skip
+    (tmp_path / "graphs").mkdir()
+    model = onnx.parser.parse_model(f'<ir_version: 10, opset_import: ["" : 20]> {SUMS}')
+    onnx.save(model, str(tmp_path / "graphs/main.onnx"))
+    spec = PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0)
+    sealed = seal(tmp_path, Manifest("sums", "1", spec, program=(step,)))
+    manifest = replace(sealed.manifest, graphs={"main": Graph("graphs/main.onnx", opset=20)})
+    (row,) = Overhead(iterations=100).run(seal(tmp_path, manifest), Context()).rows
+    assert row.value("bare_run_p50") > 0

@@ -259,14 +259,46 @@ def test_control_flow_on_data_is_told_without_a_traceback(plain, tmp_path: Path)
     body = "if x.sum() > 0:\n    return self.linear(x)\nreturn self.linear(x) * 2"
     with pytest.raises(GraphError, match="torch cannot export the graph 'main': ") as caught:
         export(plain(body), tmp_path / "out")
-    assert "control flow" in caught.value.fix
+    assert "control flow" in caught.value.message
     assert len(caught.value.message.splitlines()) == 1
 
 
+EXPORTED_PY = (
+    PLAIN_PY.replace("BODY", "return self.linear(torch.relu(x))").replace("def make", "def plain")
+    + """
+from pathlib import Path
+
+def make():
+    program = torch.export.export(plain().eval(), (torch.zeros(1, 3),))
+    file = Path(__file__).with_name("policy.pt2")
+    torch.export.save(program, file)
+    program = torch.export.load(file)
+    return FORM
+"""
+)
+
+
+@pytest.mark.parametrize("form", ["program", "program.module()", "nn.Sequential(program.module())"])
+def test_a_program_of_torch_export_is_a_policy(source, tmp_path: Path, form: str):
+    bundle = source(EXPORTED_PY.replace("FORM", form))
+    made = export(bundle, tmp_path / "out")
+    observation = {"x": np.array([1.0, -2.0, 3.0], np.float32)}
+    wanted = torch_policy(bundle).infer(observation).chunk
+    np.testing.assert_allclose(load(made.path, threads=1).infer(observation).chunk, wanted, rtol=1e-5)
+    assert np.abs(wanted).sum() > 0
+
+
 def test_random_numbers_in_forward_are_seen(plain, tmp_path: Path):
-    with pytest.raises(GraphError, match="ONNX Runtime and torch differ on calibration sample 0") as caught:
+    with pytest.raises(GraphError, match="draws random numbers, once an inference") as caught:
         export(plain("return self.linear(x) + torch.rand(1, 2)"), tmp_path / "out")
-    assert "random numbers" in caught.value.fix
+    assert "distribution: uniform" in caught.value.fix
+
+
+def test_state_that_forward_keeps_is_seen(plain, tmp_path: Path):
+    body = "self.linear.turn = getattr(self.linear, 'turn', 0) + 1\nreturn self.linear(x) * self.linear.turn"
+    with pytest.raises(GraphError, match="ONNX Runtime and torch differ on calibration sample 0") as caught:
+        export(plain(body), tmp_path / "out")
+    assert "'keep' in the program" in caught.value.fix
 
 
 def test_a_factory_that_gives_no_module(source, tmp_path: Path):

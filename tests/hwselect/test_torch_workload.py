@@ -9,6 +9,9 @@ import pytest
 
 from vlatool.bundle import Bundle
 from vlatool.errors import SourceError
+from vlatool.export.onnx import ExportOnnx
+from vlatool.hwselect._board import work_of
+from vlatool.hwselect._boards_report import work_sentence
 from vlatool.hwselect._torch_workload import torch_workload
 from vlatool.hwselect._workload import workload
 from vlatool.samples._write import write_sample
@@ -158,3 +161,48 @@ def test_a_sample_is_counted_with_its_attention(tmp_path: Path) -> None:
     assert found.runs == {"main": 1}
     assert 120e6 < graph.weights < 128e6, "127 M parameters, says its description"
     assert "attention" in graph.traits
+
+
+LOOPED = """\
+import torch
+from torch import nn
+
+class Policy(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.step = nn.Linear(6, 6)
+        self.mix = nn.Conv1d(1, 1, 3, padding=1, bias=False)
+
+    def forward(self, state):
+        for _ in range(5):
+            state = state + torch.tanh(self.mix(self.step(state)[:, None])[:, 0])
+        return state[:, None]
+
+def make():
+    torch.manual_seed(0)
+    return Policy()
+"""
+LOOPED_YAML = """\
+schema: 1
+name: looped
+version: 1.0.0
+source: policy.py:make
+spec:
+  inputs: [{name: state, shape: [1, 6]}]
+  outputs: [{name: action, shape: [1, 1, 6]}]
+  control_hz: 10
+"""
+
+
+def test_the_weights_of_a_loop_count_once_and_are_read_in_each_turn(tmp_path: Path) -> None:
+    folder = tmp_path / "looped"
+    folder.mkdir()
+    (folder / "policy.py").write_text(LOOPED)
+    (folder / "policy.yaml").write_text(LOOPED_YAML)
+    source = remade(folder, tmp_path / "source")
+    (tmp_path / "exported").mkdir()
+    for found in (torch_workload(source), workload(ExportOnnx().run(source, tmp_path / "exported", Context()))):
+        graph = found.graphs["main"]
+        assert (graph.weights, graph.reads, graph.layers) == (36 + 3, 5 * 39, 10)
+        assert work_of(graph).weights == 5 * 39, "a turn of the loop reads its weights again, which takes time"
+        assert "with 39 weights" in work_sentence(found)

@@ -6,7 +6,10 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle import Bundle
+from vlatool.cli._run import is_bundle
 from vlatool.errors import GraphError, RecipeError, SourceError
+from vlatool.hwselect._workload import graph_workload
+from vlatool.pipeline import source_stage
 from vlatool.runtime import load
 from vlatool.sources.onnx import OnnxFile
 from vlatool.stage import Context, build_stage
@@ -151,3 +154,85 @@ def test_a_description_that_the_file_does_not_fit_is_not_sealed(tmp_path: Path, 
     )
     with pytest.raises(GraphError, match=told):
         build(tmp_path / "out", linear(tmp_path / "walker.onnx"), policy=tmp_path / "policy.yaml")
+
+
+def reshaped(path: Path, shape: object = ("batch", "rows", 4), opset: int = 17) -> Path:
+    """An ONNX file that reads its own batch: ``y = (x @ w)``, reshaped to [batch, 2, ...] as exporters write it."""
+    weight = numpy_helper.from_array(np.arange(8, dtype=np.float32).reshape(4, 2), "w")
+    rest = numpy_helper.from_array(np.array([2, -1], np.int64), "rest")
+    nodes = [
+        helper.make_node("MatMul", ["x", "w"], ["m"], name="product"),
+        helper.make_node("Shape", ["x"], ["n"], start=0, end=1),
+        helper.make_node("Concat", ["n", "rest"], ["wanted"], axis=0),
+        helper.make_node("Reshape", ["m", "wanted"], ["y"]),
+    ]
+    result = helper.make_tensor_value_info("y", TensorProto.FLOAT, (shape[0], 2, None))  # type: ignore[index]
+    given = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
+    graph = helper.make_graph(nodes, "main", [given], [result], [weight, rest])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8), path)
+    return path
+
+
+def shapes(bundle: Bundle) -> tuple[list[int], list[int]]:
+    graph = onnx.load(bundle.path / "graphs/main.onnx").graph
+    (found, given) = (
+        [axis.dim_value for axis in each.type.tensor_type.shape.dim] for each in (graph.input[0], graph.output[0])
+    )
+    return found, given
+
+
+@pytest.mark.parametrize("batch", ["batch", None, -1, 0])
+def test_the_batch_axis_of_the_graph_is_fixed_to_one(tmp_path: Path, batch: object) -> None:
+    said: list[str] = []
+    path = reshaped(tmp_path / "a.onnx", (batch, 6, 4))
+    (tmp_path / "out").mkdir()
+    bundle = OnnxFile(model=path).run(None, tmp_path / "out", Context(lambda text, _share: said.append(text)))
+    assert shapes(bundle) == ([1, 6, 4], [1, 2, 6])
+    assert "free axes get a length: x axis 0 = 1" in said
+    assert graph_workload(bundle.path / "graphs/main.onnx").macs == {"float32": 6 * 4 * 2}
+    observation = {"x": np.ones((1, 6, 4), np.float32)}
+    wanted = load(bundle.path, threads=1).infer(observation).chunk
+    np.testing.assert_allclose(
+        load(bundle.path, threads=1, engine="openvino").infer(observation).chunk, wanted, rtol=1e-5
+    )
+
+
+def test_other_free_axes_get_the_lengths_of_the_description(tmp_path: Path) -> None:
+    (tmp_path / "policy.yaml").write_text(
+        "name: free\nspec:\n  inputs: [{name: x, shape: [1, 6, 4]}]\n  outputs: [{name: y, shape: [1, 2, 6]}]\n"
+        "  control_hz: 10\n  chunk: 2\n"
+    )
+    path = reshaped(tmp_path / "a.onnx")
+    assert shapes(build(tmp_path / "out", path, policy=tmp_path)) == ([1, 6, 4], [1, 2, 6])
+
+
+def test_an_opset_that_is_asked_for_is_converted_to(tmp_path: Path) -> None:
+    bundle = build(tmp_path / "out", reshaped(tmp_path / "a.onnx", (1, 6, 4), opset=17), opset=20)
+    assert bundle.manifest.graphs["main"].opset == 20
+    assert onnx.load(bundle.path / "graphs/main.onnx").opset_import[0].version == 20
+    assert bundle.manifest.made_by["options"]["opset"] == 20
+
+
+def test_an_opset_that_cannot_be_converted_to_says_why(tmp_path: Path) -> None:
+    path = linear(tmp_path / "a.onnx", op="Gelu")
+    model = onnx.load(path)
+    del model.graph.node[0].input[1:]
+    onnx.save(model, path)
+    with pytest.raises(SourceError, match=r"has opset 20, which onnx cannot convert to 17: .*Gelu") as caught:
+        build(tmp_path / "out", path, opset=17)
+    assert "leave --opset out" in caught.value.fix
+
+
+@pytest.mark.parametrize("described", [False, True])
+def test_a_directory_with_an_onnx_file_is_told_to_name_the_file(tmp_path: Path, described: bool) -> None:
+    path = linear(tmp_path / "walker.onnx")
+    if described:
+        (tmp_path / "policy.yaml").write_text(
+            "name: w\nspec:\n  inputs: [{name: x, shape: [1, 3]}]\n  outputs: [{name: y, shape: [1, 2]}]\n"
+            "  control_hz: 9\n"
+        )
+    with pytest.raises(SourceError, match=r"holds ONNX files \(walker.onnx\)") as caught:
+        source_stage(str(tmp_path))
+    assert str(path) in caught.value.fix
+    assert "--factory" not in str(caught.value)
+    assert not is_bundle(str(tmp_path))

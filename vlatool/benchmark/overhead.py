@@ -13,8 +13,10 @@ from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import UsageError
 from vlatool.host import fingerprint
+from vlatool.manifest import ProgramStep
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import draw
 from vlatool.stage import Context, Measure
 from vlatool.statistics import quantile_interval
 
@@ -51,7 +53,8 @@ class Overhead(Measure):
         observations = observations_for(source, 16)
         step = policy.program.steps[0]
         session = getattr(policy.program.sessions[step.graph], "_session")  # noqa: B009
-        values = [policy.encode(observation) for observation in observations]
+        own = _own_values(step)
+        values = [{**policy.encode(observation), **own} for observation in observations]
         feeds = [{name: encoded[value] for name, value in step.feeds.items()} for encoded in values]
 
         def run(fed: dict[str, Any]) -> Any:
@@ -88,6 +91,16 @@ class Overhead(Measure):
         row = Row(source.manifest.name, measurements=measurements, raw={"overhead_us": differences.tolist()})
         return Report("benchmark", f"Overhead of the runtime on {source.manifest.name}", summary=(text,), rows=(row,),
                       environment=fingerprint())  # fmt: skip
+
+
+def _own_values(step: ProgramStep) -> dict[str, Any]:
+    """Return what the program itself feeds to a step: kept values of a new episode, noise, and the schedule's first."""
+    random = np.random.default_rng(0)
+    values: dict[str, Any] = {name: draw(wanted, random) for name, wanted in step.noise.items()}
+    values |= {name: np.zeros(kept["shape"], kept.get("dtype", "float32")) for name, kept in step.keep.items()}
+    for name, numbers in step.schedule.items():
+        values[name] = np.array(numbers[:1], np.int64 if all(isinstance(each, int) for each in numbers) else np.float32)
+    return values
 
 
 def _median_us(call: Callable[[Any], Any], arguments: Sequence[Any]) -> float:

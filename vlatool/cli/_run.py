@@ -68,7 +68,9 @@ MEASURE_FLAGS = (
 def is_bundle(source: str) -> bool:
     """Say whether SOURCE is a bundle rather than a policy to export."""
     path = Path(source)
-    return (path / MANIFEST).is_file() or (path.exists() and path.is_dir() and not (path / "policy.yaml").is_file())
+    if (path / MANIFEST).is_file() or not path.is_dir():
+        return (path / MANIFEST).is_file()
+    return not (path / "policy.yaml").is_file() and not any(path.glob("*.onnx"))
 
 
 def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool) -> None:
@@ -83,7 +85,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         elif stage.kind() == "export":
             bundle = sourced(source, cache_directory(), context)
             if bundle.manifest.graphs:  # an ONNX file: its source stage is all the export that there is
-                stage, bundle = source_stage(source)[0], None
+                stage, bundle = _onnx_source(stage, source_stage(source)[0]), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         made = run_transform(stage, bundle, out, context, force=force)
@@ -100,6 +102,12 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     for name, shares in precision.items():
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
     _refuse(made)
+
+
+def _onnx_source(export: Transform, source: Transform) -> Transform:
+    """Return the source stage of an ONNX file, with the opset that the export was asked for."""
+    asked = "opset" in export.model_fields_set
+    return source.model_copy(update={"opset": getattr(export, "opset", None)}) if asked else source
 
 
 def _refuse(made: Bundle) -> None:

@@ -10,11 +10,13 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
+from vlatool.export._failures import remedy_for
 from vlatool.manifest import ProgramStep
 from vlatool.printable import message_of
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.sources._factory import exits_told
+from vlatool.sources._modules import modules_of
 from vlatool.sources._origin import origin_of
 from vlatool.sources._shards import read_header, shard_files
 
@@ -28,21 +30,14 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     Raises:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
-    torch = require("torch", "build")
+    require("torch", "build")
     origin = origin_of(source)
     origin.check()
-    made = origin.made()
-    modules = made if isinstance(made, Mapping) else {"main": made}
-    wanted = {step.graph for step in source.manifest.program}
-    for name in wanted:
-        if name not in modules:
-            raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, modules)}.")
-        if not isinstance(modules[name], torch.nn.Module):
-            raise SourceError(f"The factory gave a {type(modules[name]).__name__} for '{name}'; wanted a torch module.")
+    modules = modules_of(origin.made(), sorted({step.graph for step in source.manifest.program}))
     if origin.weights:
-        for name in wanted:
-            _load_weights(name, modules[name], origin.folder, origin.weights)
-    return {name: modules[name].eval() for name in sorted(wanted)}
+        for name, module in modules.items():
+            _load_weights(name, module, origin.folder, origin.weights)
+    return modules
 
 
 def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:
@@ -103,7 +98,7 @@ class TorchSession:
         torch = require("torch", "build")
         if self.first_feeds is None:
             self.first_feeds = dict(feeds)
-        arguments = [torch.from_numpy(np.ascontiguousarray(feeds[name])) for name in self.step.feeds]
+        arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
         try:
             with torch.inference_mode(), exits_told("the policy's forward()"):
                 given = self.module(*arguments)
@@ -113,7 +108,8 @@ class TorchSession:
             shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
             raise SourceError(
                 f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
-                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes})."
+                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
+                remedy_for(error),
             ) from error
         outputs = list(given) if isinstance(given, tuple | list) else [given]
         if len(outputs) != len(self.step.gives):
@@ -122,5 +118,8 @@ class TorchSession:
             )
         for name, value in zip(self.step.gives, outputs, strict=True):
             if not isinstance(value, torch.Tensor):
-                raise SourceError(f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.")
+                raise SourceError(
+                    f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.",
+                    "return a tensor, or a tuple of tensors in the order of 'gives'",
+                )
         return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}

@@ -18,10 +18,11 @@ from pydantic import Field
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, SourceError, require, require_present
+from vlatool.export._draws import refuse_draws
+from vlatool.export._failures import export_error
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
-from vlatool.printable import message_of
 from vlatool.runtime.contract import Outputs, check_chunk
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
@@ -111,7 +112,8 @@ class ExportOnnx(Transform):
                 raise GraphError(
                     f"ONNX Runtime and torch differ on calibration sample {number}: relative L2 error {error:.3g}, "
                     f"allowed {self.tolerance:g}.",
-                    "look for random numbers or in-place state in forward(), or raise --tolerance if you know why",
+                    "look for state that forward() keeps in its modules (declare it with 'keep' in the program), or "
+                    "raise --tolerance if you know why",
                 )
 
 
@@ -123,12 +125,12 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
         options: For ``torch.onnx.export``.
 
     Raises:
-        GraphError: when torch cannot.
+        GraphError: when torch cannot, or the graph would draw random numbers.
     """
     torch = require("torch", "build")
     try:
         with quiet_exporter(), torch.no_grad(), exits_told("the policy's forward()"):
-            return torch.onnx.export(
+            exported = torch.onnx.export(
                 module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
                 output_names=list(step.gives), verbose=False, **options,
             )  # fmt: skip
@@ -136,12 +138,9 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
         raise
     except Exception as error:  # the seam: the exporter raises many foreign types
         raise_interrupt(error)
-        reason = (message_of(error).strip() or type(error).__name__).splitlines()[0][:400]
-        raise GraphError(
-            f"torch cannot export the graph '{step.graph}': {reason}.",
-            "keep data-dependent control flow, and what depends on the values of weights, out of forward(); see "
-            "docs/guides/your-own-policy.md",
-        ) from error
+        raise export_error(error, step.graph, module) from error
+    refuse_draws(exported.model, step.graph)
+    return exported
 
 
 def raise_interrupt(error: BaseException | None) -> None:
@@ -195,14 +194,14 @@ def _weight_bytes(module: nn.Module) -> int:
 @contextlib.contextmanager
 def quiet_exporter() -> Iterator[None]:
     """Keep the exporter's progress prints, log lines and warnings away from the user's terminal."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "torch")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    nowhere = io.StringIO()
     try:
-        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        with (
+            contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings()
+        ):  # fmt: skip
             warnings.simplefilter("ignore")
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)

@@ -167,7 +167,7 @@ def outcomes(asked: Sequence[Candidate], load: Workload, model: LatencyModel) ->
 
 def work_of(graph: GraphWorkload) -> Work:
     """Return one run of a graph as the latency model sees it."""
-    return Work(sum(graph.macs.values()), graph.weights, graph.activations, graph.layers, graph.traits)
+    return Work(sum(graph.macs.values()), graph.reads, graph.activations, graph.layers, graph.traits)
 
 
 def stored_precision(graph: GraphWorkload) -> str:
@@ -265,6 +265,7 @@ def at(load: Workload, scale: dict[str, tuple[float, float, float]], runs: dict[
             graph,
             macs={kind: int(count * macs) for kind, count in graph.macs.items()},
             weights=int(graph.weights * weights),
+            read_again=int(graph.read_again * weights),
             weight_bytes=int(graph.weight_bytes * weights),
             activations=int(graph.activations * activations),
             activation_bytes=int(graph.activation_bytes * activations),

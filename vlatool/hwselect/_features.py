@@ -37,7 +37,7 @@ class Work:
 
     Args:
         macs: Multiply-accumulates.
-        weights: Numbers in the weights that it reads.
+        weights: Numbers that it reads from weights, as often as it reads them.
         activations: Numbers that its compute layers write.
         layers: Compute layers.
         traits: Of ``TRAITS``.

@@ -66,7 +66,7 @@ def whole_work(load: Workload) -> dict[str, Any]:
         graph = load.graphs[name]
         macs = float(sum(graph.macs.values())) * runs
         sums["macs"] += macs
-        sums["weights"] += graph.weights * runs
+        sums["weights"] += graph.reads * runs
         sums["activations"] += graph.activations * runs
         sums["layers"] += graph.layers * runs
         traits |= graph.traits

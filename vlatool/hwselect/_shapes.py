@@ -73,6 +73,12 @@ class Tensors:
             name = node.input[0]
         return True
 
+    def root(self, name: str) -> str:
+        """Return the name of the tensor whose numbers these are, before their type or order changed."""
+        while name not in self._stored and (node := self._producers.get(name)) and node.op_type in UNCHANGED:
+            name = node.input[0]
+        return name
+
     def attribute(self, node: Any, name: str, default: Any) -> Any:
         """Return an attribute of a node, strings decoded."""
         for item in node.attribute:

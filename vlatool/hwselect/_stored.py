@@ -15,9 +15,9 @@ from vlatool.errors import OutputError
 from vlatool.files import whole_file
 from vlatool.hwselect._workload import GraphWorkload, Workload
 
-LAYOUT = 3
+LAYOUT = 4
 """Version of the file."""
-COUNTS = ("layers", "weights", "activations", "weight_bytes", "activation_bytes", "peak_bytes")
+COUNTS = ("layers", "weights", "read_again", "activations", "weight_bytes", "activation_bytes", "peak_bytes")
 
 
 def digest(bundle: Bundle) -> str:

@@ -8,7 +8,7 @@ import math
 import warnings
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ def torch_workload(bundle: Bundle) -> Workload:
         tally = found.tally
         graphs[name] = GraphWorkload(
             {"float32": found.macs}, tally.layers, tally.weights, tally.activations, tally.traits(),
-            found.stored, 4 * tally.activations, found.peak, parts=tally.parts(),
+            found.stored, 4 * tally.activations, found.peak, parts=tally.parts(), read_again=tally.read_again,
         )  # fmt: skip
     return Workload(graphs, dict(runs))
 
@@ -109,9 +109,9 @@ class _Seen:
     alive: int = 0
     peak: int = 0
 
-    def product(self, macs: int, written: int, weights: int, groups: int = 1) -> None:
+    def product(self, macs: int, written: int, weights: int, groups: int = 1, weight: Hashable = "") -> None:
         self.macs += macs
-        self.tally.layer(macs, written, weights, groups, self.inside[-1] if self.inside else "")
+        self.tally.layer(macs, written, weights, groups, self.inside[-1] if self.inside else "", weight)
 
     def keep(self, tensor: Any) -> None:
         size = tensor.numel() * tensor.element_size()
@@ -175,11 +175,11 @@ def _counting(seen: _Seen) -> contextlib.AbstractContextManager[Any]:
 def _count(torch: Any, seen: _Seen, name: str, args: Any, given: Any) -> None:
     if name in PRODUCTS:
         first, second = args[PRODUCTS[name] : PRODUCTS[name] + 2]
-        seen.product(given.numel() * first.shape[-1], given.numel(), _weights(torch, second))
+        seen.product(given.numel() * first.shape[-1], given.numel(), _weights(torch, second), weight=_weight_of(second))
     elif name == "convolution":
         weight, groups, transposed = args[1], args[8], args[6]
         base = args[0].numel() if transposed else given.numel()
-        seen.product(base * math.prod(weight.shape[1:]), given.numel(), weight.numel(), groups)
+        seen.product(base * math.prod(weight.shape[1:]), given.numel(), weight.numel(), groups, _weight_of(weight))
     elif name.startswith(ATTENTION):
         query, key, value = args[:3]
         scores = math.prod(query.shape[:-1]) * key.shape[-2]
@@ -197,3 +197,9 @@ def _weights(torch: Any, tensor: Any) -> int:
     base = tensor._base if tensor._base is not None else tensor
     sizes = (size for size, stride in zip(tensor.shape, tensor.stride(), strict=True) if stride)
     return math.prod(sizes) if isinstance(base, torch.nn.Parameter) else 0
+
+
+def _weight_of(tensor: Any) -> Hashable:
+    """Return what tells a factor from others: the tensor that it views, from where, in which shape."""
+    base = tensor._base if tensor._base is not None else tensor
+    return id(base), tensor.storage_offset(), math.prod(tensor.shape)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ class GraphWorkload:
     Args:
         macs: Precision (``float32``, ``int8``, ``int4`` ...) -> multiply-accumulates.
         layers: Compute layers (matrix products and convolutions).
-        weights: Numbers that the compute layers read from weights, however they are stored.
+        weights: Numbers in the weights of the compute layers, each weight once, however they are stored.
         activations: Numbers that the compute layers write.
         traits: What the published latencies of its kind depend on, of ``TRAITS``.
         weight_bytes: Bytes of all initializers as they are stored.
@@ -43,8 +43,9 @@ class GraphWorkload:
         peak_bytes: The most bytes of tensors, weights apart, that are alive at one node.
         integer_ops: Whether int8 is computed by integer operators (MatMulInteger and its kin) and not in QDQ form.
         unknown: Compute layers that cannot be counted, because their shapes are not static.
-        parts: Part of the policy (vision, language ...; empty: none) -> multiply-accumulates, weights, activations and
-            layers of its compute layers, but for those that are unknown.
+        parts: Part of the policy (vision, language ...; empty: none) -> multiply-accumulates, reads of weights,
+            activations and layers of its compute layers, but for those that are unknown.
+        read_again: Numbers that are read from a weight after the first time, as in the turns of a loop.
     """
 
     macs: Mapping[str, int] = field(default_factory=dict)
@@ -58,6 +59,12 @@ class GraphWorkload:
     integer_ops: bool = False
     unknown: tuple[str, ...] = ()
     parts: Mapping[str, tuple[int, int, int, int]] = field(default_factory=dict)
+    read_again: int = 0
+
+    @property
+    def reads(self) -> int:
+        """Numbers that one run reads from weights."""
+        return self.weights + self.read_again
 
 
 @dataclass(frozen=True)
@@ -164,11 +171,13 @@ def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]]) -> GraphWorkloa
         macs[precision_of(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
         part = part_named(node.name, parts)
-        tally.layer(count, math.prod(tensors.shape(node.output[0]) or ()), *_operands(node, tensors), part=part)
+        written_numbers = math.prod(tensors.shape(node.output[0]) or ())
+        weights, groups = _operands(node, tensors)
+        tally.layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors))
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
         dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
-        activation_bytes, tensors.peak_bytes(), integer, tuple(unknown), tally.parts(),
+        activation_bytes, tensors.peak_bytes(), integer, tuple(unknown), tally.parts(), tally.read_again,
     )  # fmt: skip
 
 
@@ -182,12 +191,19 @@ def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
     return (math.prod(shape) if tensors.is_constant(second) else 0), groups
 
 
+def _weight_of(node: Any, tensors: Tensors) -> str:
+    """Return the name of the tensor that is stored for a layer's weight."""
+    place = WEIGHT_AT.get(node.op_type, 1)
+    return tensors.root(node.input[place]) if len(node.input) > place else ""
+
+
 @dataclass
 class Tally:
     """Sums over the compute layers of a graph, however they were found."""
 
     layers: int = 0
     weights: int = 0
+    read_again: int = 0
     activations: int = 0
     _concats: int = 0
     _macs: int = 0
@@ -196,14 +212,24 @@ class Tally:
     _products: int = 0
     _rows: int = 0
     _parts: dict[str, tuple[int, int, int, int]] = field(default_factory=dict)
+    _seen: set[Hashable] = field(default_factory=set)
 
-    def layer(self, macs: int, written: int, weights: int, groups: int = 1, part: str = "") -> None:
-        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights, groups and part."""
+    def layer(
+        self, macs: int, written: int, weights: int, groups: int = 1, part: str = "", weight: Hashable = ""
+    ) -> None:
+        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights, groups and part.
+
+        Args:
+            weight: What tells its weight from others; a weight that was seen before is read again, not stored again.
+                Empty: a weight of its own.
+        """
         before = self._parts.get(part, (0, 0, 0, 0))
         added = zip(before, (macs, weights, written, 1), strict=True)
         self._parts[part] = tuple(old + new for old, new in added)  # type: ignore[assignment]
         self.layers += 1
-        self.weights += weights
+        self.weights += 0 if weight in self._seen else weights
+        self.read_again += weights if weight in self._seen else 0
+        self._seen.update([weight] if weight else [])
         self.activations += written
         self._macs += macs
         self._depthwise += groups > 1 and macs <= DEPTHWISE * written
@@ -221,7 +247,7 @@ class Tally:
 
     def traits(self) -> frozenset[str]:
         """Return which of ``TRAITS`` the graph has."""
-        layers, macs, weights = max(1, self.layers), max(1, self._macs), max(1, self.weights)
+        layers, macs, weights = max(1, self.layers), max(1, self._macs), max(1, self.weights + self.read_again)
         has = (
             self._depthwise >= 0.15 * layers, self._products >= 0.005 * macs, self._grouped >= 0.2 * macs,
             self._concats >= 0.1 * layers, self._rows >= 0.6 * weights,

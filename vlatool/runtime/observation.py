@@ -63,10 +63,16 @@ class ObservationEncoder:
         if not isinstance(observation, Mapping):
             return DataError(
                 f"The observation is a {type(observation).__name__}; it must be a mapping of names to values: {takes}",
-                f'pass {{"{name}": ...}}',
+                self._example(),
             )
         has = ", ".join(map(str, observation)) or "nothing"
         return DataError(f"The observation has no '{name}' (it has: {has}); {takes}")
+
+    def _example(self) -> str:
+        """Say how an observation is written."""
+        written = ", ".join(f'"{name}": ...' for name in self.names)
+        only = "the policy has one input: " if len(self.names) == 1 else ""
+        return f"{only}pass {{{written}}}"
 
 
 def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:

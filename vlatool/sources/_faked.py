@@ -10,10 +10,11 @@ import numpy as np
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, require
 from vlatool.manifest import ProgramStep
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.sources._factory import exits_told
+from vlatool.sources._modules import modules_of
 from vlatool.sources._origin import origin_of
 
 DRAWING = (
@@ -72,15 +73,8 @@ def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
     origin.check((".py",))
     with _parameters_on_meta(torch):
         made = origin.made()
-    modules = made if isinstance(made, Mapping) else {"main": made}
-    for step in bundle.manifest.program:
-        given = modules.get(step.graph)
-        if given is None:
-            known = nearest(step.graph, modules)
-            raise SourceError(f"The program runs '{step.graph}', which the factory does not give; {known}.")
-        if not isinstance(given, torch.nn.Module):
-            raise SourceError(f"The factory gave a {type(given).__name__} for '{step.graph}'; wanted a torch module.")
-    return {step.graph: modules[step.graph].eval().float() for step in bundle.manifest.program}
+    modules = modules_of(made, (step.graph for step in bundle.manifest.program))
+    return {name: module.float() for name, module in modules.items()}
 
 
 @contextlib.contextmanager

@@ -14,7 +14,11 @@ from vlatool.errors import SourceError, nearest, require
 from vlatool.finish import finish
 from vlatool.manifest import Graph, Manifest, single_graph
 from vlatool.quantize._precision import precision_shares
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.policy import relative_error
 from vlatool.sources._description import Description, read_description
+from vlatool.sources._onnx_axes import fix_axes, opset_of, told, with_opset
 from vlatool.sources.torch_module import copy_assets
 from vlatool.spec import PolicySpec, TensorSpec
 from vlatool.stage import Context, Transform
@@ -22,6 +26,8 @@ from vlatool.stage import Context, Transform
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
+TOLERANCE = 1e-3
+"""Largest relative L2 difference between a file and what it was converted to."""
 DTYPE_OF = {1: "float32", 2: "uint8", 6: "int32", 7: "int64", 9: "bool", 10: "float16"}
 """ONNX element type -> dtype of a spec."""
 
@@ -35,6 +41,7 @@ class OnnxFile(Transform):
     policy: Path | None = Field(
         None, description="policy.yaml with spec and assets; the file's own shapes when not given"
     )
+    opset: int | None = Field(None, ge=7, le=23, description="convert the default ONNX domain to this opset")
     control_hz: float = Field(10.0, gt=0, description="rate of the control loop when there is no policy.yaml, in Hz")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -57,8 +64,14 @@ class OnnxFile(Transform):
         """Load the file, store it, and run it once."""
         self.check(None, None)
         model = _load(self.model)
-        described = read_description(self.policy) if self.policy else self._described(model)
+        given = read_description(self.policy) if self.policy else None
+        fixed = told(fix_axes(model, given.spec if given else None))
+        if fixed:
+            context.tell(fixed, None)
+        described = given or self._described(model)
         _check_names(model, described.spec)
+        if self.opset is not None:
+            model = with_opset(model, self.opset)
         copy_assets(described, out)
         (out / "graphs").mkdir()
         onnx = require("onnx", "build")
@@ -74,11 +87,13 @@ class OnnxFile(Transform):
             description=described.description,
             license=described.license,
         )
-        opset = max((entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")), default=0)
-        graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset)}
-        made_by = {**self.made_by(), "options": {"model": self.model.name}}
-        origin = Bundle(out, manifest)
-        return finish(origin, out, made_by=made_by, graphs=graphs, observations=_observations(described, out, manifest))
+        graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
+        converted = {"opset": self.opset} if self.opset is not None else {}
+        made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
+        observations = _observations(described, out, manifest)
+        if converted:
+            _compare(self.model, out, described.spec, observations)
+        return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
 
     def _described(self, model: Any) -> Description:
         initializers = {tensor.name for tensor in model.graph.initializer}
@@ -108,7 +123,7 @@ def _tensor(value: Any) -> TensorSpec:
             f"'{value.name}' has the ONNX type {kind.elem_type}; allowed: {', '.join(DTYPE_OF.values())}."
         )
     axes = [axis.dim_value if axis.HasField("dim_value") else (axis.dim_param or "n") for axis in kind.shape.dim]
-    if axes and axes[0] != 1 and isinstance(axes[0], str):
+    if axes and isinstance(axes[0], str):
         axes[0] = 1
     if math.prod(axis for axis in axes if isinstance(axis, int)) < 1 or not axes:
         raise SourceError(f"'{value.name}' has the shape {axes}; a policy needs at least one axis of 1 or more.")
@@ -123,6 +138,26 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
                 raise SourceError(
                     f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}."
                 )
+
+
+def _compare(before: Path, out: Path, spec: PolicySpec, observations: list[dict[str, Any]]) -> None:
+    """Hold the converted graph against the file that it came from.
+
+    Raises:
+        SourceError: when ONNX Runtime computes something else.
+    """
+    sessions = [OrtCpuSession(path, threads=1) for path in (before, out / "graphs/main.onnx")]
+    encode = ObservationEncoder(spec, out / "assets")
+    for observation in observations:
+        feeds = encode(observation)
+        wanted, got = (session.run(feeds)[spec.action.name] for session in sessions)
+        error = relative_error(got, wanted)
+        if not error <= TOLERANCE:
+            raise SourceError(
+                f"Converted to another opset, the ONNX file computes something else: relative L2 error {error:.3g}, "
+                f"allowed {TOLERANCE:g}.",
+                "leave --opset out, or export the file again where it was made",
+            )
 
 
 def _observations(described: Description, out: Path, manifest: Manifest) -> list[dict[str, Any]]:
