@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
+from vlatool.cli._document import document
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.host import MAX_CPU_ISA
 from vlatool.instruction_sets import ENGINE, board_set
@@ -62,6 +62,7 @@ MEASURE_FLAGS = (
     ),
     _FORCE,
     _JSON,
+    _flag("raw", bool, False, "--raw", help="keep every raw sample in the JSON of --json"),
 )
 
 
@@ -91,7 +92,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
     findings = made.manifest.findings
     if as_json:
-        typer.echo(json.dumps({**summary, "precision": precision, "findings": findings}))
+        document({**summary, "precision": precision, "findings": findings})
         _refuse(made)
         return
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
@@ -161,6 +162,7 @@ def measure(
     workers: int | None,
     force: bool,
     as_json: bool,
+    raw: bool = False,
     target: str | None = None,
     remote_python: str | None = None,
 ) -> None:
@@ -183,7 +185,7 @@ def measure(
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
-    show(report, as_json=as_json, out=out, force=force)
+    show(report, as_json=as_json, out=out, force=force, raw=raw)
 
 
 def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Context) -> Report:

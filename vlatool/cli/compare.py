@@ -23,6 +23,7 @@ def compare(
     threads: Annotated[int, typer.Option(min=1, help="intra-op threads")] = 1,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Compare bundles in one interleaved run, or put reports side by side. The first is the baseline.
 
@@ -47,4 +48,4 @@ def compare(
         raise UsageError("compare takes bundles or reports, not both at once.")
     else:
         report = side_by_side(paths, read_reports(paths))
-    show(report, as_json=as_json, out=output, force=force)
+    show(report, as_json=as_json, out=output, force=force, raw=raw)

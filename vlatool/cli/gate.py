@@ -14,6 +14,7 @@ import typer
 from vlatool.bundle import Bundle
 from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
 from vlatool.cli._default import group_with
+from vlatool.cli._document import document
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files import refuse_file, write_own
@@ -49,6 +50,7 @@ def run(
     workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Measure the baseline anew beside the candidate, and leave with 0 (pass), 1 (fail) or 5 (inconclusive).
 
@@ -72,7 +74,7 @@ def run(
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
         _tell_github(report)
     try:
-        show(report, as_json=as_json, out=output, force=force)
+        show(report, as_json=as_json, out=output, force=force, raw=raw)
     finally:  # after the directory of reports, for the file may lie in it
         if junit is not None:
             _write_junit(report, junit)
@@ -86,6 +88,7 @@ def init(
     ),
     candidate: Annotated[Path, typer.Option(help="what a change makes, relative to the repository")] = Path("policy"),
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
     from vlatool.gate_files import gate_files
@@ -97,6 +100,10 @@ def init(
         path.parent.mkdir(parents=True, exist_ok=True)
     for path, text in files.items():
         write_own(path, text, force=force)
+    if as_json:
+        document({"written": [str(path) for path in files]})
+        return
+    for path in files:
         emit(f"written: {path}\n")
     emit("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
     emit(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")

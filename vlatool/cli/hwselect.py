@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ import typer
 
 from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
+from vlatool.cli._document import document
 from vlatool.errors import UsageError
 
 app = typer.Typer(
@@ -136,7 +136,7 @@ def score(
             found = refit_points(points, held_out, seed, refit, context.tell)
         tables = list(found.values())
     if as_json:
-        typer.echo(json.dumps(found))
+        document(found)
         return
     for table in tables:
         for line in lines(table):
@@ -156,9 +156,12 @@ def fit(
     anew: Annotated[
         bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
     ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.hwselect._fit import fit_files
 
     _finite(seconds=seconds)
     fit_files(points, output, seconds, seed, anew, lambda line: typer.echo(line, err=True))
+    if as_json:
+        document({"written": [str(output / name) for name in ("latency.npz", "latency.json")]})

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
 
 from vlatool.cli._console import progress
+from vlatool.cli._document import document
 
 
 def simulate(
@@ -24,7 +24,7 @@ def simulate(
     with progress() as context:
         found = simulated(source, profile, mode, engine, precision, context)
     if as_json:
-        typer.echo(json.dumps(found))
+        document(found)
         return
     for line in simulation_lines(found):
         typer.echo(line)
