@@ -16,10 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from json_documents import COMMANDS, definitions
 from pydantic import BaseModel
 
 from vlatool import errors, gate, manifest, registry, report, spec
+from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.profile import load_profile, names
 from vlatool.stage import Stage, stage_kinds
 

@@ -13,6 +13,8 @@ from vlatool.errors import DataError
 
 SCHEMA = 1
 REPORT = "report.json"
+ON_BOARD = "is_profile"
+"""Key of the environment: the profile that the machine is the board of."""
 ORIGINS = ("measured", "predicted")
 VERDICTS = ("pass", "fail", "inconclusive", "info")
 ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")

@@ -133,7 +133,7 @@ def test_every_command_takes_json_and_its_document_has_a_schema(command: str) ->
     for word in command.split():
         current = current.get_command(None, word)
     assert any("--json" in option.opts for option in current.params), f"vlatool {command} has no --json"
-    assert of(SCHEMA["commands"], command), f"docs/json_documents.py says nothing of vlatool {command}"
+    assert of(SCHEMA["commands"], command), f"vlatool/cli/_schemas.py says nothing of vlatool {command}"
     assert of(LINES, command) is not None, f"LINES has no example of vlatool {command}"
 
 

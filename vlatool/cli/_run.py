@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
+from vlatool.choice import foretold
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
@@ -209,4 +210,6 @@ def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
         told = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
     except MissingExtra as error:
         return replace(report, warnings=(*report.warnings, f"nothing is predicted for {board.name}: {error.message}"))
-    return replace(report, rows=tuple(told if each is row else each for each in report.rows))
+    rows = tuple(told if each is row else each for each in report.rows)
+    first, *more = (*report.summary, "")
+    return replace(report, rows=rows, summary=(first + foretold(told, told, board.name), *filter(None, more)))
