@@ -134,6 +134,7 @@ font-variant-numeric:tabular-nums}
 .fill{fill:var(--series);opacity:.62}.outer{fill:var(--series);opacity:.13}.band{fill:var(--series);opacity:.26}.band~.line{stroke-dasharray:none}
 .mark{stroke:var(--series);stroke-width:2}.whisker{stroke:var(--series);stroke-width:1.5;opacity:.65}
 .dot{fill:var(--series);stroke:var(--paper);stroke-width:1}.hollow{fill:var(--paper);stroke:var(--series);stroke-width:2}
+.leader{stroke:var(--series);stroke-width:1;opacity:.8}
 .ring{fill:none;stroke:var(--series);stroke-width:1.5}
 .limit{stroke:var(--limit);stroke-width:1.4;stroke-dasharray:5 3}.chart .limit-text{fill:var(--limit)}
 .outside{fill:var(--limit-wash)}.front{stroke:var(--muted);stroke-width:1;stroke-dasharray:2 3}
