@@ -12,6 +12,7 @@ import typer
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.choice import foretold
+from vlatool.cli import _complete
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
@@ -34,7 +35,12 @@ def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any
 SOURCE_FLAG = inspect.Parameter(
     "source",
     inspect.Parameter.KEYWORD_ONLY,
-    default=typer.Argument(..., show_default=False, help="a bundle, a policy directory, path.py:make or an .onnx file"),
+    default=typer.Argument(
+        ...,
+        show_default=False,
+        help="a bundle, a policy directory, path.py:make or an .onnx file",
+        autocompletion=_complete.sources,
+    ),
     annotation=str,
 )
 _FORCE = _flag("force", bool, False, "--force", help="replace an output that exists")
@@ -52,6 +58,7 @@ MEASURE_FLAGS = (
         None,
         "--profile",
         help="add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set",
+        autocompletion=_complete.profiles,
     ),
     _flag(
         "workers",

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
 from vlatool.cli._side_by_side import read_reports, side_by_side
 from vlatool.errors import DataError, UsageError
@@ -16,7 +17,10 @@ from vlatool.errors import DataError, UsageError
 
 def compare(
     paths: Annotated[
-        list[Path], typer.Argument(help="two or more bundles, or two or more reports", show_default=False)
+        list[Path],
+        typer.Argument(
+            help="two or more bundles, or two or more reports", show_default=False, autocompletion=_complete.reports
+        ),
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
     iterations: Annotated[int, typer.Option(min=20, help="timed inferences of each bundle")] = 200,

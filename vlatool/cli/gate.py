@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vlatool.bundle import Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document
@@ -33,8 +34,16 @@ CONFIG = Path("gate.yaml")
 
 @app.command("run")
 def run(
-    candidate: Annotated[str, typer.Argument(help="a bundle, or a policy that is exported first", show_default=False)],
-    baseline: Annotated[Path | None, typer.Option(help="bundle to compare with; the one in the gate if unset")] = None,
+    candidate: Annotated[
+        str,
+        typer.Argument(
+            help="a bundle, or a policy that is exported first", show_default=False, autocompletion=_complete.sources
+        ),
+    ],
+    baseline: Annotated[
+        Path | None,
+        typer.Option(help="bundle to compare with; the one in the gate if unset", autocompletion=_complete.bundles),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option(help="the gate (see: vlatool gate init); gate.yaml here, or the defaults, if unset")
     ] = None,

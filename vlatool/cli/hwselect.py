@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document
@@ -23,7 +24,9 @@ POINTS = "published latencies: a CSV file with device, device_class, runtime, mo
 
 @app.command("select")
 def select(
-    source: Annotated[str, typer.Argument(help="a bundle or a policy source", show_default=False)],
+    source: Annotated[
+        str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
+    ],
     hz: Annotated[
         float | None,
         typer.Option(
@@ -50,9 +53,18 @@ def select(
     kwh_price: Annotated[float, typer.Option(help="US dollars for a kWh")] = 0.3,
     cloud: Annotated[bool, typer.Option(help="compare with a rented machine")] = False,
     network_ms: Annotated[float, typer.Option(help="way to the rented machine and back")] = 40.0,
-    precision: Annotated[list[str] | None, typer.Option(help="allow this precision only; may be repeated")] = None,
-    platform: Annotated[str | None, typer.Option(help="start from a robot platform's rate, power and battery")] = None,
-    boards: Annotated[list[str] | None, typer.Option(help="look at this profile only; may be repeated")] = None,
+    precision: Annotated[
+        list[str] | None,
+        typer.Option(help="allow this precision only; may be repeated", autocompletion=_complete.precisions),
+    ] = None,
+    platform: Annotated[
+        str | None,
+        typer.Option(help="start from a robot platform's rate, power and battery", autocompletion=_complete.platforms),
+    ] = None,
+    boards: Annotated[
+        list[str] | None,
+        typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles),
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given"),

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from vlatool.bundle import Bundle, manifest_bytes
+from vlatool.cli import _complete
 from vlatool.cli._document import document
 from vlatool.errors import GraphError
 from vlatool.manifest import Manifest
@@ -19,7 +20,7 @@ from vlatool.spec import TensorSpec
 
 
 def inspect(
-    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False)],
+    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)],
     as_json: Annotated[bool, typer.Option("--json", help="print the manifest as JSON")] = False,
     probe: Annotated[
         bool,

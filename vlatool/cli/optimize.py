@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._console import default_workers, emit, file_or_none, leave, progress, refuse_existing, terminal_text
 from vlatool.cli._document import document, report_document
 from vlatool.cli._plan import plan_document
@@ -21,10 +22,19 @@ if TYPE_CHECKING:
 
 
 def optimize(
-    source: Annotated[str, typer.Argument(help="policy directory, path.py:make or .onnx file", show_default=False)],
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="policy directory, path.py:make or .onnx file", show_default=False, autocompletion=_complete.sources
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
     profile: Annotated[
-        str | None, typer.Option(help="board to optimise for (see: vlatool profiles list); this host if unset")
+        str | None,
+        typer.Option(
+            help="board to optimise for (see: vlatool profiles list); this host if unset",
+            autocompletion=_complete.profiles,
+        ),
     ] = None,
     max_drop: Annotated[
         str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._document import document
 
 app = typer.Typer(
@@ -32,7 +33,10 @@ def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JS
 
 @app.command("show")
 def show_profile(
-    name: Annotated[str, typer.Argument(help="name of a profile, or a YAML file", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Print one profile with the source of every figure."""
@@ -52,8 +56,11 @@ def show_profile(
 
 @app.command("diff")
 def diff_profiles(
-    first: Annotated[str, typer.Argument(help="name of a profile, or a YAML file", show_default=False)],
-    second: Annotated[str, typer.Argument(help="another one", show_default=False)],
+    first: Annotated[
+        str,
+        typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles),
+    ],
+    second: Annotated[str, typer.Argument(help="another one", show_default=False, autocompletion=_complete.profiles)],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Print where two profiles differ: field, first, second."""
@@ -76,7 +83,12 @@ def diff_profiles(
 
 @app.command("validate")
 def validate_profiles(
-    files: Annotated[list[str], typer.Argument(help="YAML files, directories of them, or names", show_default=False)],
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            help="YAML files, directories of them, or names", show_default=False, autocompletion=_complete.profiles
+        ),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Check profiles against the schema; exit 3 when one is wrong, naming every line of it."""
@@ -107,7 +119,9 @@ def validate_profiles(
 @app.command("new")
 def new_profile(
     name: Annotated[str, typer.Argument(help="name of the new profile", show_default=False)],
-    like: Annotated[str, typer.Option("--from", help="profile to begin with")] = "raspberry-pi-5",
+    like: Annotated[
+        str, typer.Option("--from", help="profile to begin with", autocompletion=_complete.profiles)
+    ] = "raspberry-pi-5",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; NAME.yaml when not given")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace a file that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
@@ -126,7 +140,9 @@ def new_profile(
 
 @app.command("calibrate")
 def calibrate_profile(
-    name: Annotated[str, typer.Argument(help="the board's profile", show_default=False)],
+    name: Annotated[
+        str, typer.Argument(help="the board's profile", show_default=False, autocompletion=_complete.profiles)
+    ],
     report: Annotated[
         Path, typer.Option("--from", help="report of `vlatool benchmark` on the board", show_default=False)
     ],

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.bundle import Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import emit, progress, refuse_existing
 from vlatool.cli._document import document
 from vlatool.errors import GateFailed, UsageError
@@ -20,10 +21,18 @@ Versions = dict[str, tuple[str, str]]
 
 
 def rebuild(
-    bundle: Annotated[Path, typer.Argument(help="a bundle that a stage or optimize made", show_default=False)],
+    bundle: Annotated[
+        Path,
+        typer.Argument(
+            help="a bundle that a stage or optimize made", show_default=False, autocompletion=_complete.bundles
+        ),
+    ],
     source: Annotated[
         str | None,
-        typer.Option(help="policy directory, path.py:make, .onnx file or an earlier bundle; where it was if unset"),
+        typer.Option(
+            help="policy directory, path.py:make, .onnx file or an earlier bundle; where it was if unset",
+            autocompletion=_complete.sources,
+        ),
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="exit 1 when a byte differs")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the rebuilt bundle here")] = None,

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from vlatool import registry
+from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
 from vlatool.errors import MissingExtra, UsageError, VlatoolError, nearest
@@ -32,7 +33,12 @@ def list_samples(
 
 @app.command("make")
 def make(
-    name: Annotated[str, typer.Argument(help="which shape (see: vlatool samples list)", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="which shape (see: vlatool samples list)", show_default=False, autocompletion=_complete.samples
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new policy", show_default=False)],
     seed: Annotated[int, typer.Option(min=0, help="seed of weights and data")] = 0,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
