@@ -19,6 +19,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from vlatool import errors, gate, manifest, registry, report, spec
+from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.profile import load_profile, names
 from vlatool.stage import Stage, stage_kinds
 
@@ -37,9 +38,11 @@ def main() -> None:
         "errors.md": errors_page(),
         "profiles.md": profiles_page(),
         "gate.md": gate_page(),
+        "json.md": json_page(),
     }  # fmt: skip
     pages = {name: NOTE + text for name, text in pages.items()}
     pages["report.schema.json"] = schema_page()
+    pages["output.schema.json"] = output_schema_page()
     if "--check" not in sys.argv:
         REFERENCE.mkdir(exist_ok=True)
         for name, text in pages.items():
@@ -154,6 +157,47 @@ def schema_page() -> str:
         "title": "vlatool report",
     }
     return json.dumps({**head, **root, "additionalProperties": True, "$defs": defs}, indent=1) + "\n"
+
+
+def output_schema_page() -> str:
+    """Return the JSON Schema of every document that a command prints with ``--json``."""
+    head = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$comment": "written by docs/generate.py from the code; do not edit",
+        "title": "what vlatool prints with --json",
+        "commands": COMMANDS,
+    }
+    defs = definitions(json.loads(schema_page()))
+    told = dict.fromkeys(["failed", *(name for names in COMMANDS.values() for name in names)])
+    any_of = [{"$ref": f"#/$defs/{name}"} for name in told]
+    return json.dumps({**head, "anyOf": any_of, "$defs": defs}, indent=1) + "\n"
+
+
+def json_page() -> str:
+    """Return which command prints which document."""
+    return inspect.cleandoc(JSON_ABOUT) + "\n\n| command | document |\n|---|---|\n" + "\n".join(
+        f"| `vlatool {command}` | {', '.join(f'`{name}`' for name in names)} |" for command, names in COMMANDS.items()
+    ) + "\n"  # fmt: skip
+
+
+JSON_ABOUT = """
+    # --json
+
+    Every command takes `--json`, and then standard output holds one JSON document: when it ends well, when it fails,
+    when an option is wrong, and on Ctrl-C. Whatever else is printed meanwhile, by a policy, its libraries or the
+    processes that they start, goes to standard error.
+
+    A command that ends with another exit code than 0 has the key `error`: `type` (a class of [errors](errors.md),
+    `OSError`, `MemoryError`, `Interrupted`, `Terminated` or `InternalError`), `message`, `fix` (what to do; may be
+    empty) and `exit_code`. It stands alone, or beside what was found out all the same, such as the report of a gate
+    that fails: `vlatool gate CANDIDATE --json | jq -r '.error.fix // "pass"'`.
+
+    A number that could not be had is null. A report's raw samples are left out (a benchmark has megabytes of them);
+    `raw_samples` says how many they are and which `report.json` keeps them, and `--raw` prints them.
+
+    [output.schema.json](output.schema.json) is the JSON Schema (draft 2020-12); the document of a command is its
+    `$defs/NAME`, and `$defs/failed` where an error stands alone.
+"""
 
 
 WORDS = {

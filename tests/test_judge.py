@@ -402,3 +402,35 @@ def test_float32_is_no_answer_when_memory_was_asked_for() -> None:
     judged = [held(each, FLOAT) for each in (FLOAT, slower)]
     assert next(item.row.name for item in choose(judged) if item.row.role == "chosen") == "float32"
     assert next(item.row.name for item in choose(judged, small=True) if item.row.role == "chosen") == "small"
+
+
+# ---- for a board that is not this host
+
+
+def elsewhere(*candidates: Row, baseline: Row = FLOAT) -> str:
+    judged = [held(each, baseline) for each in (baseline, *candidates)]
+    return next(item for item in choose(judged, elsewhere=BOARD.name) if item.row.role == "chosen").sentences[0]
+
+
+def test_the_first_sentence_has_what_was_measured_here_beside_what_is_predicted_for_the_board():
+    rate = Measurement("success", 0.96, "1", samples=200)
+    base = Row("float32", "baseline", measurements=(*FLOAT.measurements, predicted(300.0, 200.0, 500.0)))
+    found = elsewhere(row("fast", 4.0, drop(0.0), rate, predicted(120.0, 90.0, 160.0)), baseline=base)
+    assert found.startswith("fast is 2.50x as fast as float32 (2.48 to 2.52; measured on this host); its graphs take")
+    assert "96.0% of 200 closed-loop episodes succeed." in found
+    told = "Predicted for raspberry-pi-5, not measured there: 120 ms (90 to 160, 95%), float32 300 ms."
+    assert found.endswith(told)
+    assert "4 ms" not in found
+
+
+def test_float32_that_is_kept_for_a_board_is_told_with_its_prediction():
+    base = Row("float32", "baseline", measurements=(*FLOAT.measurements, predicted(300.0, 200.0, 500.0)))
+    found = elsewhere(row("int8", 12.0, drop(0.0)), baseline=base)
+    assert found.endswith(" Predicted for raspberry-pi-5, not measured there: 300 ms (200 to 500, 95%).")
+
+
+def test_the_nearest_is_told_with_both_sides_and_a_prediction_that_lacks_is_said_to():
+    found = elsewhere(row("far", 4.0, drop(0.5)))
+    assert found.startswith("No candidate keeps to the limits; the nearest, far, was kept. It is 2.50x as fast")
+    assert "10 ms" not in found
+    assert found.endswith("No latency can be predicted for raspberry-pi-5.")

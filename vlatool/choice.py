@@ -13,7 +13,7 @@ LEAST = 1.005
 """Ratio of the medians from which on two decimals do not say 1.00."""
 
 
-def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False) -> list[Judged]:
+def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False, elsewhere: str = "") -> list[Judged]:
     """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside.
 
     A candidate is faster than float32 when the interval of its measured speed-up says so; where none is, float32 stays.
@@ -25,26 +25,31 @@ def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False) -
         small: Whether memory was asked for: float32 is then no answer while a smaller plan keeps to the limits.
         engine: The engine of the board. When it is not the one that was measured here, predictions for the board rank
             the candidates, where every candidate has one.
+        elsewhere: The board that the candidates are for, when it is not this host: its milliseconds are told, and not
+            this host's.
     """
     origin = "measured"
     if engine not in MEASURED_ENGINES and all(p50(item.row, "predicted") < float("inf") for item in judged):
         origin = "predicted"
     inside = [item for item in judged if item.row.role != "baseline" and item.within]
     if not inside:
-        best, reason, sentences = _nearest(judged, origin)
+        best, reason, sentences = _nearest(judged, origin, elsewhere)
     else:
         best, reason = _best(inside, judged[0], origin, small)
-        sentences = _praise(best, judged, small) if origin == "measured" else _foretell(best, judged)
+        praised = origin == "measured"
+        sentences = _praise(best, judged, small, elsewhere) if praised else _foretell(best, judged)
     chosen = replace(best, row=replace(best.row, role="chosen", reason=reason), sentences=sentences)
     return [chosen if item is best else item for item in judged]
 
 
-def _nearest(judged: list[Judged], origin: str) -> tuple[Judged, str, tuple[str, ...]]:
+def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged, str, tuple[str, ...]]:
     """Return the candidate that misses the limits by least, and what is said of all of them."""
     quantized = [item for item in judged if item.row.role != "baseline"]
     best = min(quantized, key=lambda item: (item.miss, p50(item.row, origin)))
     sentences = (
-        f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept.",
+        f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept."
+        + (f" It is {speed_words(best.row, judged[0].row, elsewhere)}." if elsewhere and origin == "measured" else "")
+        + foretold(best.row, judged[0].row, elsewhere),
         *(f"{item.row.name}: {item.row.reason}." for item in quantized),
     )
     return best, f"kept as the nearest, though outside the limits: {best.row.reason}", sentences
@@ -96,21 +101,45 @@ def _times(row: Row, base: Row) -> str:
     return f"{p50(row):.4g} ms instead of {p50(base):.4g} ms, measured on this host"
 
 
-def speed_words(row: Row, base: Row) -> str:
-    """Return ``1.32x as fast as float32 (...)``, or that it is not faster, with the numbers for it."""
+def foretold(row: Row, base: Row, elsewhere: str) -> str:
+    """Return a sentence on what a row is predicted to need on a board, with its range; empty without a board."""
+    found = row.get("latency_p50", "predicted")
+    if not elsewhere:
+        return ""
+    if found is None or not found.known:
+        return f" No latency can be predicted for {elsewhere}."
+    span = (
+        ""
+        if found.low is None or found.high is None
+        else f" ({found.low:.3g} to {found.high:.3g}, {found.confidence:.0%})"
+    )
+    reference = base.get("latency_p50", "predicted")
+    beside = f", {base.name} {reference.value:.3g} ms" if row is not base and reference and reference.known else ""
+    return f" Predicted for {elsewhere}, not measured there: {found.value:.3g} ms{span}{beside}."
+
+
+def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
+    """Return ``1.32x as fast as float32 (...)``, or that it is not faster, with the numbers for it.
+
+    Args:
+        row: A variant.
+        base: What it is held against.
+        elsewhere: The board that it is for, when it is not this host: only the ratio is told.
+    """
     times = ratio(row, base)
     speedup = row.get("speedup")
     known = speedup is not None and speedup.low is not None and speedup.high is not None
     span = f"; {speedup.low:.2f} to {speedup.high:.2f}" if speedup and known else ""
+    here = "measured on this host" if elsewhere else _times(row, base)
     if is_faster(row, base):
-        return f"{times:.2f}x as fast as {base.name} ({_times(row, base)})"
-    return f"not shown to be faster than {base.name} ({times:.3g}x{span}; {_times(row, base)})"
+        return f"{times:.2f}x as fast as {base.name} ({span[2:] + '; ' if elsewhere and span else ''}{here})"
+    return f"not shown to be faster than {base.name} ({times:.3g}x{span}; {here})"
 
 
-def _praise(best: Judged, judged: list[Judged], small: bool) -> tuple[str, ...]:
+def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> tuple[str, ...]:
     row, base = best.row, judged[0].row
     if best is judged[0]:
-        return _float32_kept(judged)
+        return _float32_kept(judged, elsewhere)
     size = f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
     accuracy = row.get("success")
     success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
@@ -118,23 +147,25 @@ def _praise(best: Judged, judged: list[Judged], small: bool) -> tuple[str, ...]:
     if not is_faster(row, base):
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
         why = f" It was chosen because {reason}."
-    first = f"{row.name} is {speed_words(row, base)}; {size}.{why}{success}"
+    told = foretold(row, base, elsewhere)
+    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {size}.{why}{success}{told}"
     return (first, f"{row.reason[:1].upper()}{row.reason[1:]}.")
 
 
-def _float32_kept(judged: list[Judged]) -> tuple[str, ...]:
+def _float32_kept(judged: list[Judged], elsewhere: str) -> tuple[str, ...]:
     base = judged[0].row
     outside = [item for item in judged[1:] if not item.within and is_faster(item.row, base)]
     inside = [item for item in judged[1:] if item.within]
-    told = tuple(f"{item.row.name} is {speed_words(item.row, base)}." for item in inside)
+    told = tuple(f"{item.row.name} is {speed_words(item.row, base, elsewhere)}." for item in inside)
+    board = foretold(base, base, elsewhere)
     if outside:
         return (
-            f"{base.name} was kept: no candidate inside the limits is faster on this host.",
+            f"{base.name} was kept: no candidate inside the limits is faster on this host.{board}",
             *told,
             *(f"{item.row.name} is faster, but outside: {item.row.reason}." for item in outside),
         )
     return (
-        f"{base.name} was kept: no quantized candidate is faster on this host.",
+        f"{base.name} was kept: no quantized candidate is faster on this host.{board}",
         *told,
         "In a graph this small the quantize and dequantize steps can cost more than int8 arithmetic saves.",
     )
@@ -152,12 +183,15 @@ def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     times = ratio(row, base, "predicted")
     faster = is_faster(row, base, "predicted")
     speed = f"{times:.2f}x as fast as {base.name}" if faster else f"not faster than {base.name} ({times:.3g}x)"
+    here = f" Measured on this host: its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
+    if accuracy := row.get("success"):
+        here += f", and {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed"
     overlap = ""
     if faster and reference.low is not None and reference.low < high:
         overlap = f" (whose range, {reference.low:.4g} to {reference.high or reference.value:.4g} ms, overlaps)"
     return (
         f"{row.name} is predicted to need {own.value:.4g} ms ({low:.4g} to {high:.4g}) on {own.where}, "
-        f"{speed}{overlap}; not measured there.",
+        f"{speed}{overlap}; not measured there.{here}.",
         f"{row.reason[:1].upper()}{row.reason[1:]}.",
         "The board's engine does not run on this host: the latencies measured here are ONNX Runtime's on this CPU.",
     )

@@ -26,7 +26,7 @@ from vlatool.launch import cached_measure, cached_transform
 from vlatool.profile import Profile
 from vlatool.recipe import Limits, Recipe, stage_entries
 from vlatool.render import write_reports
-from vlatool.report import Report, Row, read_report
+from vlatool.report import ON_BOARD, Report, Row, read_report
 from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
 from vlatool.search import Search
 from vlatool.sources._description import FILE, read_description
@@ -66,6 +66,11 @@ class Plan:
     def board(self) -> str:
         """Name of the profile, or of what stands in for it."""
         return self.profile.name if self.profile else "this host"
+
+    @property
+    def on_board(self) -> bool:
+        """Whether this host is the board, so that what is measured here holds there."""
+        return self.profile is None or matches(self.profile.model_strings, fingerprint())
 
     @property
     def closed_loop(self) -> ClosedLoop | None:
@@ -246,13 +251,14 @@ def judged_rows(
         rows: Name -> row with everything that was measured and predicted, float32 first.
         engines: Name -> engine of each candidate; needed where the engines cannot be compared.
     """
-    on_board = plan.profile is None or matches(plan.profile.model_strings, fingerprint())
+    on_board = plan.on_board
     judged = [judge(row, rows[BASELINE], plan.recipe.limits, plan.profile, on_board) for row in rows.values()]
     small = plan.recipe.limits.max_memory_mb is not None
     if plan.profile and plan.board_set.confined:
         judged = choose_apart(judged, engines or {}, tuple(plan.profile.engines), plan.board_set, small)
     else:
-        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small)
+        elsewhere = "" if on_board else plan.board
+        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small, elsewhere)
     trust = credibility(rows[BASELINE], BASELINE)
     if trust.table:
         judged[0] = _with_tables(judged[0], {"Whether the reference does its task": list(trust.table)})
@@ -414,7 +420,7 @@ def _report(
         limits={key: value for key, value in limits.items() if value is not None},
         command=context.command,
         created=now(),
-        environment=fingerprint(),
+        environment={**fingerprint(), **({ON_BOARD: plan.board} if plan.profile and plan.on_board else {})},
         warnings=warnings,
     )
 

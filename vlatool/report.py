@@ -13,6 +13,8 @@ from vlatool.errors import DataError
 
 SCHEMA = 1
 REPORT = "report.json"
+ON_BOARD = "is_profile"
+"""Key of the environment: the profile that the machine is the board of."""
 ORIGINS = ("measured", "predicted")
 VERDICTS = ("pass", "fail", "inconclusive", "info")
 ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")
@@ -163,7 +165,7 @@ class Report:
 
     def to_json(self) -> str:
         """Return JSON; NaN is written as null."""
-        return json.dumps(_without_nan(asdict(self)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        return json.dumps(without_nan(asdict(self)), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Report:
@@ -212,11 +214,12 @@ def _row(data: Mapping[str, Any]) -> Row:
     return Row(**{**data, "measurements": tuple(measurements)})
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """Return a value that JSON can say: NaN and the infinities are null, tuples are lists."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     return value

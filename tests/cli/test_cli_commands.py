@@ -277,7 +277,8 @@ def test_json_alone_is_on_stdout(vlatool, float_bundle, tmp_path):
     for line in (["benchmark", *FAST], ["benchmark", "overhead", "--iterations", "100"], ["evaluate"]):
         code, out, _ = vlatool(*line, float_bundle.path, "--json", "-o", tmp_path / line[-1])
         assert code == 0
-        assert Report.from_json(out) == read_report(tmp_path / line[-1])
+        report = read_report(tmp_path / line[-1])
+        assert Report.from_json(out) == replace(report, rows=tuple(replace(row, raw={}) for row in report.rows))
 
 
 def test_evaluate_means_recorded_and_predicts_for_the_bundle(vlatool, float_bundle, int8_bundle):

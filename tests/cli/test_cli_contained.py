@@ -47,6 +47,12 @@ def vlatool(capfd):
     return run
 
 
+def error_in(out: str) -> int:
+    """Return the exit code that a document tells that holds an error alone."""
+    (error,) = json.loads(out).values()
+    return int(error["exit_code"])
+
+
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory) -> Path:
     """A bundle of the policy that does nothing wrong."""
@@ -65,7 +71,7 @@ def plain(tmp_path_factory) -> Path:
 def test_a_policy_that_ends_its_process_is_no_success(vlatool, folder, tmp_path: Path, where: str, act: str) -> None:
     code, says = ENDS[act]
     status, out, err = vlatool("export", folder(**{where: code}), "-o", tmp_path / "out", "--json")
-    assert (status, out) == (3, "")
+    assert (status, error_in(out)) == (3, 3)
     assert "policy" in err
     assert re.search(says, err), err
     assert not (tmp_path / "out").exists()
@@ -85,7 +91,7 @@ def test_no_command_takes_it_for_its_own_end(vlatool, folder, plain, tmp_path: P
         "benchmark": ["benchmark", mine, "--json"],
     }[command]
     status, out, err = vlatool(*line)
-    assert (status, out) == (3, "")
+    assert (status, error_in(out)) == (3, 3)
     assert "policy.py" in err
     assert re.search(says, err), err
 
@@ -96,7 +102,7 @@ def test_what_a_policy_raises_or_forges_does_not_decide_the_exit_code(
 ) -> None:
     code, says = FORGES[act]
     status, out, err = vlatool("export", folder(in_make=code), "-o", tmp_path / "out", "--json")
-    assert (status, out) == (3, ""), err
+    assert (status, error_in(out)) == (3, 3), err
     assert re.search(says, err), err
     assert "internal error" not in err
     assert not (tmp_path / "out").exists()
@@ -107,7 +113,7 @@ def test_what_a_policy_raises_or_forges_does_not_decide_the_exit_code(
 def test_what_an_environment_raises_or_forges_does_not_either(vlatool, folder, plain, where: str, act: str) -> None:
     line = ["evaluate", "closed-loop", plain, "--policy", folder({where: FORGES[act][0]}), "--episodes", 2]
     status, out, err = vlatool(*line, "--workers", 1, "--json")
-    assert (status, out) == (3, ""), err
+    assert (status, error_in(out)) == (3, 3), err
     assert "internal error" not in err
 
 
@@ -117,7 +123,7 @@ def test_an_environment_that_ends_its_process_is_no_success(vlatool, folder, pla
     code, says = ENDS[act]
     line = ["evaluate", "closed-loop", plain, "--policy", folder({where: code}), "--episodes", 2, "--workers", 1]
     status, out, err = vlatool(*line, "--json")
-    assert (status, out) == (3, "")
+    assert (status, error_in(out)) == (3, 3)
     assert "environment" in err
     assert re.search(says, err), err
 

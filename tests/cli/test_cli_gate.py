@@ -55,6 +55,8 @@ def test_json_junit_and_a_directory_of_reports(vlatool, float_bundle, slowdown, 
     assert code == 1
     found = json.loads(out)
     assert (found["kind"], found["verdict"]) == ("gate", "fail")
+    error = {"type": "GateFailed", "message": found["summary"][0], "fix": "", "exit_code": 1}
+    assert found["error"] == error, "the verdict stands beside its report"
     assert found["command"].startswith("vlatool")
     assert ElementTree.parse(tmp_path / "deep/gate.xml").getroot().get("failures") == "1"
     assert {path.name for path in (tmp_path / "out").glob("[!.]*")} == {"report.json", "report.html", "report.md"}

@@ -99,9 +99,9 @@ def test_page_stays_small_with_many_details() -> None:
 def test_order_of_the_parts() -> None:
     page = render(optimize(), "html")
     order = [
-        "<h1", "badge pass", "limits asked for", "Variants", "How latency is spread",
-        "Success against latency p50", "Action error vs baseline by dimension", "Details",
-        "Predicted for raspberry-pi-5", "Predicted for jetson-orin-nano", "Latency along the run",
+        "<h1", "badge pass", 'class="sides"', "limits asked for", "Predicted for raspberry-pi-5",
+        "Predicted for jetson-orin-nano", "Variants", "How latency is spread",
+        "Success against latency p50", "Action error vs baseline by dimension", "Details", "Latency along the run",
         "Environment", "Warnings", "Reproduce",
     ]  # fmt: skip
     places = [page.index(text) for text in order]

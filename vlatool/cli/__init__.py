@@ -14,6 +14,8 @@ import typer
 
 from vlatool import __version__, trust
 from vlatool.cli._console import plain_warnings
+from vlatool.cli._document import Output, output
+from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
 from vlatool.cli._stages import StageGroup
 from vlatool.cli.compare import compare
 from vlatool.cli.doctor import doctor
@@ -27,13 +29,7 @@ from vlatool.cli.rebuild import rebuild
 from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
 from vlatool.cli.telemetry import telemetry
-from vlatool.errors import VlatoolError
 from vlatool.printable import printable
-
-INTERRUPTED = 130
-OUR_BUG = 70
-CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
-"""The base of usage errors: of the click that typer brings, or of the one that it imports, by its version."""
 
 app = typer.Typer(
     name="vlatool",
@@ -93,9 +89,6 @@ app.add_typer(gate, name="gate")
 app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")
 app.add_typer(samples, name="samples")
-
-KEEPING = frozenset(("optimize", "export", "quantize"))
-"""Commands whose finished stages stay in the cache when they are interrupted."""
 
 
 def _standard_files() -> None:
@@ -158,10 +151,22 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit.
 
     0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
+    With ``--json``, standard output holds one JSON document, of an error too.
+
+    Args:
+        arguments: Its words; when None, those that the process was started with, and the process ends with this call.
     """
     _standard_files()
     _end_on_signals()
     words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
+    with output(words, for_good=arguments is None) as document:
+        code = _run(words, document)
+    _flushed()
+    sys.exit(code)
+
+
+def _run(words: list[str], document: Output | None) -> Any:
+    """Run a command line; return what the process ends with."""
     try:
         with plain_warnings(), trust.nothing_named():
             code = app(words, standalone_mode=False) or 0
@@ -169,38 +174,25 @@ def main(arguments: list[str] | None = None) -> None:
             raise KeyboardInterrupt
     except SystemExit as left:  # a closed pipe: typer puts a wrapper around stdout and leaves with 1
         code = 0 if type(sys.stdout).__name__ == "PacifyFlushWrapper" else left.code
+        if code and document:
+            document.failed(failure(left, words))
     except BaseException as error:  # the seam: whatever happened becomes an exit code
         if not isinstance(error, Exception | KeyboardInterrupt):
             raise
-        code = _exit_code(error, words)
-    _flushed()
-    sys.exit(code)
+        found = failure(error, words)
+        if document and found.exit_code:
+            document.failed(found)
+        _tell(error, found)
+        code = found.exit_code
+    return code
 
 
-def _exit_code(error: BaseException, words: list[str]) -> int:
-    """Say what went wrong; return the exit code that it has."""
+def _tell(error: BaseException, found: Failure) -> None:
+    """Say on stderr what went wrong; let what may be a bug end in a traceback where one is asked for."""
     if isinstance(error, CLICK_EXCEPTION):
         with contextlib.suppress(OSError, ValueError):
             error.show()
-        return int(error.exit_code)
-    if isinstance(error, VlatoolError):
-        _say(f"error: {error.message}", error.fix)
-        return error.exit_code
-    if isinstance(error, KeyboardInterrupt | typer.Abort):
-        _say(f"interrupted{'; finished stages are kept' if KEEPING.intersection(words) else ''}")
-        return INTERRUPTED
-    if isinstance(error, BrokenPipeError):
-        return 0
-    if isinstance(error, OSError):
-        _say(f"error: {error.filename or 'a file'}: {error.strerror or error}.")
-        return 3
-    if isinstance(error, MemoryError):
-        _say("error: out of memory.", "use a machine with more memory, or a smaller policy")
-        return 3
-    if os.environ.get("VLATOOL_DEBUG"):
+    elif found.type == "InternalError" and os.environ.get("VLATOOL_DEBUG"):
         raise error
-    _say(
-        f"internal error: {type(error).__name__}: {error}",
-        "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback",
-    )
-    return OUR_BUG
+    elif found.exit_code:
+        _say(str(found), found.fix)

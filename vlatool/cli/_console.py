@@ -16,10 +16,12 @@ from typing import Any
 
 import typer
 
+from vlatool.cli._document import document, report_document
 from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.host import cache_directory
 from vlatool.outputs import REPORT, refuse_inputs, refuse_replacing
 from vlatool.printable import one_line, printable
+from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
 from vlatool.stage import Context, Tell
 from vlatool.writing import writing
@@ -151,8 +153,15 @@ def _refuse_unwritable(out: Path) -> None:
         raise OutputError(f"Cannot write {out}: this user may not write to {above}.", "choose another output")
 
 
-def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False) -> None:
+def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False, raw: bool = False) -> None:
     """Print a report on stdout, write it to a directory where wanted, and leave with the verdict's exit code.
+
+    Args:
+        report: What was found out.
+        as_json: Print JSON.
+        out: Directory for the report, None for none.
+        force: Replace a report that exists there.
+        raw: Print raw samples, too, as JSON.
 
     Raises:
         GateFailed: for the verdict ``fail``.
@@ -162,7 +171,10 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
 
     now = datetime.now(timezone.utc).isoformat(timespec="seconds")
     report = replace(report, command=report.command or command_line(), created=report.created or now)
-    emit(report.to_json() if as_json else terminal_text(report))  # first, so that a full disk does not lose it
+    if as_json:  # first, so that a full disk does not lose it
+        document(report_document(report, raw=raw, file=out / REPORT_FILE if out else None))
+    else:
+        emit(terminal_text(report))
     if out is not None:
         with writing(out, force=force) as draft:
             write_reports(report, draft)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
+from vlatool.choice import foretold
+from vlatool.cli import _complete
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
+from vlatool.cli._document import document
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.host import MAX_CPU_ISA
 from vlatool.instruction_sets import ENGINE, board_set
@@ -33,7 +35,12 @@ def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any
 SOURCE_FLAG = inspect.Parameter(
     "source",
     inspect.Parameter.KEYWORD_ONLY,
-    default=typer.Argument(..., show_default=False, help="a bundle, a policy directory, path.py:make or an .onnx file"),
+    default=typer.Argument(
+        ...,
+        show_default=False,
+        help="a bundle, a policy directory, path.py:make or an .onnx file",
+        autocompletion=_complete.sources,
+    ),
     annotation=str,
 )
 _FORCE = _flag("force", bool, False, "--force", help="replace an output that exists")
@@ -51,6 +58,7 @@ MEASURE_FLAGS = (
         None,
         "--profile",
         help="add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set",
+        autocompletion=_complete.profiles,
     ),
     _flag(
         "workers",
@@ -62,6 +70,7 @@ MEASURE_FLAGS = (
     ),
     _FORCE,
     _JSON,
+    _flag("raw", bool, False, "--raw", help="keep every raw sample in the JSON of --json"),
 )
 
 
@@ -93,7 +102,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
     findings = made.manifest.findings
     if as_json:
-        typer.echo(json.dumps({**summary, "precision": precision, "findings": findings}))
+        document({**summary, "precision": precision, "findings": findings})
         _refuse(made)
         return
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
@@ -169,6 +178,7 @@ def measure(
     workers: int | None,
     force: bool,
     as_json: bool,
+    raw: bool = False,
     target: str | None = None,
     remote_python: str | None = None,
 ) -> None:
@@ -191,7 +201,7 @@ def measure(
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
-    show(report, as_json=as_json, out=out, force=force)
+    show(report, as_json=as_json, out=out, force=force, raw=raw)
 
 
 def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Context) -> Report:
@@ -215,4 +225,6 @@ def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
         told = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
     except MissingExtra as error:
         return replace(report, warnings=(*report.warnings, f"nothing is predicted for {board.name}: {error.message}"))
-    return replace(report, rows=tuple(told if each is row else each for each in report.rows))
+    rows = tuple(told if each is row else each for each in report.rows)
+    first, *more = (*report.summary, "")
+    return replace(report, rows=rows, summary=(first + foretold(told, told, board.name), *filter(None, more)))

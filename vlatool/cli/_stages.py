@@ -16,7 +16,7 @@ from pydantic_core import PydanticUndefined
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.cli import _run
+from vlatool.cli import _complete, _run
 from vlatool.errors import UsageError, nearest
 from vlatool.stage import Measure, Stage, validated
 
@@ -46,10 +46,15 @@ class StageGroup(TyperGroup):
         """Insert the default method when the first word is not a method."""
         known = self.list_commands(ctx)
         if args and args[0] != "--help" and args[0].replace("_", "-") not in known:
-            if difflib.get_close_matches(args[0], known, n=1) and not Path(args[0]).exists():
+            likely = difflib.get_close_matches(args[0], known, n=1)
+            if likely and not ctx.resilient_parsing and not Path(args[0]).exists():
                 raise UsageError(f"There is no {self.name} method '{args[0]}'; {nearest(args[0], known)}.")
             args = [DEFAULTS[self.name or ""], *args]
         return super().parse_args(ctx, args)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Return methods, and what the default method takes in their place."""
+        return [*super().shell_complete(ctx, incomplete), *_complete.items(_complete.sources(incomplete))]
 
 
 def stage_function(stage: type[Stage]) -> Callable[..., None]:
@@ -92,7 +97,11 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     flags = (f"{flag}/--no-{flag[2:]}",) if annotation is bool else (flag,)
     required = default is PydanticUndefined
     option = typer.Option(
-        ... if required else default, *flags, help=field.description, show_default=not isinstance(default, list)
+        ... if required else default,
+        *flags,
+        help=field.description,
+        show_default=not isinstance(default, list),
+        autocompletion=_complete.OF_FIELDS.get(name),
     )
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
 

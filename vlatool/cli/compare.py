@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from vlatool.bundle import MANIFEST, Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
 from vlatool.cli._side_by_side import read_reports, side_by_side
 from vlatool.errors import DataError, UsageError
@@ -16,13 +17,17 @@ from vlatool.errors import DataError, UsageError
 
 def compare(
     paths: Annotated[
-        list[Path], typer.Argument(help="two or more bundles, or two or more reports", show_default=False)
+        list[Path],
+        typer.Argument(
+            help="two or more bundles, or two or more reports", show_default=False, autocompletion=_complete.reports
+        ),
     ],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
     iterations: Annotated[int, typer.Option(min=20, help="timed inferences of each bundle")] = 200,
     threads: Annotated[int, typer.Option(min=1, help="intra-op threads")] = 1,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Compare bundles in one interleaved run, or put reports side by side. The first is the baseline.
 
@@ -47,4 +52,4 @@ def compare(
         raise UsageError("compare takes bundles or reports, not both at once.")
     else:
         report = side_by_side(paths, read_reports(paths))
-    show(report, as_json=as_json, out=output, force=force)
+    show(report, as_json=as_json, out=output, force=force, raw=raw)

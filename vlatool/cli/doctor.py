@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import Annotated
 
 import typer
+
+from vlatool.cli._document import document
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
@@ -15,7 +16,7 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] =
 
     checks = diagnose()
     if as_json:
-        typer.echo(json.dumps([asdict(check) for check in checks]))
+        document([asdict(check) for check in checks])
         return
     marks = {"ok": "ok     ", "warn": "warn   ", "missing": "missing"}
     for check in checks:

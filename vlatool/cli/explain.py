@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from vlatool.bundle import Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
 
 
 def explain(
-    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False)],
+    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)],
     baseline: Annotated[
         Path | None, typer.Option(help="float32 bundle that it was made from; looked for in the cache when not given")
     ] = None,

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vlatool.bundle import Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
 from vlatool.cli._default import group_with
+from vlatool.cli._document import document
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files import refuse_file, write_own
@@ -32,8 +34,16 @@ CONFIG = Path("gate.yaml")
 
 @app.command("run")
 def run(
-    candidate: Annotated[str, typer.Argument(help="a bundle, or a policy that is exported first", show_default=False)],
-    baseline: Annotated[Path | None, typer.Option(help="bundle to compare with; the one in the gate if unset")] = None,
+    candidate: Annotated[
+        str,
+        typer.Argument(
+            help="a bundle, or a policy that is exported first", show_default=False, autocompletion=_complete.sources
+        ),
+    ],
+    baseline: Annotated[
+        Path | None,
+        typer.Option(help="bundle to compare with; the one in the gate if unset", autocompletion=_complete.bundles),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option(help="the gate (see: vlatool gate init); gate.yaml here, or the defaults, if unset")
     ] = None,
@@ -49,6 +59,7 @@ def run(
     workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Measure the baseline anew beside the candidate, and leave with 0 (pass), 1 (fail) or 5 (inconclusive).
 
@@ -72,7 +83,7 @@ def run(
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
         _tell_github(report)
     try:
-        show(report, as_json=as_json, out=output, force=force)
+        show(report, as_json=as_json, out=output, force=force, raw=raw)
     finally:  # after the directory of reports, for the file may lie in it
         if junit is not None:
             _write_junit(report, junit)
@@ -86,6 +97,7 @@ def init(
     ),
     candidate: Annotated[Path, typer.Option(help="what a change makes, relative to the repository")] = Path("policy"),
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
     from vlatool.gate_files import gate_files
@@ -97,6 +109,10 @@ def init(
         path.parent.mkdir(parents=True, exist_ok=True)
     for path, text in files.items():
         write_own(path, text, force=force)
+    if as_json:
+        document({"written": [str(path) for path in files]})
+        return
+    for path in files:
         emit(f"written: {path}\n")
     emit("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
     emit(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")

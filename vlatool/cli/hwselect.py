@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
+from vlatool.cli._document import document
 from vlatool.errors import UsageError
 
 app = typer.Typer(
@@ -23,7 +24,9 @@ POINTS = "published latencies: a CSV file with device, device_class, runtime, mo
 
 @app.command("select")
 def select(
-    source: Annotated[str, typer.Argument(help="a bundle or a policy source", show_default=False)],
+    source: Annotated[
+        str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
+    ],
     hz: Annotated[
         float | None,
         typer.Option(
@@ -50,9 +53,18 @@ def select(
     kwh_price: Annotated[float, typer.Option(help="US dollars for a kWh")] = 0.3,
     cloud: Annotated[bool, typer.Option(help="compare with a rented machine")] = False,
     network_ms: Annotated[float, typer.Option(help="way to the rented machine and back")] = 40.0,
-    precision: Annotated[list[str] | None, typer.Option(help="allow this precision only; may be repeated")] = None,
-    platform: Annotated[str | None, typer.Option(help="start from a robot platform's rate, power and battery")] = None,
-    boards: Annotated[list[str] | None, typer.Option(help="look at this profile only; may be repeated")] = None,
+    precision: Annotated[
+        list[str] | None,
+        typer.Option(help="allow this precision only; may be repeated", autocompletion=_complete.precisions),
+    ] = None,
+    platform: Annotated[
+        str | None,
+        typer.Option(help="start from a robot platform's rate, power and battery", autocompletion=_complete.platforms),
+    ] = None,
+    boards: Annotated[
+        list[str] | None,
+        typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles),
+    ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given"),
@@ -136,7 +148,7 @@ def score(
             found = refit_points(points, held_out, seed, refit, context.tell)
         tables = list(found.values())
     if as_json:
-        typer.echo(json.dumps(found))
+        document(found)
         return
     for table in tables:
         for line in lines(table):
@@ -156,9 +168,12 @@ def fit(
     anew: Annotated[
         bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
     ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.hwselect._fit import fit_files
 
     _finite(seconds=seconds)
     fit_files(points, output, seconds, seed, anew, lambda line: typer.echo(line, err=True))
+    if as_json:
+        document({"written": [str(output / name) for name in ("latency.npz", "latency.json")]})

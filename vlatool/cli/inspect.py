@@ -9,6 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from vlatool.bundle import Bundle, manifest_bytes
+from vlatool.cli import _complete
+from vlatool.cli._document import document
 from vlatool.errors import GraphError
 from vlatool.manifest import Manifest
 from vlatool.printable import printable
@@ -18,7 +20,7 @@ from vlatool.spec import TensorSpec
 
 
 def inspect(
-    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False)],
+    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)],
     as_json: Annotated[bool, typer.Option("--json", help="print the manifest as JSON")] = False,
     probe: Annotated[
         bool,
@@ -38,7 +40,7 @@ def inspect(
     opened = Bundle.open(bundle)
     tried = try_once(bundle, first_run_s=first_run, memory_mb=memory) if probe else None
     if as_json:
-        typer.echo(manifest_bytes(opened.manifest).decode(), nl=False)
+        document(opened.manifest.to_dict(), manifest_bytes(opened.manifest).decode())
     else:
         for line in [*describe(opened), *([] if tried is None else [_probed(tried)])]:
             typer.echo(printable(line))

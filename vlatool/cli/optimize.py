@@ -5,20 +5,36 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._console import default_workers, emit, file_or_none, leave, progress, refuse_existing, terminal_text
+from vlatool.cli._document import document, report_document
+from vlatool.cli._plan import plan_document
 from vlatool.errors import UsageError
 from vlatool.outputs import BUNDLE
+from vlatool.report import REPORT
+
+if TYPE_CHECKING:
+    from vlatool.pipeline import Plan
 
 
 def optimize(
-    source: Annotated[str, typer.Argument(help="policy directory, path.py:make or .onnx file", show_default=False)],
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="policy directory, path.py:make or .onnx file", show_default=False, autocompletion=_complete.sources
+        ),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
     profile: Annotated[
-        str | None, typer.Option(help="board to optimise for (see: vlatool profiles list); this host if unset")
+        str | None,
+        typer.Option(
+            help="board to optimise for (see: vlatool profiles list); this host if unset",
+            autocompletion=_complete.profiles,
+        ),
     ] = None,
     max_drop: Annotated[
         str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")
@@ -44,7 +60,10 @@ def optimize(
     fresh: Annotated[bool, typer.Option("--fresh", help="measure again, even what was measured before")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print the report as JSON on stdout")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")
+    ] = False,
+    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Export a policy, quantize it in several ways, measure and evaluate each, and keep the fastest inside the budget.
 
@@ -80,15 +99,24 @@ def optimize(
         chosen = chosen.model_copy(update={"search": search})
     plan = pipeline.make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
     if dry_run:
-        for line in plan.lines():
-            typer.echo(line)
+        _show_plan(plan, as_json)
         return
     with progress(workers or default_workers()) as context:
         report = pipeline.optimize(plan, output, context, force=force)
-    emit(report.to_json() if as_json else terminal_text(report, brief=True))
-    if not as_json:
+    if as_json:
+        document(report_document(report, raw=raw, file=output / "reports" / REPORT))
+    else:
+        emit(terminal_text(report, brief=True))
         emit(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
     leave(report)
+
+
+def _show_plan(plan: Plan, as_json: bool) -> None:
+    if as_json:
+        document(plan_document(plan))
+        return
+    for line in plan.lines():
+        typer.echo(line)
 
 
 def budget(text: str) -> dict[str, Any]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from vlatool.cli import _complete
+from vlatool.cli._document import document
 
 app = typer.Typer(
     help="Hardware profiles: what a board has and what it allows.", no_args_is_help=True, rich_markup_mode=None
@@ -21,7 +24,7 @@ def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JS
 
     found = [load_profile(name) for name in names()]
     if as_json:
-        typer.echo(json.dumps([profile.model_dump(mode="json") for profile in found]))
+        document([profile.model_dump(mode="json") for profile in found])
         return
     width = max((len(profile.name) for profile in found), default=0)
     for profile in found:
@@ -30,7 +33,10 @@ def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JS
 
 @app.command("show")
 def show_profile(
-    name: Annotated[str, typer.Argument(help="name of a profile, or a YAML file", show_default=False)],
+    name: Annotated[
+        str,
+        typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Print one profile with the source of every figure."""
@@ -38,7 +44,7 @@ def show_profile(
 
     profile = load_profile(name)
     if as_json:
-        typer.echo(json.dumps(profile.model_dump(mode="json")))
+        document(profile.model_dump(mode="json"))
         return
     typer.echo(f"{profile.title} ({profile.name})")
     for line in _lines(profile.model_dump(mode="json", exclude={"name", "title", "sources"}, exclude_none=True), "  "):
@@ -50,8 +56,11 @@ def show_profile(
 
 @app.command("diff")
 def diff_profiles(
-    first: Annotated[str, typer.Argument(help="name of a profile, or a YAML file", show_default=False)],
-    second: Annotated[str, typer.Argument(help="another one", show_default=False)],
+    first: Annotated[
+        str,
+        typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles),
+    ],
+    second: Annotated[str, typer.Argument(help="another one", show_default=False, autocompletion=_complete.profiles)],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Print where two profiles differ: field, first, second."""
@@ -64,7 +73,7 @@ def diff_profiles(
         if pair[0].get(field) != pair[1].get(field)
     ]
     if as_json:
-        typer.echo(json.dumps(found))
+        document(found)
         return
     for each in found:
         typer.echo(f"{each['field']:44} {_told(each[first]):>24} {_told(each[second]):>24}")
@@ -74,13 +83,19 @@ def diff_profiles(
 
 @app.command("validate")
 def validate_profiles(
-    files: Annotated[list[str], typer.Argument(help="YAML files, directories of them, or names", show_default=False)],
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            help="YAML files, directories of them, or names", show_default=False, autocompletion=_complete.profiles
+        ),
+    ],
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Check profiles against the schema; exit 3 when one is wrong, naming every line of it."""
     from vlatool.errors import ProfileError
     from vlatool.profile import SUFFIXES, load_profile
 
-    wrong = []
+    valid, wrong = [], []
     for name in files:
         path = Path(name)
         inside = sorted(each for each in path.iterdir() if each.suffix in SUFFIXES) if path.is_dir() else [name]
@@ -92,7 +107,11 @@ def validate_profiles(
             except ProfileError as error:
                 wrong.append(error.message)
             else:
-                typer.echo(f"ok  {found.name}")
+                valid.append(found.name)
+                if not as_json:
+                    typer.echo(f"ok  {found.name}")
+    if as_json:
+        document({"valid": valid, "wrong": wrong})
     if wrong:
         raise ProfileError("\n".join(wrong), "correct these lines")
 
@@ -100,27 +119,36 @@ def validate_profiles(
 @app.command("new")
 def new_profile(
     name: Annotated[str, typer.Argument(help="name of the new profile", show_default=False)],
-    like: Annotated[str, typer.Option("--from", help="profile to begin with")] = "raspberry-pi-5",
+    like: Annotated[
+        str, typer.Option("--from", help="profile to begin with", autocompletion=_complete.profiles)
+    ] = "raspberry-pi-5",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; NAME.yaml when not given")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace a file that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Write a profile of your own to begin with: another one's figures under a new name."""
     from vlatool.profile import copy_profile
 
     target = output or Path(f"{name}.yaml")
     copy_profile(like, name, target, force=force)
+    if as_json:
+        document({"written": [str(target)]})
+        return
     typer.echo(f"{target}: correct its figures, then: vlatool profiles validate {target}")
     typer.echo("put it into a directory named in VLATOOL_PROFILES to find it by name")
 
 
 @app.command("calibrate")
 def calibrate_profile(
-    name: Annotated[str, typer.Argument(help="the board's profile", show_default=False)],
+    name: Annotated[
+        str, typer.Argument(help="the board's profile", show_default=False, autocompletion=_complete.profiles)
+    ],
     report: Annotated[
         Path, typer.Option("--from", help="report of `vlatool benchmark` on the board", show_default=False)
     ],
     mode: Annotated[str | None, typer.Option(help="power mode that it ran in; the default one when not given")] = None,
     bundle: Annotated[Path | None, typer.Option(help="what was measured, when the report does not say")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Tell the latency model what was measured on a board: predictions for it rest on that from now on."""
     from vlatool.bundle import Bundle
@@ -132,11 +160,14 @@ def calibrate_profile(
     profile = load_profile(name)
     found = measured_in(report, profile, mode, load)
     file = store(found)
-    for each in found:
+    if as_json:
+        document({"kept_in": str(file), "measured": [asdict(each) for each in found]})
+    for each in [] if as_json else found:
         typer.echo(f"{each.profile}, {each.mode}, {each.engine}, {each.precision}: {each.ms:.4g} ms measured")
     if made_on := elsewhere(report, profile):
         typer.echo(f"warning: the report was made on {made_on}, which {name} does not name in model_strings", err=True)
-    typer.echo(f"kept in {file}; remove the file to forget it, or set VLATOOL_CALIBRATIONS (now {calibrations()})")
+    if not as_json:
+        typer.echo(f"kept in {file}; remove the file to forget it, or set VLATOOL_CALIBRATIONS (now {calibrations()})")
 
 
 def _leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vlatool.bundle import Bundle
+from vlatool.cli import _complete
 from vlatool.cli._console import emit, progress, refuse_existing
+from vlatool.cli._document import document
 from vlatool.errors import GateFailed, UsageError
 from vlatool.outputs import BUNDLE
 
@@ -20,10 +21,18 @@ Versions = dict[str, tuple[str, str]]
 
 
 def rebuild(
-    bundle: Annotated[Path, typer.Argument(help="a bundle that a stage or optimize made", show_default=False)],
+    bundle: Annotated[
+        Path,
+        typer.Argument(
+            help="a bundle that a stage or optimize made", show_default=False, autocompletion=_complete.bundles
+        ),
+    ],
     source: Annotated[
         str | None,
-        typer.Option(help="policy directory, path.py:make, .onnx file or an earlier bundle; where it was if unset"),
+        typer.Option(
+            help="policy directory, path.py:make, .onnx file or an earlier bundle; where it was if unset",
+            autocompletion=_complete.sources,
+        ),
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="exit 1 when a byte differs")] = False,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the rebuilt bundle here")] = None,
@@ -51,7 +60,10 @@ def rebuild(
     with progress() as context:
         files = tuple(file or ())
         made = run(opened, context, source=source, files=files, cache=cache_directory(), out=output, force=force)
-    emit(_json(made, versions, output) if as_json else _text(made, versions, output))
+    if as_json:
+        document(_told_as_json(made, versions, output))
+    else:
+        emit(_text(made, versions, output))
     if check and not made.identical:
         _fail(made, versions)
 
@@ -85,8 +97,8 @@ def _text(made: Rebuilt, versions: Versions, output: Path | None) -> str:
     return "\n".join([*lines, *([f"bundle: {output}"] if output else [])]) + "\n"
 
 
-def _json(made: Rebuilt, versions: Versions, output: Path | None) -> str:
-    told = {
+def _told_as_json(made: Rebuilt, versions: Versions, output: Path | None) -> dict[str, Any]:
+    return {
         "bundle": str(made.bundle.path),
         "source": made.source,
         "identical": made.identical,
@@ -100,7 +112,6 @@ def _json(made: Rebuilt, versions: Versions, output: Path | None) -> str:
         ],
         "output": str(output) if output else None,
     }
-    return json.dumps(told, indent=1) + "\n"
 
 
 def _fail(made: Rebuilt, versions: Versions) -> None:

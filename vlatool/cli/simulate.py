@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
 
+from vlatool.cli import _complete
 from vlatool.cli._console import progress
+from vlatool.cli._document import document
 
 
 def simulate(
-    source: Annotated[str, typer.Argument(help="a bundle or a policy source", show_default=False)],
-    profile: Annotated[str, typer.Option(help="the board", show_default=False)],
+    source: Annotated[
+        str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
+    ],
+    profile: Annotated[str, typer.Option(help="the board", show_default=False, autocompletion=_complete.profiles)],
     mode: Annotated[str | None, typer.Option(help="power mode; the default one when not given")] = None,
-    engine: Annotated[str | None, typer.Option(help="engine; the board's preferred one when not given")] = None,
-    precision: Annotated[str, typer.Option(help="precision; as the policy is stored when not given")] = "",
+    engine: Annotated[
+        str | None,
+        typer.Option(help="engine; the board's preferred one when not given", autocompletion=_complete.engines),
+    ] = None,
+    precision: Annotated[
+        str, typer.Option(help="precision; as the policy is stored when not given", autocompletion=_complete.precisions)
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
@@ -24,7 +32,7 @@ def simulate(
     with progress() as context:
         found = simulated(source, profile, mode, engine, precision, context)
     if as_json:
-        typer.echo(json.dumps(found))
+        document(found)
         return
     for line in simulation_lines(found):
         typer.echo(line)

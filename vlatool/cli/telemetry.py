@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vlatool.cli._document import document
 from vlatool.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def telemetry(
         time.sleep(seconds)
     found = recorder.recorded
     if as_json:
-        typer.echo(json.dumps(found.to_dict()))
+        document(found.to_dict())
         return
     for line in lines(found):
         typer.echo(line)

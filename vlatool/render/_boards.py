@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from vlatool.render._format import number
+from vlatool.render._labels import Mark, labels
 from vlatool.render._svg import Axis, Canvas, axis_for
 from vlatool.report import Measurement, Report, Row
 
@@ -107,21 +108,26 @@ def chart(report: Report, width: int) -> str:
     spoken = "; ".join(
         f"{row.name}: {_spread(item)} ms, {_money(row.get('price', 'predicted'))} dollars" for row, item in found
     )
-    canvas = Canvas(f"boards-{width}", width, height, "Price against predicted latency", spoken)
+    marks = [_mark(row, item, across, up) for row, item in found]
+    limit = limit_ms(report)
+    ends = [(item.low or item.value, item.high or item.value) for _, item in found]
+    lines = [(across(low), mark.y - 1, across(high), mark.y + 1) for mark, (low, high) in zip(marks, ends, strict=True)]
+    lines += [(across(limit) - 1, top, across(limit) + 1, bottom)] if across.holds(limit) else []
+    named = labels(marks, (left, top - 10, width - 4.0, bottom), lines, width * 0.5)
+    canvas = Canvas(f"boards-{width}", width, height + round(named.height), "Price against predicted latency", spoken)
     for value in up.ticks(6):
         canvas.line(left, up(value), right, up(value), "grid")
         canvas.text(left - 6, up(value) + 4, f"{value:,.0f}", "tick", "end")
     canvas.across(across, bottom, top, 8 if width > 500 else 4)
     canvas.text(0, 12, "US dollars", "note")
     canvas.text(right, bottom + 32, "predicted latency of one inference, ms (80 % interval)", "note", "end")
-    limit = limit_ms(report)
     if across.holds(limit):
         canvas.line(across(limit), top, across(limit), bottom, "limit")
         canvas.text(across(limit) - 5, bottom - 8, f"limit {limit:g} ms", "limit-text", "end")
     _front(canvas, found, across, up)
-    taken: list[tuple[float, float]] = []
     for row, item in found:
-        _board(canvas, row, item, across, up, taken, right)
+        _board(canvas, row, item, across, up)
+    named.draw(canvas, height)
     return canvas.svg()
 
 
@@ -142,12 +148,15 @@ def _front(canvas: Canvas, found: Sequence[tuple[Row, Measurement]], across: Axi
         canvas.steps([(across(x), up(y)) for x, y in best], "front")
 
 
-def _board(
-    canvas: Canvas, row: Row, item: Measurement, across: Axis, up: Axis, taken: list[tuple[float, float]], right: float
-) -> None:
+def _mark(row: Row, item: Measurement, across: Axis, up: Axis) -> Mark:
     price = row.get("price", "predicted")
-    x, y = across(item.value), up(price.value if price else 0.0)
     css = {"chosen": "s-chosen", "within": "s1", "subject": "s3", "outside": "s-base"}[row.role]
+    return Mark(across(item.value), up(price.value if price else 0.0), row.name, css, 5.0)
+
+
+def _board(canvas: Canvas, row: Row, item: Measurement, across: Axis, up: Axis) -> None:
+    mark = _mark(row, item, across, up)
+    x, y, css = mark.x, mark.y, mark.css
     if item.low is not None and item.high is not None:
         canvas.line(across(item.low), y, across(item.high), y, f"whisker {css}")
     tip = f"{row.name}: {_spread(item)} ms; {row.reason}"
@@ -155,9 +164,3 @@ def _board(
         canvas.add("circle", f"hollow {css}", tip, cx=x, cy=y, r=4)
     else:
         canvas.add("circle", f"dot {css}", tip, cx=x, cy=y, r=5 if row.role == "chosen" else 4)
-    size = 6.0 * len(row.name)
-    side = x + 8 + size > right
-    spot = (x - 8 - size if side else x + 8, y - 6)
-    if all(abs(spot[1] - other[1]) > 11 or abs(spot[0] - other[0]) > size for other in taken):
-        taken.append(spot)
-        canvas.text(x - 8 if side else x + 8, y - 6, row.name, "tick", "end" if side else "start")

@@ -93,6 +93,12 @@ border-radius:0 5px 5px 0;max-width:90ch}
 .trust p{margin:0;font-weight:620}.trust ul{margin:6px 0 0;padding:0;list-style:none;font-size:14px}
 .trust li{margin-top:5px}.trust li b{font-weight:620;margin-right:4px}.trust b.note{color:var(--muted)}
 .trust b.suspect{color:var(--inconclusive)}.trust b.invalid{color:var(--fail)}.remedy{display:block;color:var(--muted)}
+.sides{display:grid;grid-template-columns:1fr 1fr;gap:14px;margin:14px 0}
+.sides>div{border:1px solid var(--rule);border-radius:8px;padding:13px 16px;background:var(--raised)}
+.sides>.guess{border:1px dashed var(--guess-rule);background:var(--guess-wash)}
+.sides p{font-size:13px;color:var(--muted);margin:0 0 6px}.sides dl{margin:0}
+.sides dl div{display:grid;grid-template-columns:minmax(90px,34%) 1fr;gap:0 12px;padding:2px 0}
+.sides dt{color:var(--muted);font-size:13px}.sides dd{margin:0;font-weight:620}
 .percentiles{width:auto;min-width:min(100%,420px)}.percentiles .bound{color:var(--muted)}
 .percentiles .why{color:var(--muted);font-size:12.5px;font-style:italic;max-width:46ch}
 .percentiles .begin{padding-left:30px}
@@ -128,6 +134,7 @@ font-variant-numeric:tabular-nums}
 .fill{fill:var(--series);opacity:.62}.outer{fill:var(--series);opacity:.13}.band{fill:var(--series);opacity:.26}.band~.line{stroke-dasharray:none}
 .mark{stroke:var(--series);stroke-width:2}.whisker{stroke:var(--series);stroke-width:1.5;opacity:.65}
 .dot{fill:var(--series);stroke:var(--paper);stroke-width:1}.hollow{fill:var(--paper);stroke:var(--series);stroke-width:2}
+.leader{stroke:var(--series);stroke-width:1;opacity:.8}
 .ring{fill:none;stroke:var(--series);stroke-width:1.5}
 .limit{stroke:var(--limit);stroke-width:1.4;stroke-dasharray:5 3}.chart .limit-text{fill:var(--limit)}
 .outside{fill:var(--limit-wash)}.front{stroke:var(--muted);stroke-width:1;stroke-dasharray:2 3}
@@ -138,6 +145,7 @@ font-variant-numeric:tabular-nums}
 
 NARROW = """
 @media screen and (max-width:700px){
+.sides{grid-template-columns:1fr}
 main{padding:26px 16px 48px}h1{font-size:22px}section{margin-top:36px}
 .result{flex-direction:column;gap:8px}.result p{font-size:16px}
 .wide{display:none}.narrow{display:block}
@@ -150,7 +158,7 @@ main{padding:26px 16px 48px}h1{font-size:22px}section{margin-top:36px}
 .variants thead{position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%)}
 .variants tbody{padding:10px 12px;border-bottom:1px solid var(--rule)}
 .variants tbody th{padding:0 0 4px}
-.variants tbody td:not(.gap){display:grid;grid-template-columns:110px 1fr;padding:3px 0;
+.variants tbody td:not(.gap){display:grid;grid-template-columns:minmax(110px,42%) 1fr;column-gap:12px;padding:3px 0;
 text-align:left;white-space:normal}
 .variants td::before{content:attr(data-label);color:var(--muted);font-size:13px;grid-row:1/span 4}
 .variants td>*{grid-column:2}.variants .gap{display:none}

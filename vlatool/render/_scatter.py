@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vlatool.render._format import full, is_share, label, number, quantity, tick, unit
-from vlatool.render._svg import CHARACTER, Axis, Canvas, axis_for, series, shorten
+from vlatool.render._labels import Box, Mark, labels
+from vlatool.render._svg import CHARACTER, Axis, Canvas, axis_for, series
 from vlatool.render._view import ERRORS, Latency, accuracy, floor, latency, measured
 from vlatool.report import Measurement, Report
 
 FOOTPRINT = ("peak_rss", "steady_rss", "size")
-Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -91,19 +91,18 @@ def scatter(report: Report, width: int) -> str:
     across, up = _axes(found, aim, least, frame)
     spoken = "; ".join(f"{point.name}: {quantity(point.x)}, {full(point.y)}" for point in found)
     title = f"{label(found[0].y.name)} against {label(aim.name)}"
-    canvas = Canvas(f"scatter-{width}", width, height, title, spoken)
+    marks = [Mark(across(point.x.value), up(point.y.value), point.name, point.css) for point in found]
+    inside = (46.0, 16.0, width - 4.0, height - 40.0)
+    named = labels(marks, inside, _limit_boxes(across, up, aim, least, frame), width * 0.45)
+    canvas = Canvas(f"scatter-{width}", width, height + round(named.height), title, spoken)
     _background(canvas, found[0], across, up, frame)
-    boxes = _limits(canvas, across, up, aim, least, frame)
+    _limits(canvas, across, up, aim, least, frame)
     _front(canvas, front(found), across, up)
-    boxes += [
-        (across(item.x.value) - 8, up(item.y.value) - 8, across(item.x.value) + 8, up(item.y.value) + 8)
-        for item in found
-    ]
     for point in found:
         _whiskers(canvas, point, across, up)
     for point in found:
         _point(canvas, point, across(point.x.value), up(point.y.value))
-        _name(canvas, point, across(point.x.value), up(point.y.value), boxes)
+    named.draw(canvas, height)
     return canvas.svg()
 
 
@@ -120,24 +119,41 @@ def _background(canvas: Canvas, first: Point, across: Axis, up: Axis, frame: Box
     canvas.text(right, bottom + 32, f"{label(first.x.name)}, {first.x.unit}{scale}", "note", "end")
 
 
-def _limits(canvas: Canvas, across: Axis, up: Axis, aim: Latency, least: float | None, frame: Box) -> list[Box]:
+def _limit_boxes(across: Axis, up: Axis, aim: Latency, least: float | None, frame: Box) -> list[Box]:
+    """Return what the lines of the limits and their words cover."""
     left, top, right, bottom = frame
     boxes: list[Box] = []
     if aim.limit is not None and across.holds(aim.limit):
-        spot, text = across(aim.limit), f"{aim.word} {tick(aim.limit)} ms"
-        canvas.add("rect", "outside", x=spot, y=top, width=right - spot, height=bottom - top)
-        canvas.line(spot, top, spot, bottom, "limit")
-        canvas.text(spot - 5, bottom - 8, text, "limit-text", "end")
+        spot, text = across(aim.limit), _limit_words(aim)
         boxes.append((spot - 1, top, spot + 1, bottom))
         boxes.append((spot - 5 - len(text) * CHARACTER, bottom - 18, spot + 2, bottom - 4))
     if least is not None and up.holds(least):
-        spot, text = up(least), f"at least {number(round(least * 100, 2))} %"
-        canvas.add("rect", "outside", x=left, y=spot, width=right - left, height=bottom - spot)
-        canvas.line(left, spot, right, spot, "limit")
-        canvas.text(left + 5, spot + 13, text, "limit-text")
+        spot, text = up(least), _least_words(least)
         boxes.append((left, spot - 1, right, spot + 1))
         boxes.append((left, spot, left + 5 + len(text) * CHARACTER, spot + 16))
     return boxes
+
+
+def _limit_words(aim: Latency) -> str:
+    return f"{aim.word} {tick(aim.limit or 0.0)} ms"
+
+
+def _least_words(least: float) -> str:
+    return f"at least {number(round(least * 100, 2))} %"
+
+
+def _limits(canvas: Canvas, across: Axis, up: Axis, aim: Latency, least: float | None, frame: Box) -> None:
+    left, top, right, bottom = frame
+    if aim.limit is not None and across.holds(aim.limit):
+        spot, text = across(aim.limit), _limit_words(aim)
+        canvas.add("rect", "outside", x=spot, y=top, width=right - spot, height=bottom - top)
+        canvas.line(spot, top, spot, bottom, "limit")
+        canvas.text(spot - 5, bottom - 8, text, "limit-text", "end")
+    if least is not None and up.holds(least):
+        spot, text = up(least), _least_words(least)
+        canvas.add("rect", "outside", x=left, y=spot, width=right - left, height=bottom - spot)
+        canvas.line(left, spot, right, spot, "limit")
+        canvas.text(left + 5, spot + 13, text, "limit-text")
 
 
 def _front(canvas: Canvas, best: Sequence[Point], across: Axis, up: Axis) -> None:
@@ -163,27 +179,3 @@ def _point(canvas: Canvas, point: Point, x: float, y: float) -> None:
         canvas.add("circle", f"ring {point.css}", cx=x, cy=y, r=9.5)
     hollow = "hollow " if point.role == "outside" else "dot "
     canvas.add("circle", f"{hollow}{point.css}", tip, cx=x, cy=y, r=5.5)
-
-
-def _name(canvas: Canvas, point: Point, x: float, y: float, taken: list[Box]) -> None:
-    text = shorten(point.name, canvas.width * 0.45)
-    wide = len(text) * (CHARACTER + 0.7)
-    spots = [
-        (x + dx, y + dy, anchor)
-        for dy in (4.0, -13.0, 22.0, -30.0, 40.0)
-        for dx, anchor in ((13.0, "start"), (-13.0, "end"))
-    ]
-    chosen = spots[0]
-    for spot in spots:
-        start = spot[0] if spot[2] == "start" else spot[0] - wide
-        box = (start, spot[1] - 10, start + wide, spot[1] + 3)
-        inside = box[0] >= 46 and box[2] <= canvas.width - 4 and box[1] >= 16 and box[3] <= canvas.height - 40
-        if inside and not any(_overlap(box, other) for other in taken):
-            chosen = spot
-            taken.append(box)
-            break
-    canvas.text(chosen[0], chosen[1], text, f"name halo ink {point.css}", chosen[2])
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

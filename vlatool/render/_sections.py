@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from html import escape
 
+from vlatool.render._columns import Column, about, columns, sides
 from vlatool.render._format import aside, label, limit, plain, quantity, span
 from vlatool.render._svg import series
 from vlatool.render._tables import Table
@@ -16,7 +17,6 @@ from vlatool.render._view import (
     dimension,
     error_groups,
     facts,
-    headline,
     latency,
     matrix,
     measured_where,
@@ -27,7 +27,6 @@ from vlatool.render._view import (
     place,
     places,
     role,
-    short,
     unmeasured,
 )
 from vlatool.report import Measurement, Report, Row
@@ -56,6 +55,7 @@ def head(report: Report, trust: str = "") -> str:
     badge = f'<span class="badge {report.verdict}">{f"{MARKS[report.verdict]} {report.verdict}".strip()}</span>'
     parts = [f'<header><div class="over">{safe(made)}</div><h1>{safe(report.title)}</h1>']
     parts.append(f'<div class="result">{badge}<p>{safe(first)}</p></div>')
+    parts.append(_sides(report))
     parts += [f"<p>{safe(sentence)}</p>" for sentence in more]
     parts.append(trust)
     if report.limits:
@@ -70,13 +70,33 @@ def head(report: Report, trust: str = "") -> str:
     return "".join([*parts, "</header>"])
 
 
+def _sides(report: Report) -> str:
+    """Return what was measured here beside what is predicted for the board; nothing without a board."""
+    found = sides(report)
+    if found is None:
+        return ""
+    here = measured_where(report).replace("Measured", "measured", 1)
+    return (
+        f'<div class="sides" aria-label="{safe(found.name)}: measured and predicted">'
+        + _side("measured", f"{found.name}, {here}", found.measured)
+        + _side("predicted", f"{found.name}, on {found.board}: not measured there", found.predicted)
+        + "</div>"
+    )
+
+
+def _side(kind: str, title: str, told: Sequence[tuple[str, str]]) -> str:
+    pairs = "".join(f"<div><dt>{safe(name)}</dt><dd>{safe(text)}</dd></div>" for name, text in told)
+    css = ' class="guess"' if kind == "predicted" else ""
+    return f'<div{css}><p><span class="kind">{kind}</span>{safe(title)}</p><dl>{pairs}</dl></div>'
+
+
 def variants(report: Report) -> str:
     """Return the headline table: one variant a row, its reason below."""
-    shown = headline(report)
+    shown = columns(report)
     if not report.rows:
         return section("Variants", "<p>The report has no rows.</p>")
     heads = "".join(
-        f'<th scope="col" role="columnheader"{_n(name)}>{safe(capital(short(name)))}</th>' for name in shown
+        f'<th scope="col" role="columnheader"{_n(column.name)}>{safe(capital(column.title))}</th>' for column in shown
     )
     top = max((_reach(row.get("latency_p50")) for row in report.rows), default=0.0)
     aim = latency(report)
@@ -93,7 +113,7 @@ def variants(report: Report) -> str:
     return section(
         "Variants",
         f'<div class="scroll">{table}</div>',
-        f"{measured_where(report)}. {brackets(report, 'measured')}",
+        " ".join(part for part in (f"{measured_where(report)}.", about(report), brackets(report, "measured")) if part),
         "measured",
     )
 
@@ -116,11 +136,11 @@ def _reach(item: Measurement | None) -> float:
     return max((value for value in (item.value, item.high or 0.0) if math.isfinite(value)), default=0.0)
 
 
-def _variant(row: Row, css: str, shown: Sequence[str], top: float, mark: float | None, report: Report) -> str:
+def _variant(row: Row, css: str, shown: Sequence[Column], top: float, mark: float | None, report: Report) -> str:
     several = len(places(report, "measured")) > 1
     cells = []
-    for name in shown:
-        item = row.get(name)
+    for column in shown:
+        name, item = column.name, column.of(row)
         content = value_cell(_without_count(item, row) if name == "speedup" else item)
         if item is not None and name == "latency_p50":
             content += bar(item, top, css, mark)
@@ -132,7 +152,7 @@ def _variant(row: Row, css: str, shown: Sequence[str], top: float, mark: float |
             )
         if item is not None and several:
             content += f'<span class="aside">{safe(place(report, item.where))}</span>'
-        cells.append(f'<td role="cell" data-label="{safe(short(name))}"{_n(name, item)}>{content}</td>')
+        cells.append(f'<td role="cell" data-label="{safe(column.title)}"{_n(name, item)}>{content}</td>')
     name_cell = f'<th scope="row" role="rowheader"><span class="key {css}"></span>{breakable(row.name)}</th>'
     why = f'<span class="role">{safe(role(row))}</span>{": " + safe(row.reason) if row.reason else ""}'
     if row.role == "subject":

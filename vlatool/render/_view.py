@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeGuard
 
 from vlatool.render._format import cell, interval, is_usual, label, plain
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import ON_BOARD, Measurement, Report, Row
 
 ACCURACY = ("success", "agreement", "agreement_expert", "agreement_baseline")
 ERRORS = ("error", "error_expert", "error_baseline")
@@ -219,10 +219,11 @@ def latency(report: Report) -> Latency:
     """Return which latency percentile the limit speaks of, and the limit.
 
     A benchmark at a rate (``hz``) without one has its period as the deadline, and so have several that are compared.
-    The rate that ``optimize`` was asked for is no limit on this host.
+    What ``optimize`` was asked for is no limit on this host when it is for another board.
     """
     present = names(report)
-    for name, wanted in report.limits.items():
+    foretold = names(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
+    for name, wanted in () if foretold else report.limits.items():
         if _number(wanted) and name.endswith("_ms") and ("latency" in name or "deadline" in name):
             hit = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
             chosen = f"latency_{hit[0]}" if hit else "latency_p50"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from vlatool.render import _sections as part
 from vlatool.render._boards import KIND, by_state, chart
 from vlatool.render._boards_html import boards_section, cost_section
+from vlatool.render._columns import board
 from vlatool.render._css import stylesheet
 from vlatool.render._distribution import Sampled, beyond, distribution, left_out, sampled
 from vlatool.render._format import label
@@ -33,6 +34,7 @@ class HtmlRenderer:
         body = "".join(
             (
                 part.head(report, trust(report)),
+                part.predicted(report) if board(report) else "",
                 part.variants(report),
                 percentile_section(report),
                 self._spread(report, variants),
@@ -42,7 +44,7 @@ class HtmlRenderer:
                 part.errors(report),
                 part.others(report),
                 part.tables(details(report, tuple(BARS))),
-                part.predicted(report),
+                "" if board(report) else part.predicted(report),
                 self._along(report, untimed(variants)),
                 part.circumstances(report),
             )

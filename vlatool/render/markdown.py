@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from vlatool.render._boards import HEADS, KIND, by_state, cells, costs, reasons
+from vlatool.render._columns import about, board, columns
 from vlatool.render._format import full, label, limit, plain
 from vlatool.render._percentiles import percentiles
 from vlatool.render._tables import details
@@ -15,7 +16,6 @@ from vlatool.render._view import (
     brackets,
     error_groups,
     facts,
-    headline,
     matrix,
     measured_where,
     names,
@@ -24,7 +24,6 @@ from vlatool.render._view import (
     place,
     places,
     role,
-    short,
     unmeasured,
 )
 from vlatool.report import Report
@@ -42,9 +41,10 @@ class MarkdownRenderer:
             return "\n\n".join([*_head(report), *_boards(report), *_circumstances(report)]) + "\n"
         blocks = [
             *_head(report),
+            *(_predicted(report) if board(report) else []),
             *_variants(report),
             *_percentiles(report),
-            *_predicted(report),
+            *([] if board(report) else _predicted(report)),
             *_further(report),
             *_details(report),
             *_circumstances(report),
@@ -126,18 +126,19 @@ def _percentiles(report: Report) -> list[str]:
 def _variants(report: Report) -> list[str]:
     if not report.rows:
         return ["The report has no rows."]
-    shown = headline(report)
+    shown = columns(report)
     several = len(places(report, "measured")) > 1
     rows = []
     for row in report.rows:
-        items = [row.get(name) for name in shown]
+        items = [column.of(row) for column in shown]
         where = [next((place(report, item.where) for item in items if item), "–")] if several else []
         rows.append([row.name, role(row), *where, *(full(item) if item else "–" for item in items)])
-    heads = ["variant", "role", *(["where"] if several else []), *(short(name) for name in shown)]
+    heads = ["variant", "role", *(["where"] if several else []), *(column.title for column in shown)]
     numeric = [False] * (3 if several else 2) + [True] * len(shown)
     reasons = [f"{row.name}: {row.reason}" for row in report.rows if row.reason]
-    about = f"**{inline(measured_where(report))}.** {inline(brackets(report, 'measured'))}".rstrip()
-    return [about, _table(heads, rows, numeric), *_list(reasons)]
+    words = " ".join(part for part in (about(report), brackets(report, "measured")) if part)
+    top = f"**{inline(measured_where(report))}.** {inline(words)}".rstrip()
+    return [top, _table(heads, rows, numeric), *_list(reasons)]
 
 
 def _matrix(report: Report, shown: Sequence[str], origin: str, where: str | None = None) -> str:

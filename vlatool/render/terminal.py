@@ -10,6 +10,7 @@ from rich.text import Text
 
 from vlatool.render._boards import HEADS as BOARD_HEADS
 from vlatool.render._boards import KIND, by_state, cells, costs, reasons
+from vlatool.render._columns import Column, about, board, columns
 from vlatool.render._format import aside, count, label, limit, plain, quantity, span
 from vlatool.render._grid import grid
 from vlatool.render._percentiles import percentiles
@@ -20,10 +21,8 @@ from vlatool.render._view import (
     brackets,
     error_groups,
     facts,
-    headline,
     in_order,
     matrix,
-    measured,
     measured_where,
     names,
     notes,
@@ -32,7 +31,6 @@ from vlatool.render._view import (
     place,
     places,
     role,
-    short,
     unmeasured,
 )
 from vlatool.report import Report, Row
@@ -74,11 +72,13 @@ class TerminalRenderer:
         """Return the text, with a line break at the end."""
         if report.kind == KIND:
             return self._printed([*self._verdict(report), *self._boards(report), *self._warnings(report)])
+        first, last = ([], self._predicted(report)) if not board(report) else (self._predicted(report), [])
         lines = [
             *self._verdict(report),
+            *first,
             *self._variants(report),
             *([] if self.brief else [*self._further(report), *self._details(report)]),
-            *self._predicted(report),
+            *last,
             *([] if self.brief else self._environment(report)),
             *self._warnings(report),
             *([] if self.brief else self._command(report)),
@@ -136,15 +136,16 @@ class TerminalRenderer:
             reasons = self._reasons(report)
             return [*self._percentiles(report, self._origin(report)), *self._numbers(report),
                     *([Text(), *reasons] if reasons else []), *self._spread(report)]  # fmt: skip
-        shown = headline(report)
-        same = [self._same_count(report, name) for name in shown]
+        shown = columns(report)
+        same = [self._same_count(report, column) for column in shown]
         body = [["", *same]] if any(same) else []
         styles: dict[int, str] = {0: "dim"} if body else {}
         for row in report.rows:
             styles[len(body)] = "bold green" if row.role == "chosen" else ""
             body += self._variant(row, shown, same, report)
         lines = self._heading(self._origin(report))
-        lines += self._table(["variant", *(short(name) for name in shown)], body, styles=styles)
+        lines += self._table(["variant", *(column.title for column in shown)], body, styles=styles)
+        lines += self._wrapped(about(report), style="dim")
         lines += self._wrapped(brackets(report, "measured"), style="dim")
         return [*lines, Text(), *self._reasons(report), *self._spread(report)]
 
@@ -185,12 +186,13 @@ class TerminalRenderer:
     def _origin(self, report: Report) -> str:
         return measured_where(report).replace("Measured", "MEASURED", 1)
 
-    def _same_count(self, report: Report, name: str) -> str:
-        found = {count(item.samples) for item in measured(report, name) if item is not None and item.known}
+    def _same_count(self, report: Report, column: Column) -> str:
+        items = [column.of(row) for row in report.rows]
+        found = {count(item.samples) for item in items if item is not None and item.known}
         return found.pop() if len(found) == 1 else ""
 
-    def _variant(self, row: Row, shown: Sequence[str], same: Sequence[str], report: Report) -> list[list[str]]:
-        items = [row.get(name) for name in shown]
+    def _variant(self, row: Row, shown: Sequence[Column], same: Sequence[str], report: Report) -> list[list[str]]:
+        items = [column.of(row) for column in shown]
         lines = [
             [plain(row.name), *(quantity(item) if item else "–" for item in items)],
             ["", *(span(item) if item else "" for item in items)],
@@ -218,7 +220,8 @@ class TerminalRenderer:
                 tail = None if percentile_names(report) else row.get("latency_p99")
                 beside = f"{quantity(tail)} ({aside(tail)})" if tail and aside(tail) else quantity(tail) if tail else ""
                 body.append([plain(row.name), sparkline(samples, 20), beside or count(len(samples))])
-        heads = ["spread of latency", "min … p99", "calls" if percentile_names(report) else "latency p99"]
+        where = ", this host" if board(report) else ""
+        heads = [f"spread of latency{where}", "min … p99", "calls" if percentile_names(report) else "latency p99"]
         return [Text(), *self._table(heads, body, [False, False, True])] if body else []
 
     def _further(self, report: Report) -> list[Text]:

@@ -1,0 +1,118 @@
+"""What a shell may complete: names of profiles, engines, samples, and what lies in folders. Reads names alone."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from typer.core import TyperGroup
+
+from vlatool import registry
+from vlatool.bundle import MANIFEST
+from vlatool.report import REPORT
+
+MOST = 200
+"""Of a folder."""
+_CLICK: Any = TyperGroup.__mro__[1].__module__.rpartition(".")[0]
+CompletionItem: Any = importlib.import_module(f"{_CLICK}.shell_completion").CompletionItem
+"""Of the click that typer brings, or of the one that it imports, by its version."""
+
+
+def profiles(incomplete: str) -> list[str]:
+    """Return names of profiles, or YAML files and folders."""
+    from vlatool.profile import SUFFIXES, names
+
+    files = _paths(incomplete, lambda path: path.endswith(tuple(SUFFIXES))) if os.sep in incomplete else []
+    return [*(name for name in names() if name.startswith(incomplete)), *files]
+
+
+def platforms(incomplete: str) -> list[str]:
+    """Return names of robot platforms."""
+    from vlatool.platforms import platform_names
+
+    return [name for name in platform_names() if name.startswith(incomplete)]
+
+
+def engines(incomplete: str) -> list[str]:
+    """Return names of engines."""
+    return _names("engines", incomplete)
+
+
+def samples(incomplete: str) -> list[str]:
+    """Return the shapes of policies that can be made."""
+    return [
+        name.replace("_", "-") for name in registry.names("samples") if name.replace("_", "-").startswith(incomplete)
+    ]
+
+
+def precisions(incomplete: str) -> list[str]:
+    """Return the precisions that profiles speak of."""
+    return [
+        name for name in ("float32", "float16", "bfloat16", "float8", "int8", "int4") if name.startswith(incomplete)
+    ]
+
+
+def bundles(incomplete: str) -> list[str]:
+    """Return bundles, and folders that may hold some."""
+    return _paths(incomplete, _is_bundle)
+
+
+def reports(incomplete: str) -> list[str]:
+    """Return bundles, reports, and folders that may hold some."""
+    return _paths(incomplete, lambda path: _is_bundle(path) or path.endswith(".json") or _holds(path, REPORT))
+
+
+def sources(incomplete: str) -> list[str]:
+    """Return bundles, policies, ONNX files, and folders that may hold some."""
+    return _paths(incomplete, lambda path: _is_bundle(path) or _holds(path, "policy.yaml") or path.endswith(".onnx"))
+
+
+def policies(incomplete: str) -> list[str]:
+    """Return folders of policies, and folders that may hold some."""
+    return _paths(incomplete, lambda path: _holds(path, "policy.yaml"))
+
+
+OF_FIELDS: dict[str, Callable[[str], list[str]]] = {
+    "engine": engines, "against": bundles, "baseline": bundles, "policy": policies,
+}  # fmt: skip
+"""Field of a stage -> what completes it."""
+
+
+def items(found: list[str]) -> list[Any]:
+    """Return what click takes from a group."""
+    return [CompletionItem(each) for each in found]
+
+
+def _names(kind: str, incomplete: str) -> list[str]:
+    return [name for name in registry.names(kind) if name.startswith(incomplete)]
+
+
+def _is_bundle(path: str) -> bool:
+    return _holds(path, MANIFEST)
+
+
+def _holds(path: str, name: str) -> bool:
+    return os.path.isfile(os.path.join(path, name))
+
+
+def _paths(incomplete: str, wanted: Callable[[str], bool]) -> list[str]:
+    """Return the paths that begin so and are wanted; folders that are not end in a slash."""
+    found = []
+    for path in _beginning(incomplete):
+        if wanted(path):
+            found.append(path)
+        elif os.path.isdir(path):
+            found.append(path + os.sep)
+    return found
+
+
+def _beginning(incomplete: str) -> Iterator[str]:
+    """Return what lies in the folder of an incomplete path, and begins so; hidden files only when asked for."""
+    folder, start = os.path.split(incomplete)
+    with contextlib.suppress(OSError):
+        for name in sorted(os.listdir(folder or os.curdir))[: MOST * 10]:
+            if name.startswith(start) and (start or not name.startswith(".")):
+                yield os.path.join(folder, name)

@@ -1,0 +1,74 @@
+"""What went wrong on a command line: its kind, its words, what to do, and the exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+
+from vlatool.errors import VlatoolError
+from vlatool.printable import message_of
+
+OK = 0
+USAGE = 2
+INPUT = 3
+OUR_BUG = 70
+INTERRUPTED = 130
+CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
+"""The base of usage errors: of the click that typer brings, or of the one that it imports, by its version."""
+KEEPING = frozenset(("optimize", "export", "quantize"))
+"""Commands whose finished stages stay in the cache when they are interrupted."""
+TYPES = ("OSError", "MemoryError", "Interrupted", "Terminated", "InternalError")
+"""Types of failures beside the classes of ``vlatool.errors``."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a command line did not end well.
+
+    Args:
+        type: A class of ``vlatool.errors``, or one of ``TYPES``.
+        message: What was wrong.
+        fix: What to do about it; may be empty.
+        exit_code: What the process ends with.
+    """
+
+    type: str
+    message: str
+    fix: str
+    exit_code: int
+
+    def __str__(self) -> str:
+        start = {"Interrupted": "", "InternalError": "internal error: "}.get(self.type, "error: ")
+        return f"{start}{self.message}"
+
+
+def failure(error: BaseException, words: Sequence[str]) -> Failure:
+    """Return what an exception means to the person who typed these words."""
+    if isinstance(error, CLICK_EXCEPTION):
+        return _usage(error)
+    if isinstance(error, VlatoolError):
+        return Failure(type(error).__name__, error.message, error.fix, error.exit_code)
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
+        kept = "; finished stages are kept" if KEEPING.intersection(words) else ""
+        return Failure("Interrupted", f"interrupted{kept}", "", INTERRUPTED)
+    if isinstance(error, BrokenPipeError):
+        return Failure("OSError", "nobody reads the output any more.", "", OK)
+    if isinstance(error, OSError):
+        return Failure("OSError", f"{error.filename or 'a file'}: {error.strerror or error}.", "", INPUT)
+    if isinstance(error, MemoryError):
+        return Failure("MemoryError", "out of memory.", "use a machine with more memory, or a smaller policy", INPUT)
+    if isinstance(error, SystemExit):
+        code = error.code if isinstance(error.code, int) else 1
+        return Failure("Terminated", f"ended by signal {code - 128}." if code > 128 else "ended.", "", code)
+    fix = "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback"
+    return Failure("InternalError", f"{type(error).__name__}: {message_of(error)}", fix, OUR_BUG)
+
+
+def _usage(error: Any) -> Failure:
+    """Return what click says of a command line that it refuses."""
+    context = getattr(error, "ctx", None)
+    fix = f"{context.command_path} --help" if context else ""
+    return Failure("UsageError", error.format_message(), fix, int(error.exit_code))

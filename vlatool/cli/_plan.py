@@ -1,0 +1,36 @@
+"""The plan of ``vlatool optimize --dry-run`` as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vlatool.pipeline import Plan
+    from vlatool.stage import Stage
+
+
+def plan_document(plan: Plan) -> dict[str, Any]:
+    """Return what ``plan.lines()`` says, as values that JSON can say."""
+    effort, loop = plan.recipe.effort, plan.closed_loop
+    told = {
+        "source": {"policy": str(plan.policy) if plan.policy else None, **_stage(plan.source)},
+        "export": _stages(plan.export),
+        "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
+        "search": plan.recipe.search,
+        "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
+        "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
+        "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),
+        "profile": plan.profile.name if plan.profile else None,
+        "computes": plan.board_set.plan() or None,
+        "cache": str(plan.cache),
+    }
+    return {"plan": told}
+
+
+def _stages(stages: Iterable[Stage]) -> list[dict[str, Any]]:
+    return [_stage(stage) for stage in stages]
+
+
+def _stage(stage: Stage) -> dict[str, Any]:
+    return {"stage": stage.name(), "options": stage.options()}

@@ -1,0 +1,175 @@
+"""JSON Schemas of what the commands print with ``--json``; ``docs/generate.py`` writes them to ``docs/reference``."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from vlatool import errors
+from vlatool.cli._failure import TYPES
+from vlatool.profile import Profile
+
+Schema = dict[str, Any]
+TEXT: Schema = {"type": "string"}
+NUMBER: Schema = {"type": ["number", "null"]}
+INTEGER: Schema = {"type": "integer"}
+FLAG: Schema = {"type": "boolean"}
+ANYTHING: Schema = {"type": "object"}
+ERROR: Schema = {"$ref": "#/$defs/error"}
+
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "optimize": ("report", "plan"),
+    "export": ("made",),
+    "quantize": ("made",),
+    "benchmark": ("report",),
+    "evaluate": ("report",),
+    "compare": ("report",),
+    "explain": ("report",),
+    "gate run": ("report",),
+    "gate init": ("written",),
+    "hwselect select": ("report",),
+    "hwselect score": ("score", "scores"),
+    "hwselect fit": ("written",),
+    "inspect": ("manifest",),
+    "rebuild": ("rebuilt",),
+    "doctor": ("checks",),
+    "simulate": ("simulation",),
+    "telemetry": ("telemetry",),
+    "profiles list": ("profiles",),
+    "profiles show": ("profile",),
+    "profiles diff": ("differences",),
+    "profiles validate": ("validated",),
+    "profiles new": ("written",),
+    "profiles calibrate": ("calibrated",),
+    "samples list": ("samples",),
+    "samples make": ("sample",),
+}
+"""Command, or group of commands -> what it prints when it ends well; the first is the usual one."""
+
+
+def a(told: str, /, **properties: Schema) -> Schema:
+    """Return the schema of an object with exactly these keys; an error may stand beside them."""
+    return {
+        "type": "object", "description": told, "properties": {**properties, "error": ERROR},
+        "required": list(properties), "additionalProperties": False,
+    }  # fmt: skip
+
+
+def many(items: Schema) -> Schema:
+    """Return the schema of a list."""
+    return {"type": "array", "items": items}
+
+
+def by_name(values: Schema) -> Schema:
+    """Return the schema of an object with names of any kind."""
+    return {"type": "object", "additionalProperties": values}
+
+
+def record(**properties: Schema) -> Schema:
+    """Return the schema of an object inside of another one, with exactly these keys."""
+    return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}
+
+
+STAGE = record(stage=TEXT, options=ANYTHING)
+SOURCE = record(policy={"type": ["string", "null"]}, stage=TEXT, options=ANYTHING)
+PLAN = record(
+    source=SOURCE, export=many(STAGE), candidates=by_name(many(STAGE)), search=FLAG,
+    benchmark=record(iterations=INTEGER, threads=INTEGER), evaluate=record(recorded=FLAG, episodes=INTEGER),
+    limits=ANYTHING, profile={"type": ["string", "null"]}, computes={"type": ["string", "null"]}, cache=TEXT,
+)  # fmt: skip
+PHASE = record(name=TEXT, runs=INTEGER, ms=NUMBER, shares=by_name(NUMBER), parts=by_name(NUMBER))
+SHIFT = record(recorded=TEXT, installed=TEXT)
+GAUGE = record(unit=TEXT, min=NUMBER, mean=NUMBER, max=NUMBER, times=many(NUMBER), values=many(NUMBER), note=TEXT)
+COUNTER = record(unit=TEXT, difference=NUMBER, seconds=NUMBER, note=TEXT)
+RAW = record(omitted={"type": "integer", "minimum": 1}, file={"type": ["string", "null"]}, fix=TEXT)
+
+
+def definitions(report: Schema) -> dict[str, Schema]:
+    """Return the schema of every document by name.
+
+    Args:
+        report: That of a report, with its own definitions in ``$defs``.
+    """
+    shown = {**report["properties"], "raw_samples": {**RAW, "description": "raw samples that were left out"}}
+    return {
+        **report["$defs"],
+        "error": _error(),
+        "failed": a("What a command prints that found nothing out.") | {"required": ["error"]},
+        "report": {
+            **{key: report[key] for key in ("type", "description", "required")},
+            "properties": {**shown, "error": ERROR},
+            "additionalProperties": False,
+        },
+        "profile": {**_inlined(Profile.model_json_schema(mode="serialization")), "description": "A hardware profile."},
+        **_documents(),
+    }
+
+
+def _documents() -> dict[str, Schema]:
+    """Return what is made for the command line alone."""
+    files = many(record(file=TEXT, bytes=INTEGER, identical=FLAG, why=TEXT))
+    status = {"enum": ["ok", "warn", "missing"]}
+    both = {"type": "array", "items": NUMBER}
+    return {
+        "plan": a("What optimize would do.", plan=PLAN),
+        "made": a(
+            "A bundle that was written; precision: graph -> dtype -> share of its multiply-accumulates.",
+            bundle=TEXT, hash=TEXT, bytes=INTEGER, precision=by_name(by_name(NUMBER)), findings=many(ANYTHING),
+        ),
+        "manifest": {
+            "type": "object", "description": "manifest.json of the bundle, byte by byte, when there is no error.",
+            "required": ["name", "version", "spec", "graphs", "files"], "properties": {"error": ERROR},
+        },
+        "rebuilt": a(
+            "A bundle that was made again.",
+            bundle=TEXT, source=TEXT, identical=FLAG, hash=record(recorded=TEXT, rebuilt=TEXT), left_out=many(TEXT),
+            versions=by_name(SHIFT), stages=many(record(stage=TEXT, graphs_identical=FLAG)), files=files,
+            output={"type": ["string", "null"]},
+        ),
+        "checks": many(record(name=TEXT, status=status, finding=TEXT, fix=TEXT)),
+        "simulation": a(
+            "Predicted, not measured; latency_ms: value, low, high.",
+            source=TEXT, profile=TEXT, mode=TEXT, engine=TEXT, precision=TEXT, origin={"const": "predicted"},
+            latency_ms=both, regime=TEXT, memory_mb=both, watts=both, joules=NUMBER, execute=INTEGER,
+            control_hz=NUMBER, phases=many(PHASE), timeline={"type": "array"}, changes={"type": "array"},
+        ),
+        "telemetry": a(
+            "What the machine told; a reading's times are seconds.",
+            seconds=NUMBER, energy=many(ANYTHING), throttled={"type": ["boolean", "null"]}, throttling=many(TEXT),
+            gauges=by_name(GAUGE), counters=by_name(COUNTER), unmeasured=many(record(reader=TEXT, reason=TEXT)),
+        ),
+        "score": {"type": "object", "description": "Error and coverage.", "properties": {"error": ERROR}},
+        "scores": by_name({"$ref": "#/$defs/score"}),
+        "profiles": many({"$ref": "#/$defs/profile"}),
+        "differences": many({"type": "object", "required": ["field"]}),
+        "validated": a("Profiles by name, and what is wrong with others.", valid=many(TEXT), wrong=many(TEXT)),
+        "calibrated": a("What the latency model was told.", kept_in=TEXT, measured=many(ANYTHING)),
+        "written": a("Files that were written.", written=many(TEXT)),
+        "samples": many(record(name=TEXT, description=TEXT)),
+        "sample": a("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),
+    }  # fmt: skip
+
+
+def _error() -> Schema:
+    classes = [name for name, kind in vars(errors).items() if inspect.isclass(kind)
+               and issubclass(kind, errors.VlatoolError)]  # fmt: skip
+    return {
+        "description": "Why a command did not end with 0; the same is said on standard error.",
+        **record(
+            type={"enum": [*classes, *TYPES]}, message=TEXT, fix={**TEXT, "description": "what to do; may be empty"},
+            exit_code={"type": "integer", "minimum": 1},
+        ),
+    }  # fmt: skip
+
+
+def _inlined(schema: Schema) -> Schema:
+    """Return a schema whose own definitions stand where they are used: a reference starts at the document's root."""
+    defs = schema.get("$defs", {})
+
+    def walk(value: Any) -> Any:
+        if isinstance(value, dict):
+            named = str(value.get("$ref", "")).removeprefix("#/$defs/")
+            return walk(defs[named]) if named else {key: walk(each) for key, each in value.items() if key != "$defs"}
+        return [walk(each) for each in value] if isinstance(value, list) else value
+
+    return dict(walk(schema))
