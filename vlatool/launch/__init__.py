@@ -9,6 +9,7 @@ from pathlib import Path
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError
 from vlatool.host import cache_directory as cache_directory
+from vlatool.kept_files import tag
 from vlatool.launch._inside import measured_with as measured_with
 from vlatool.launch._inside import run_apart
 from vlatool.outputs import BUNDLE, refuse_replacing
@@ -64,6 +65,7 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
             return Bundle.open(path)
         except BundleError:
             context.tell(f"the cached {stage.name()} is damaged; making it again", None)
+    tag(cache)
     return run_transform(stage, source, path, context, damaged=True)
 
 
@@ -76,6 +78,7 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
         except DataError:
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
     report = replace(stage.run(source, context), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    tag(cache)
     with writing(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
     return report
