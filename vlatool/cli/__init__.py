@@ -15,6 +15,7 @@ import typer
 from vlatool import __version__, trust
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._stages import StageGroup
+from vlatool.cli.cache import app as cache
 from vlatool.cli.compare import compare
 from vlatool.cli.doctor import doctor
 from vlatool.cli.explain import explain
@@ -89,6 +90,7 @@ app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
 app.command("simulate")(simulate)
 app.command("telemetry")(telemetry)
+app.add_typer(cache, name="cache")
 app.add_typer(gate, name="gate")
 app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")
