@@ -60,3 +60,10 @@ def test_the_environment_guide_runs_as_it_stands(tmp_path: Path, monkeypatch, vl
     *_, (line, out) = follow(vlatool, "environment.md", shown=("yaml",))
     assert "closed-loop" in line
     assert re.search(r"100\.0% of 10 episodes succeed", out), out
+
+
+def test_the_guide_to_verify_runs_as_it_stands(tmp_path: Path, monkeypatch, vlatool):
+    monkeypatch.chdir(tmp_path)
+    ((line, out),) = follow(vlatool, "verify.md")
+    assert line.startswith("vlatool verify")
+    assert "reach gives what original.py:act gives" in out

@@ -28,6 +28,7 @@ from vlatool.cli.rebuild import rebuild
 from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
 from vlatool.cli.telemetry import telemetry
+from vlatool.cli.verify import verify
 from vlatool.errors import VlatoolError
 from vlatool.printable import printable
 
@@ -90,6 +91,7 @@ app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
 app.command("simulate")(simulate)
 app.command("telemetry")(telemetry)
+app.command("verify")(verify)
 app.add_typer(cache, name="cache")
 app.add_typer(gate, name="gate")
 app.add_typer(hwselect, name="hwselect")
