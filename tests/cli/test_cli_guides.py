@@ -67,3 +67,10 @@ def test_the_guide_to_verify_runs_as_it_stands(tmp_path: Path, monkeypatch, vlat
     ((line, out),) = follow(vlatool, "verify.md")
     assert line.startswith("vlatool verify")
     assert "reach gives what original.py:act gives" in out
+
+
+def test_the_guide_to_the_runtime_runs_as_it_stands(tmp_path: Path, monkeypatch, vlatool):
+    monkeypatch.chdir(tmp_path)
+    ((line, out),) = follow(vlatool, "runtime.md")
+    assert line == "vlatool export arm -o out/arm"
+    assert "arm 1.0.0" in out
