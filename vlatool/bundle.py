@@ -16,7 +16,7 @@ from vlatool.json_files import read_json
 from vlatool.limits import check, limit
 from vlatool.manifest import FileRecord, Manifest, check_files
 from vlatool.sealed_files import FIX, LITTER, held, open_inside, read_all, read_sealed, unlisted, verify_sealed
-from vlatool.written import LEDGER
+from vlatool.written import LEDGER, hash_once
 
 MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
@@ -184,7 +184,9 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
         if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
-            files[name] = FileRecord(hash_file(path), path.stat().st_size)
+            found = path.stat()
+            linked = found.st_nlink > 1  # shared among stages of the cache, and read-only
+            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), found.st_size)
     sealed = replace(manifest, files=files)
     write_manifest(directory, sealed)
     return Bundle(directory, sealed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle import Bundle, restate, seal
+from vlatool.kept_files import carry
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.runtime.engines._arithmetic import SATURATING, is_int8, machine, told
 from vlatool.runtime.engines._reference import ReferenceSession
@@ -44,13 +44,15 @@ DECIDED = ("accuracy", "engine")
 
 
 def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
-    """Copy the folders that a derived bundle keeps."""
+    """Copy the folders that a derived bundle keeps; large files are shared among the stages of a cache."""
+    known = source.manifest.files
     for folder in folders:
         for file in sorted((source.path / folder).rglob("*")):
             if file.is_file():
                 target = out / file.relative_to(source.path)
+                name = file.relative_to(source.path).as_posix()
                 target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, target)
+                carry(file, target, known[name].sha256 if name in known else "")
 
 
 def finish(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import DataError, VlatoolError
 from vlatool.limits import MIB, check
+from vlatool.npz_rows import OpenFile, Packed, Plain, Rows
 
 Array = NDArray[Any]
 DIRECTORY_BYTES = MIB
@@ -30,6 +31,7 @@ HEADER = re.compile(
     r"\s*'shape':\s*\((?P<shape>(?:\d{1,18},?\s*){0,64})\),?\s*\}\s*"
 )
 BLOCK = MIB
+IN_MEMORY = 16 * MIB
 FOREIGN = (
     OSError, ValueError, TypeError, KeyError, EOFError, NotImplementedError, RuntimeError, MemoryError,
     OverflowError, struct.error, zlib.error, zipfile.BadZipFile, zipfile.LargeZipFile,
@@ -64,29 +66,67 @@ def open_npz(
         [0, 1, 2]
     """
     where = where or ("the archive" if isinstance(source, bytes) else str(Path(source)))
+    with _foreign_errors(where, error), _archive(source) as archive:
+        members = _members(archive, allowed, where, error)
+        return {name: _array(archive, member, name) for name, member in members.items()}
+
+
+def open_rows(
+    path: str | os.PathLike[str],
+    allowed: str = "recording_bytes",
+    in_memory: int = IN_MEMORY,
+    free: float | None = None,
+) -> dict[str, Array | Rows]:
+    """Return the arrays of an ``.npz`` file by name, large ones as ``Rows``, which stay on the disk.
+
+    The whole file is read once, in blocks: a damaged one is refused here and not later.
+
+    Args:
+        path: The file.
+        allowed: Name of the limit on the bytes of all arrays together.
+        in_memory: Bytes of the largest array of numbers that is held in memory. Text, and arrays in Fortran's order, in
+            which a row is scattered, are held in memory whatever their size.
+        free: Bytes of memory that those may take together; None where it is not known.
+
+    Raises:
+        DataError: as ``open_npz`` does, and when the memory does not suffice.
+    """
+    where = str(Path(path))
+    with _foreign_errors(where, DataError), _archive(path) as archive:
+        file = OpenFile.at(path, where)
+        members = _members(archive, allowed, where, DataError)
+        stay = {name: _stays(archive, member, name, in_memory) for name, member in members.items()}
+        _refuse_beyond(where, sum(member.file_size for name, member in members.items() if not stay[name]), free)
+        return {
+            name: _rows(archive, member, name, file) if stay[name] else _array(archive, member, name)
+            for name, member in members.items()
+        }
+
+
+def _refuse_beyond(where: str, needed: int, free: float | None) -> None:
+    if free is not None and needed > free:
+        raise DataError(
+            f"{where} takes {needed / 1e6:,.0f} MB of memory, unpacked; {free / 1e6:,.0f} MB are free.",
+            "record fewer samples, or use a machine with more memory",
+        )
+
+
+@contextlib.contextmanager
+def _archive(source: bytes | str | os.PathLike[str]) -> Iterator[zipfile.ZipFile]:
+    with _stream(source) as stream, zipfile.ZipFile(_with_small_directory(stream)) as archive:
+        yield archive
+
+
+@contextlib.contextmanager
+def _foreign_errors(where: str, error: type[VlatoolError]) -> Iterator[None]:
+    """Map what zipfile, zlib and numpy raise into one sentence for the person."""
     try:
-        with _stream(source) as stream, zipfile.ZipFile(_with_small_directory(stream)) as archive:
-            members = _members(archive, allowed, where, error)
-            return {name: _array(archive, member, name) for name, member in members.items()}
+        yield
     except VlatoolError:
         raise
     except FOREIGN as foreign:
         told = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
         raise error(f"{where} cannot be read: {told}.", "write it again with np.savez") from foreign
-
-
-def declared_bytes(path: str | os.PathLike[str]) -> int:
-    """Return what the arrays of an ``.npz`` file would take in memory, as its table of contents says.
-
-    Raises:
-        DataError: when the file cannot be read or is no archive of arrays.
-    """
-    try:
-        with _stream(path) as stream, zipfile.ZipFile(_with_small_directory(stream)) as archive:
-            return sum(entry.file_size for entry in archive.infolist())
-    except FOREIGN as foreign:
-        told = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
-        raise DataError(f"{path} cannot be read: {told}.", "write it again with np.savez") from foreign
 
 
 def _told(error: BaseException) -> str:
@@ -155,17 +195,53 @@ def _members(
 
 def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Array:
     with archive.open(entry) as stream:
-        shape, fortran, dtype = _header(stream)
-        if dtype.hasobject:
-            raise ValueError("it holds pickled objects, which are refused")
-        if dtype.kind not in "biufcSU" or not dtype.itemsize:
-            raise ValueError(f"'{name}' has the dtype {dtype}, which is none of numbers or text")
-        start = stream.tell()
-        if start + math.prod(shape) * dtype.itemsize != entry.file_size:
-            raise ValueError(f"'{name}' declares the shape {str(shape)[:80]}, but has {entry.file_size - start} bytes")
+        shape, fortran, dtype, _ = _checked_header(stream, entry, name)
         array = np.empty(math.prod(shape), dtype)
         _fill(stream, array, name)
     return _sound(array, name).reshape(shape, order="F" if fortran else "C")
+
+
+def _stays(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, in_memory: int) -> bool:
+    """Say whether an array stays on the disk: it is large, and its rows lie one after the other."""
+    with archive.open(entry) as stream:
+        shape, fortran, dtype, _ = _checked_header(stream, entry, name)
+    return bool(shape and shape[0]) and not fortran and dtype.kind not in "SU" and entry.file_size > in_memory
+
+
+def _rows(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str, file: OpenFile) -> Rows:
+    """Return the rows of an array once all of its bytes were read and found sound."""
+    with archive.open(entry) as stream:
+        shape, _, dtype, start = _checked_header(stream, entry, name)
+        while block := stream.read(BLOCK):  # the end compares the checksum
+            if dtype.kind == "b":
+                _sound(np.frombuffer(block, np.bool_), name)
+    where, size = f"'{name}' in {file.where}", entry.file_size - start
+    if entry.compress_type == zipfile.ZIP_STORED:
+        return Rows(Plain(file, _data_start(file, entry) + start), shape, dtype, where)
+    return Rows(Packed(file, entry.filename, start, size), shape, dtype, where)
+
+
+def _data_start(file: OpenFile, entry: zipfile.ZipInfo) -> int:
+    """Return where an entry's data begin: after its local header, with a name and a field of sizes of their own."""
+    header = bytearray(30)
+    file.read_into(memoryview(header), entry.header_offset)
+    name, extra = struct.unpack_from("<HH", header, 26)
+    return entry.header_offset + len(header) + int(name) + int(extra)
+
+
+def _checked_header(
+    stream: IO[bytes], entry: zipfile.ZipInfo, name: str
+) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Return shape, whether it is in Fortran's order, dtype and bytes of the header of an array of numbers or text."""
+    shape, fortran, dtype = _header(stream)
+    if dtype.hasobject:
+        raise ValueError("it holds pickled objects, which are refused")
+    if dtype.kind not in "biufcSU" or not dtype.itemsize:
+        raise ValueError(f"'{name}' has the dtype {dtype}, which is none of numbers or text")
+    start = stream.tell()
+    if start + math.prod(shape) * dtype.itemsize != entry.file_size:
+        raise ValueError(f"'{name}' declares the shape {str(shape)[:80]}, but has {entry.file_size - start} bytes")
+    return shape, fortran, dtype, start
 
 
 def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

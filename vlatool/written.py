@@ -185,6 +185,11 @@ def hash_once(path: Path) -> str:
         return _HASHES[seen]
 
 
+def note_seen(path: Path, sha256: str) -> None:
+    """Note the hash of a file that was just hashed and then renamed or linked, which changes the times of its inode."""
+    _HASHES[_seen(os.lstat(path))] = sha256
+
+
 def _seen(status: os.stat_result) -> Seen:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 

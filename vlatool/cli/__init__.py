@@ -17,6 +17,7 @@ from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
 from vlatool.cli._stages import StageGroup
+from vlatool.cli.cache import app as cache
 from vlatool.cli.compare import compare
 from vlatool.cli.doctor import doctor
 from vlatool.cli.explain import explain
@@ -29,6 +30,7 @@ from vlatool.cli.rebuild import rebuild
 from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
 from vlatool.cli.telemetry import telemetry
+from vlatool.cli.verify import verify
 from vlatool.printable import printable
 
 app = typer.Typer(
@@ -85,6 +87,8 @@ app.command("rebuild")(rebuild)
 app.command("doctor")(doctor)
 app.command("simulate")(simulate)
 app.command("telemetry")(telemetry)
+app.command("verify")(verify)
+app.add_typer(cache, name="cache")
 app.add_typer(gate, name="gate")
 app.add_typer(hwselect, name="hwselect")
 app.add_typer(profiles, name="profiles")

@@ -41,12 +41,13 @@ def doubts(recording: Recording, numbers: Sequence[int], spec: PolicySpec, asset
             "record different moments, or the ranges fit one of them alone"
         )
     for tensor in spec.inputs:
-        values = recording.inputs[tensor.name][list(numbers)]
         where = f"'{tensor.name}' in {recording.path}"
+        if tensor.dtype == "uint8":
+            found += _of_pixels(where, recording, tensor.name, numbers)
+            continue
+        values = recording.inputs[tensor.name][list(numbers)]
         if tensor.kind == "text":
             found += _of_text(where, values, numbers)
-        elif tensor.dtype == "uint8":
-            found += _of_pixels(where, values)
         elif values.dtype.kind in "iuf" and np.dtype(tensor.dtype).kind == "f":
             found += [] if same else _of_channels(where, tensor, values)
             found += _of_distance(where, tensor, values, numbers, assets)
@@ -71,7 +72,9 @@ def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
 
 
 def _identical(recording: Recording, numbers: Sequence[int]) -> bool:
-    return all(bool((values[list(numbers)] == values[numbers[0]]).all()) for values in recording.inputs.values())
+    return all(
+        bool((values[number] == values[numbers[0]]).all()) for values in recording.inputs.values() for number in numbers
+    )
 
 
 def _of_text(where: str, values: Array, numbers: Sequence[int]) -> Iterator[str]:
@@ -83,8 +86,9 @@ def _of_text(where: str, values: Array, numbers: Sequence[int]) -> Iterator[str]
         )
 
 
-def _of_pixels(where: str, values: Array) -> Iterator[str]:
-    highest = int(values.max(initial=0))
+def _of_pixels(where: str, recording: Recording, name: str, numbers: Sequence[int]) -> Iterator[str]:
+    values = recording.inputs[name]
+    highest = max(int(values[number].max(initial=0)) for number in numbers)
     if values.ndim > 2 and highest <= 1:
         told = "looks normalised: no pixel is above 1" if highest else "is black in every calibration sample"
         yield f"{where} {told}; the policy takes raw pixel values from 0 to 255"

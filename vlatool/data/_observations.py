@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -26,19 +27,49 @@ def calibration_recording(source: Bundle, path: Path | None = None) -> Recording
     return None if chosen is None else read_recording(chosen, source.manifest.spec)
 
 
-def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
+class Observations(Sequence[dict[str, Any]]):
+    """Samples of a recording, each read when it is asked for.
+
+    Args:
+        recording: Where they are.
+        numbers: Which ones.
+    """
+
+    def __init__(self, recording: Recording, numbers: Sequence[int]) -> None:
+        self._recording = recording
+        self._numbers = numbers
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, at: int) -> dict[str, Any]: ...
+
+    @overload
+    def __getitem__(self, at: slice) -> Observations: ...
+
+    def __getitem__(self, at: int | slice) -> dict[str, Any] | Observations:
+        """Return one observation, or those of a slice, which are read later."""
+        if isinstance(at, slice):
+            return Observations(self._recording, self._numbers[at])
+        return self._recording.observation(self._numbers[at])
+
+
+def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> Sequence[dict[str, Any]]:
     """Return up to ``count`` recorded observations, spread over the recording; none when the bundle carries none.
+
+    They stay on the disk until they are asked for.
 
     Args:
         path: A recording to read in the place of the bundle's own.
     """
     recording = calibration_recording(source, path)
-    return [] if recording is None else [recording.observation(index) for index in recording.spread(count)]
+    return [] if recording is None else Observations(recording, recording.spread(count))
 
 
 def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
-    """Return recorded observations, or synthetic ones when the bundle carries none."""
-    found = recorded_observations(source, count, path)
+    """Return recorded observations, in memory, or synthetic ones when the bundle carries none."""
+    found = list(recorded_observations(source, count, path))
     return found or synthetic_observations(source.manifest.spec, count)
 
 

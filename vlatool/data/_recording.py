@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from vlatool import registry
 from vlatool.errors import DataError, nearest
+from vlatool.npz_rows import Rows, blocks
 from vlatool.spec import PolicySpec, TensorSpec
 
 Array = NDArray[Any]
+Values = Array | Rows
+"""An input of all samples: in memory, or on the disk, where it is large."""
 EXPERT = ("action", "episode")
 """Arrays that a recording may hold beside the inputs."""
 
@@ -26,7 +29,8 @@ class Recording:
 
     Args:
         path: Where it was read from.
-        inputs: Input name -> array with a leading sample axis, physical values, text as a unicode array.
+        inputs: Input name -> array with a leading sample axis, physical values, text as a unicode array. Large ones
+            are rows that stay on the disk.
         actions: (N, T, A) in physical units, or (N, T) indices for discrete actions; T is the policy's chunk, or fewer
             of its leading steps; None when not recorded.
         episodes: (N,) int64 episode of each sample; None when not recorded.
@@ -35,7 +39,7 @@ class Recording:
     """
 
     path: Path
-    inputs: Mapping[str, Array]
+    inputs: Mapping[str, Values]
     actions: Array | None
     episodes: Array | None
     ignored: tuple[str, ...] = ()
@@ -89,7 +93,7 @@ def read_recording(path: Path, spec: PolicySpec) -> Recording:
     return checked(path, reader.read(path), spec)
 
 
-def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Recording:
+def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recording:
     """Build a recording from arrays and check every one against the spec.
 
     Raises:
@@ -100,7 +104,7 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
         if tensor.name not in arrays:
             raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.")
         inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name], spec)
-    actions, episodes = arrays.get(spec.action.name, arrays.get("action")), arrays.get("episode")
+    actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
     lengths = {name: len(values) for name, values in inputs.items()}
     for name, recorded in (("action", actions), ("episode", episodes)):
         if recorded is not None:
@@ -117,39 +121,47 @@ def checked(path: Path, arrays: Mapping[str, Array], spec: PolicySpec) -> Record
     return Recording(path, inputs, action, episodes, ignored, spec.chunk)
 
 
-def _length(path: Path, name: str, values: Array) -> int:
+def _in_memory(arrays: Mapping[str, Values], *names: str) -> Array | None:
+    """Return the first of the arrays that there is, all of it: actions and episodes are held against each other."""
+    found = next((arrays[name] for name in names if name in arrays), None)
+    return found.read(0, len(found)) if isinstance(found, Rows) else found
+
+
+def _length(path: Path, name: str, values: Values) -> int:
     if not values.ndim:
         raise DataError(f"'{name}' in {path} is a single value; wanted one row a sample.")
     return len(values)
 
 
-def _checked_input(path: Path, tensor: TensorSpec, values: Array, spec: PolicySpec) -> Array:
+def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicySpec) -> Values:
     where = f"'{tensor.name}' in {path}"
     if tensor.kind == "text":
-        if values.dtype.kind != "U":
+        if isinstance(values, Rows) or values.dtype.kind != "U":
             raise DataError(f"{where} is {values.dtype}; a text input needs unicode strings.")
         if values.size != _length(path, tensor.name, values):
             raise DataError(f"{where} has the shape {list(values.shape)}; a text input has one string a sample.")
         return values.reshape(-1)
     if values.ndim == len(tensor.shape) + 1 and values.shape[1] == 1:
-        values = values[:, 0]
+        values = values.without_second_axis() if isinstance(values, Rows) else values[:, 0]
     if not _fits(tensor, values):
         others = [other.name for other in spec.inputs if other.kind != "text" and _fits(other, values)]
         raise DataError(
             f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, tensor.shape[1:]))}].",
             f"it would fit '{others[0]}'; are the names swapped?" if others else "",
         )
-    return _finite(where, _typed(where, tensor, values))
+    _check_type(where, tensor, values)
+    _check_finite(where, values)
+    return values
 
 
-def _fits(tensor: TensorSpec, values: Array) -> bool:
+def _fits(tensor: TensorSpec, values: Values) -> bool:
     wanted = tensor.shape[1:]
     return values.ndim == len(wanted) + 1 and all(
         isinstance(want, str) or want == got for want, got in zip(wanted, values.shape[1:], strict=True)
     )
 
 
-def _typed(where: str, tensor: TensorSpec, values: Array) -> Array:
+def _check_type(where: str, tensor: TensorSpec, values: Values) -> None:
     """Refuse a type that the runtime would refuse, and numbers that the policy's type cannot hold."""
     wanted, got = np.dtype(tensor.dtype), values.dtype
     numbers = got == wanted or (got.kind in "iu" and wanted.kind in "iu" and np.can_cast(got, wanted))
@@ -159,15 +171,20 @@ def _typed(where: str, tensor: TensorSpec, values: Array) -> Array:
         hint = "store raw pixel values from 0 to 255" if tensor.dtype == "uint8" else f"store it as {tensor.dtype}"
         raise DataError(f"{where} is {values.dtype}; the policy takes {tensor.dtype}.", hint)
     if wanted.kind == "f" and values.dtype.kind == "f" and values.dtype.itemsize > wanted.itemsize:
-        limit = float(np.finfo(wanted).max)
-        beyond = np.isfinite(values) & (np.abs(values) > limit)
+        _check_size(where, tensor, values)
+
+
+def _check_size(where: str, tensor: TensorSpec, values: Values) -> None:
+    """Refuse numbers beyond what the policy's type can hold."""
+    limit = float(np.finfo(np.dtype(tensor.dtype)).max)
+    for start, block in blocks(values):
+        beyond = np.isfinite(block) & (np.abs(block) > limit)
         if beyond.any():
-            first = int(np.flatnonzero(beyond.reshape(len(values), -1).any(axis=1))[0])
+            first = start + int(np.flatnonzero(beyond.reshape(len(block), -1).any(axis=1))[0])
             raise DataError(
-                f"{where} exceeds {tensor.dtype} in sample {first}: {float(values[beyond][0]):g}; allowed: {limit:g}.",
+                f"{where} exceeds {tensor.dtype} in sample {first}: {float(block[beyond][0]):g}; allowed: {limit:g}.",
                 "repair the recording",
             )
-    return values
 
 
 def _checked_action(path: Path, spec: PolicySpec, values: Array) -> Array:
@@ -195,7 +212,8 @@ def _numbers(where: str, values: Array, spec: PolicySpec) -> Array:
             f"{where} has {last} elements; the policy gives {width}.",
             f"store [N, {spec.chunk}, {width}], or [N, {width}] for the first action alone; got {got}",
         )
-    return _finite(where, values.reshape(len(values), math.prod(got[1:-1]), width))
+    _check_finite(where, values)
+    return values.reshape(len(values), math.prod(got[1:-1]), width)
 
 
 def _indices(where: str, values: Array, labels: int) -> Array:
@@ -212,12 +230,16 @@ def _indices(where: str, values: Array, labels: int) -> Array:
     return values
 
 
-def _finite(where: str, values: Array) -> Array:
-    if values.dtype.kind == "f" and not np.isfinite(values).all():
-        bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-        first = int(np.flatnonzero(bad)[0])
+def _check_finite(where: str, values: Values) -> None:
+    if values.dtype.kind != "f":
+        return
+    bad: list[int] = []
+    for start, block in blocks(values):
+        if not np.isfinite(block).all():
+            wrong = ~np.isfinite(block.reshape(len(block), -1)).all(axis=1)
+            bad += (start + np.flatnonzero(wrong)).tolist()
+    if bad:
         raise DataError(
-            f"{where} is not finite in {int(bad.sum())} of {len(values)} samples; the first is sample {first}.",
+            f"{where} is not finite in {len(bad)} of {len(values)} samples; the first is sample {bad[0]}.",
             "remove those samples, or repair the recording",
         )
-    return values

@@ -7,10 +7,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from vlatool.errors import DataError
 from vlatool.host import memory
-from vlatool.limits import check
-from vlatool.npz_files import declared_bytes, open_npz
+from vlatool.npz_files import open_rows
+from vlatool.npz_rows import Rows
 
 LIMIT = "recording_bytes"
 
@@ -19,22 +18,15 @@ class NpzReader:
     """Reads ``.npz``: input name -> (N, ...), ``action`` (or the output's name) and ``episode`` where recorded."""
 
     @staticmethod
-    def read(path: Path) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a file by name.
+    def read(path: Path) -> dict[str, NDArray[Any] | Rows]:
+        """Return the arrays of a file by name, large ones as rows that stay on the disk.
 
         Raises:
             DataError: when the file is corrupt, is a single array, holds Python objects, or would not fit into the
-                limit or the memory; before anything is unpacked.
+                limit, or what is no array of rows into the memory; before anything is unpacked.
         """
-        needed = declared_bytes(path)
-        check(LIMIT, needed, f"{path}, unpacked,", DataError)
         free = _free_mb()
-        if free is not None and needed > free * 1e6:
-            raise DataError(
-                f"{path} takes {needed / 1e6:,.0f} MB of memory, unpacked; {free:,.0f} MB are free.",
-                "record fewer samples, or use a machine with more memory",
-            )
-        return open_npz(path, LIMIT)
+        return open_rows(path, LIMIT, free=None if free is None else free * 1e6)
 
 
 def _free_mb() -> float | None:

@@ -16,6 +16,7 @@ from vlatool.apart import spread
 from vlatool.bundle import Bundle
 from vlatool.errors import DataError, VlatoolError
 from vlatool.evaluate._controls import Array, Blind, answers_of
+from vlatool.evaluate._environment import GUIDE, World
 from vlatool.evaluate._success import Success
 from vlatool.printable import message_of
 from vlatool.runtime.chunks import ChunkQueue
@@ -119,8 +120,8 @@ class Worker:
 
     def play(self, job: Job, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
-        environment = self.environment(job)
-        return [_episode(environment, self._actor(job.control, seed), job.task, seed, limit) for seed in job.seeds]
+        world = World(self.environment(job), job.task, self.queue.policy.spec)
+        return [_episode(world, self._actor(job.control, seed), job.task, seed, limit) for seed in job.seeds]
 
     def _actor(self, control: str, seed: int) -> ChunkQueue | Blind:
         """Return who acts: the policy, or a control that does not look."""
@@ -158,19 +159,17 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
     _worker = None
 
 
-def _episode(environment: Any, queue: ChunkQueue | Blind, task: str, seed: int, limit: int) -> Outcome:
+def _episode(world: World, queue: ChunkQueue | Blind, task: str, seed: int, limit: int) -> Outcome:
     try:
         with exits_told(f"the environment of task '{task}', at seed {seed},"):
-            observation, _ = environment.reset(seed=seed)
+            observation = world.reset(seed)
             queue.reset()
             told = Success()
             for step in range(1, limit):
-                action = queue.act(observation)
-                observation, _, terminated, truncated, info = environment.step(
-                    action.item() if action.ndim == 0 else action
-                )
+                action = _acted(queue, observation, f"task '{task}' at seed {seed}, step {step},")
+                observation, over, info = world.step(action.item() if action.ndim == 0 else action)
                 told.look(info)
-                if terminated or truncated:
+                if over:
                     return Outcome(task, seed, told.at_the_end(task, seed), step)
     except VlatoolError:
         raise
@@ -179,3 +178,12 @@ def _episode(environment: Any, queue: ChunkQueue | Blind, task: str, seed: int, 
             f"The environment of task '{task}' failed at seed {seed}: {type(error).__name__}: {message_of(error)}."
         ) from error
     raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.")
+
+
+def _acted(queue: ChunkQueue | Blind, observation: Mapping[str, Any], where: str) -> Array:
+    """Return the action; an observation that the policy does not take is the environment's."""
+    try:
+        return queue.act(observation)
+    except DataError as error:
+        raise DataError(f"The environment, in {where} gives what the policy does not take: {error.message}",
+                        error.fix or f"let it give what the policy was trained on; {GUIDE}") from error  # fmt: skip

@@ -14,7 +14,7 @@ KEYS = ("success", "is_success")
 """Where success may stand in the info of a step; the first that is there counts."""
 FIX = (
     "let every episode tell it, also when it fails: info['success'] (or info['is_success']) is True or False in the "
-    "last step, or in an earlier one"
+    "last step, or in an earlier one; a reward alone does not say it (docs/guides/environment.md)"
 )
 
 

@@ -125,14 +125,14 @@ def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, 
         DataError: when the given data does not fit the policy.
     """
     if data is not None:
-        return Observations(recorded_observations(bundle, count, data), data.name)
+        return Observations(list(recorded_observations(bundle, count, data)), data.name)
     sources = [each for each in (bundle, baseline) if each is not None]
     for source in sources:
         if EVALUATION in source.manifest.files:
-            found = recorded_observations(source, count, source.path / EVALUATION)
+            found = list(recorded_observations(source, count, source.path / EVALUATION))
             return Observations(found, "recorded observations that calibration has not seen")
     for source in sources:
-        if found := recorded_observations(source, count):
+        if found := list(recorded_observations(source, count)):
             return Observations(found, "the calibration's own observations")
     made = synthetic_observations(bundle.manifest.spec, count)
     return Observations(made, "synthetic observations", recorded=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -9,6 +11,8 @@ from pathlib import Path
 from vlatool.bundle import Bundle
 from vlatool.errors import BundleError, DataError
 from vlatool.host import cache_directory as cache_directory
+from vlatool.in_use import hold
+from vlatool.kept_files import tag
 from vlatool.launch._inside import measured_with as measured_with
 from vlatool.launch._inside import run_apart
 from vlatool.outputs import BUNDLE, refuse_replacing
@@ -59,12 +63,15 @@ def is_cached(stage: Stage, source_hash: str, cache: Path) -> bool:
 def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
     """Return the stage's bundle from the cache, or run the stage into the cache."""
     path = cached_path(stage, source.hash if source else "", cache)
-    if path.is_dir():
+    if hold(path):
         try:
             return Bundle.open(path)
         except BundleError:
             context.tell(f"the cached {stage.name()} is damaged; making it again", None)
-    return run_transform(stage, source, path, context, damaged=True)
+    tag(cache)
+    made = run_transform(stage, source, path, context, damaged=True)
+    hold(path)
+    return made
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
@@ -72,10 +79,14 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
     path = cached_path(stage, source.hash, cache)
     if path.is_dir() and not fresh:
         try:
-            return read_report(path)
+            report = read_report(path)
+            with contextlib.suppress(OSError):  # a cache that may only be read
+                os.utime(path)
+            return report
         except DataError:
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
     report = replace(stage.run(source, context), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    tag(cache)
     with writing(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
     return report

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle import Bundle
-from vlatool.data import observations_for
+from vlatool.data import observations_for, recorded_observations
 from vlatool.quantize._beyond import find_beyond
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._graphs import Quantization, load, save
@@ -44,7 +44,8 @@ class Float16(Quantization):
             candidates += [node.name for node in model.graph.node]
         selected = self.selected(candidates, bundle)
         samples = SampleSet()
-        seen = samples.watch(observations_for(bundle, self.samples, self.calibration))
+        recorded = recorded_observations(bundle, self.samples, self.calibration)
+        seen = samples.watch(recorded or observations_for(bundle, self.samples, self.calibration))
         beyond = find_beyond(bundle, chosen, seen, LARGEST, context)
         told: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": []}
         for graph, values in beyond.items():

@@ -152,6 +152,10 @@ class Policy:
         outputs = self._outputs(values)
         return outputs, self._decode(outputs[self._action])
 
+    def decode(self, raw: Array) -> Array:
+        """Return the chunk of an action as the graph gave it: (T, A) in the units of the spec, or (T,) indices."""
+        return self._decode(raw)[0]
+
     def _check_overlap(self) -> None:
         """Refuse a call during an inference where taking turns would not make it right."""
         fix = "open one policy for each thread"

@@ -12,6 +12,7 @@ from pydantic import Field
 from vlatool import trust
 from vlatool.bundle import Bundle, hash_file, seal
 from vlatool.errors import MissingExtra, SourceError, SpecError
+from vlatool.kept_files import carry
 from vlatool.manifest import Manifest
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
@@ -131,7 +132,7 @@ def copy_assets(described: Description, out: Path) -> None:
     for key, path in (("calibration", described.calibration), ("evaluation", described.evaluation)):
         if path is not None:
             (out / "data").mkdir(exist_ok=True)
-            shutil.copyfile(path, out / "data" / f"{key}.npz")
+            carry(path, out / "data" / f"{key}.npz")
 
 
 def check_assets(described: Description, copies: Path) -> None:

@@ -1,0 +1,111 @@
+"""What breaks gymnasium's contract, each told in a sentence with its remedy; and what may be left out of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vlatool.errors import DataError
+from vlatool.evaluate._environment import World
+from vlatool.evaluate._episodes import Job, run_jobs
+from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.stage import Context
+
+GOOD = """\
+import numpy as np
+
+def observation():
+    return {"image": np.zeros((8, 8, 3), np.uint8), "proprio": np.zeros(3), "instruction": "go", "more": object()}
+
+class World:
+    def reset(self, *, seed=None, options=None):
+        return observation(), {}
+
+    def step(self, action):
+        return observation(), 1.0, True, False, {"success": True}
+
+def make(task):
+    return World()
+"""
+ONE = PolicySpec((TensorSpec("state", (1, 4)),), (TensorSpec("move", (1, 1, 2)),), 10.0, 1)
+
+
+def played(folder, bundle, old: str = "", new: str = ""):
+    """Play an episode in the good world, of which a part is another; the worlds are in files of their own."""
+    assert old in GOOD
+    (folder / "world.py").write_text(GOOD.replace(old, new) if old else GOOD)
+    return run_jobs(bundle, [Job("world.py:make", str(folder), "reach", (7,))], "", Context())
+
+
+def test_a_good_world_is_played(tmp_path, float_bundle):
+    (outcome,) = played(tmp_path, float_bundle)
+    assert (outcome.success, outcome.steps) == (True, 1)
+
+
+STEP = 'return observation(), 1.0, True, False, {"success": True}'
+RESET = "return observation(), {}"
+BROKEN = {
+    "no environment": ("return World()", "return 5", "gives an int, which has no reset and no step", "gymnasium"),
+    "no seed": ("*, seed=None, options=None", "", "takes no 'seed'", "seed=None"),
+    "old reset": (RESET, "return observation()", "gives a dict; it must give (observation, info)", "gym's"),
+    "old step": (STEP, "return observation(), 1.0, True, {}", "gives 4 values; it must give five", "done, False, info"),
+    "step gives nothing": (STEP, "pass", "gives a NoneType; it must give five values", "done, False"),
+    "reward only": (STEP, "return observation(), 1.0, True, False, {}", "never told whether", "a reward alone"),
+    "success is a word": (STEP, STEP.replace("{\"success\": True}", "{'success': 'yes'}"), "'yes'", "True or False"),
+    "a box": (RESET, "return np.zeros(4), {}", "float64 with the shape [4], without names; the policy takes image, "
+              "proprio, instruction", "environment.md"),
+    "a box later": (STEP, "return np.zeros(4), 1.0, False, False, {}", "without names", "wrap it"),
+    "no proprio": ('"proprio": np.zeros(3), ', "", "no 'proprio' (it has: image, instruction, more)", "trained on"),
+    "another shape": ("np.zeros(3)", "np.zeros(5)", "The input 'proprio' has the shape [1, 5]", "trained on"),
+    "another dtype": ("np.uint8", "np.float32", "The input 'image' is float32", "uint8"),
+    "nan": ("np.zeros(3)", "np.full(3, np.nan)", "'proprio' holds 3 NaN of 3 values", "sensor"),
+    "no text": ('"go"', "3", "'instruction' is text; got int", "pass a str"),
+    "many at once": (STEP, "return observation(), 1.0, np.zeros(2), np.zeros(2), {}", "2 episodes at once", "single"),
+    "raises": (STEP, "return [][1]", "failed at seed 7: IndexError: list index out of range", ""),
+    "raises in reset": (RESET, "raise RuntimeError('no display')", "failed at seed 7: RuntimeError: no display", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_breach_of_the_contract_is_told_with_its_remedy(tmp_path, float_bundle, name):
+    old, new, says, fix = BROKEN[name]
+    with pytest.raises(DataError) as caught:
+        played(tmp_path, float_bundle, old, new)
+    assert says in caught.value.message
+    assert fix in caught.value.fix
+    assert "reach" in caught.value.message or name == "success is a word"
+
+
+class Box:
+    """A plain environment: bare observations."""
+
+    def reset(self, *, seed=None):
+        return np.arange(4.0), {}
+
+    def step(self, action):
+        return np.arange(4.0), 0.0, np.bool_(False), np.array([True]), {}
+
+
+def test_a_bare_observation_is_that_of_the_only_input():
+    world = World(Box(), "any", ONE)
+    np.testing.assert_array_equal(world.reset(3)["state"], np.arange(4.0))
+    observation, over, _ = world.step(0)
+    assert list(observation) == ["state"]
+    assert over is True
+
+
+def test_a_plain_gymnasium_environment_is_played_by_a_policy_with_one_input():
+    gymnasium = pytest.importorskip("gymnasium")
+    world = World(gymnasium.make("CartPole-v1"), "CartPole-v1", ONE)
+    first = world.reset(3)["state"]
+    assert first.shape == (4,)
+    np.testing.assert_array_equal(world.reset(3)["state"], first)
+    assert world.step(1)[1] is False
+
+
+def test_a_reset_that_hides_its_parameters_is_believed():
+    class Hidden(Box):
+        def reset(self, *given, **named):
+            return Box.reset(self, **named)
+
+    assert list(World(Hidden(), "any", ONE).reset(1)) == ["state"]

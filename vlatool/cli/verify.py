@@ -1,0 +1,44 @@
+"""``vlatool verify``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlatool.bundle import Bundle
+from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._run import is_bundle
+
+
+def verify(
+    source: Annotated[str, typer.Argument(help="policy directory, path.py:make or a bundle", show_default=False)],
+    against: Annotated[
+        str, typer.Option(help="path.py:FUNCTION or package.module:FUNCTION of the original", show_default=False)
+    ],
+    data: Annotated[Path | None, typer.Option(help="recorded observations; the policy's own when not given")] = None,
+    samples: Annotated[int, typer.Option(min=1, max=100_000, help="observations at most, spread over the data")] = 32,
+    tolerance: Annotated[float, typer.Option(help="largest relative error of an action, and of each stage")] = 1e-3,
+    seed: Annotated[int, typer.Option(min=0, help="of the noise that both are given")] = 0,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+) -> None:
+    """Say whether a policy gives what the code that it was made from gives, and if not, which stage differs.
+
+    FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the action in physical
+    units. Exits 1 when the actions differ.
+    """
+    from vlatool.host import cache_directory
+    from vlatool.pipeline import sourced
+    from vlatool.verify import Options, check
+    from vlatool.verify import verify as verified
+
+    refuse_existing(output, force, source, data)
+    options = Options(against, data, samples, tolerance, seed)
+    check(options)
+    with progress() as context:
+        bundle = Bundle.open(source) if is_bundle(source) else sourced(source, cache_directory(), context)
+        report = verified(bundle, options, context)
+    show(report, as_json=as_json, out=output, force=force)

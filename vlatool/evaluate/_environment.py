@@ -1,0 +1,116 @@
+"""A user's environment, held against what gymnasium promises: every breach is a sentence with its remedy."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlatool.errors import DataError
+from vlatool.spec import PolicySpec
+
+GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
+
+
+class World:
+    """Resets and steps an environment, and gives observations as the policy takes them.
+
+    Args:
+        environment: What ``make(task=...)`` returned.
+        task: Of the environment, for messages.
+        spec: Of the policy.
+
+    Raises:
+        DataError: when it has no ``reset`` and ``step``, or ``reset`` takes no ``seed``.
+    """
+
+    def __init__(self, environment: Any, task: str, spec: PolicySpec) -> None:
+        self._environment = environment
+        self._name = f"the environment of task '{task}'"
+        self._inputs = [tensor.name for tensor in spec.inputs]
+        lacking = [name for name in ("reset", "step") if not callable(getattr(environment, name, None))]
+        if lacking:
+            raise DataError(
+                f"What makes {self._name} gives {_told(environment)}, which has no {' and no '.join(lacking)}.",
+                "return an environment with gymnasium's interface",
+            )
+        if not _takes_seed(environment.reset):
+            raise DataError(
+                f"reset() of {self._name} takes no 'seed', so no two policies would see the same episode.",
+                f"write reset(self, *, seed=None, options=None), as gymnasium has it; {GUIDE}",
+            )
+
+    def reset(self, seed: int) -> Mapping[str, Any]:
+        """Begin an episode and return its first observation.
+
+        Raises:
+            DataError: when it does not give an observation and an info.
+        """
+        given = self._environment.reset(seed=seed)
+        if not (isinstance(given, tuple) and len(given) == 2):
+            raise DataError(
+                f"reset() of {self._name} gives {_told(given)}; it must give (observation, info).",
+                f"return observation, {{}}: that is gymnasium's interface, and no longer gym's; {GUIDE}",
+            )
+        return self._observation(given[0])
+
+    def step(self, action: Any) -> tuple[Mapping[str, Any], bool, Any]:
+        """Take an action; return the next observation, whether the episode is over, and the info.
+
+        Raises:
+            DataError: when it does not give the five values of gymnasium.
+        """
+        given = self._environment.step(action)
+        if not (isinstance(given, tuple | list) and len(given) == 5):
+            raise DataError(
+                f"step() of {self._name} gives {_told(given)}; it must give five values: observation, reward, "
+                "terminated, truncated, info.",
+                f"return observation, reward, done, False, info where gym had observation, reward, done, info; {GUIDE}",
+            )
+        observation, _, terminated, truncated, info = given
+        return self._observation(observation), self._over(terminated) or self._over(truncated), info
+
+    def _over(self, said: Any) -> bool:
+        if np.size(said) != 1:
+            raise DataError(
+                f"step() of {self._name} tells of {np.size(said)} episodes at once whether they are over.",
+                "name a single environment, not a vector of them",
+            )
+        return bool(np.asarray(said).reshape(-1)[0])
+
+    def _observation(self, given: Any) -> Mapping[str, Any]:
+        """Return an observation by the names of the policy; one that has no name is that of its only input."""
+        if isinstance(given, Mapping):
+            return given
+        if len(self._inputs) == 1:
+            return {self._inputs[0]: given}
+        raise DataError(
+            f"{self._name.capitalize()} gives its observation as {_told(given)}, without names; the policy takes "
+            f"{', '.join(self._inputs)}.",
+            f"wrap it, so that it gives a dict with these names; {GUIDE}",
+        )
+
+
+def _takes_seed(reset: Any) -> bool:
+    """Say whether ``reset`` can be called with ``seed=``; what hides its parameters is believed to."""
+    try:
+        parameters = inspect.signature(reset).parameters.values()
+    except (TypeError, ValueError):
+        return True
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return any(
+        each.kind is inspect.Parameter.VAR_KEYWORD or (each.name == "seed" and each.kind in named)
+        for each in parameters
+    )
+
+
+def _told(given: Any) -> str:
+    """Return what something is, as a part of a sentence."""
+    if isinstance(given, tuple | list):
+        return f"{len(given)} values"
+    if isinstance(given, np.ndarray):
+        return f"an array of {given.dtype} with the shape {list(given.shape)}"
+    name = type(given).__name__
+    return f"{'an' if name[0].lower() in 'aeio' else 'a'} {name}"

@@ -1,0 +1,99 @@
+"""Whether a policy directory gives what the code that it was made from gives, and if not, which part of it differs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vlatool import apart, trust
+from vlatool.bundle import Bundle
+from vlatool.errors import UsageError
+from vlatool.host import fingerprint
+from vlatool.report import Measurement, Report, Row
+from vlatool.sources._factory import factory_file, split_factory
+from vlatool.stage import Context
+
+PRELOAD = ("torch", "onnxruntime", "vlatool.verify._compare")
+STAGES, ELEMENTS = "stage by stage", "action, element by element"
+HOOKS = "let the file define preprocess(observation) and raw(observation) too: then each stage is compared"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is compared.
+
+    Args:
+        against: ``original.py:act`` or ``package.module:act``.
+        data: Recorded observations; the policy's own when None.
+        samples: Observations at most.
+        tolerance: Largest relative error of an action, of an input and of the network's output.
+        seed: Of the noise that both are given.
+    """
+
+    against: str
+    data: Path | None = None
+    samples: int = 32
+    tolerance: float = 1e-3
+    seed: int = 0
+
+
+def verify(bundle: Bundle, options: Options, context: Context) -> Report:
+    """Run the policy and the original on the same observations, in a child process, and compare.
+
+    Args:
+        bundle: A source bundle, whose torch modules run, or one with graphs.
+        options: What is compared.
+        context: Whom to tell.
+
+    Raises:
+        SourceError: when the original cannot be imported, fails, or gives what is no action.
+        DataError: when the observations cannot be read.
+    """
+    file = factory_file(options.against, Path.cwd())
+    if file is not None:
+        trust.name(file.parent)
+    job = {
+        "bundle": str(bundle.path.absolute()), "against": options.against, "folder": str(Path.cwd()),
+        "data": str(options.data.absolute()) if options.data else "", "samples": options.samples,
+        "tolerance": options.tolerance, "seed": options.seed,
+    }  # fmt: skip
+    about = split_factory(options.against)[0]
+    found = apart.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
+    return _report(bundle, options, found)
+
+
+def check(options: Options) -> None:
+    """Raise a usage error for options that make no sense."""
+    if not 0 <= options.tolerance < 1:
+        raise UsageError(f"--tolerance is {options.tolerance:g}; allowed: from 0, below 1.")
+
+
+def _report(bundle: Bundle, options: Options, found: Mapping[str, Any]) -> Report:
+    """Return what was found as a report; its verdict is ``fail`` when the actions differ."""
+    name, count, differing = bundle.manifest.name, int(found["samples"]), int(found["differing"])
+    title = f"{name} against {options.against} on {count} {found['observations']}"
+    worst = float(found["error"])
+    if differing:
+        first = found["first"]
+        said = [
+            f"{name} does not give what {options.against} gives: {differing} of {count} observations differ by more "
+            f"than {options.tolerance:g}, the first is observation {first}; the largest relative error is {worst:.3g}.",
+            *map(str, found["causes"]),
+        ]
+        said += [] if found["hooks"] or found["certain"] else [HOOKS[0].upper() + HOOKS[1:] + "."]
+    else:
+        said = [f"{name} gives what {options.against} gives: the largest relative error is {worst:.3g} (allowed: "
+                f"{options.tolerance:g})."]  # fmt: skip
+    measurements = [Measurement("relative_error_max", worst, "1", samples=count, note="action, in physical units")]
+    measurements += [
+        Measurement(f"error_max.{each['element']}", float(each["max error"]), str(each["unit"]), samples=count,
+                    note="largest |difference|") for each in found["elements"]
+    ]  # fmt: skip
+    details = {ELEMENTS: list(found["elements"]), STAGES: list(found["stages"])}
+    row = Row(name, measurements=tuple(measurements), details={key: value for key, value in details.items() if value})
+    return Report(
+        "verify", title, "fail" if differing else "pass", tuple(said), (row,), environment=fingerprint(),
+        warnings=tuple(found["warnings"]), limits={"tolerance": options.tolerance},
+    )  # fmt: skip

@@ -1,0 +1,179 @@
+"""Why the actions differ: what the compared stages say, and else what would make the two equal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import VlatoolError
+from vlatool.runtime.policy import Policy
+
+if TYPE_CHECKING:
+    from vlatool.verify._compare import Sample
+
+Array = NDArray[Any]
+Change = Callable[["Sample"], Mapping[str, Array]]
+TRIED = 6
+"""Observations on which a guess must make both equal."""
+LEAST_FIT = 8
+"""Values of an element from which a straight line through them says something."""
+
+
+def causes(
+    policy: Policy, samples: Sequence[Sample], stages: Sequence[Mapping[str, Any]], tolerance: float
+) -> tuple[list[str], bool]:
+    """Return what differs, a sentence for each cause, and whether the stage is certain."""
+    told = list(_of_stages(policy, samples, stages, tolerance))
+    if told:
+        return told, True
+    found = [*_of_action(policy, samples, tolerance), *_of_inputs(policy, samples, tolerance)]
+    if found:
+        return found, True
+    text = list(_of_texts(policy, samples, tolerance))
+    where = "no single change of an input or of the action makes both equal, so it is the network (weights, layers, "
+    where += "eval mode, the order of the inputs), or more than one stage"
+    return [*text, f"It cannot be told for certain which stage differs: {where}."], False
+
+
+def _of_stages(
+    policy: Policy, samples: Sequence[Sample], stages: Sequence[Mapping[str, Any]], tolerance: float
+) -> Iterator[str]:
+    """Say what the stages tell that could be compared."""
+    before = [stage for stage in stages if stage["input"]]
+    wrong = [stage for stage in before if stage["differs"]]
+    for stage in wrong:
+        yield f"The {stage['stage']} differs, first on observation {stage['first']}" + _by(samples, stage) + "."
+    network = next((stage for stage in stages if stage["stage"] == "network"), None)
+    if wrong:
+        if _equal(policy, samples, lambda sample: {**sample.encoded, **sample.inputs}, tolerance):
+            yield "With the original's inputs this policy gives the original's actions: nothing else differs."
+        return
+    if network is not None and not network["differs"]:
+        yield "The network gives the same, so the denormalisation differs: look at the action's statistics and units."
+    elif network is not None and len(before) == len(policy.spec.inputs):
+        words = f"The inputs are the same, the network's output is not, first on observation {network['first']}: look "
+        yield words + "at weights, layers, eval mode, and the order in which forward() takes the inputs."
+
+
+def _by(samples: Sequence[Sample], stage: Mapping[str, Any]) -> str:
+    """Return what both have there, of an input that differs."""
+    sample = next(each for each in samples if each.number == stage["first"])
+    mine, theirs = sample.encoded[stage["input"]], sample.inputs[stage["input"]]
+    if mine.shape != theirs.shape:
+        return f": {list(mine.shape)} here, {list(theirs.shape)} in the original"
+    place = np.unravel_index(int(np.abs(mine.astype(np.float64) - theirs).argmax()), mine.shape)
+    return f": {mine[place]:.6g} here, {theirs[place]:.6g} in the original, at {[int(each) for each in place[1:]]}"
+
+
+def _of_action(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
+    """Try what a wrong denormalisation would do."""
+    if policy.spec.action.kind == "discrete":
+        return
+    if policy.spec.action.normalisation != "none" and all(
+        policy.chunk_error(sample.raw.reshape(-1, sample.wanted.shape[1])[: len(sample.wanted)], sample.wanted)
+        <= tolerance
+        for sample in samples
+    ):
+        yield "The denormalisation differs: the original gives the network's output as it is, still normalised."
+        return
+    yield from _of_lines(policy, samples, tolerance)
+
+
+def _of_lines(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
+    """Fit the original's elements as straight lines of this policy's: a difference in scale or offset alone."""
+    mine = np.concatenate([sample.chunk for sample in samples])
+    theirs = np.concatenate([sample.wanted for sample in samples])
+    if len(mine) < LEAST_FIT:
+        return
+    labels = policy.spec.action.labels or tuple(map(str, range(mine.shape[1])))
+    told = []
+    for index, label in enumerate(labels):
+        spread = float(mine[:, index].std())
+        if not spread:
+            return
+        slope, offset = np.polyfit(mine[:, index], theirs[:, index], 1)
+        left = np.abs(slope * mine[:, index] + offset - theirs[:, index]).max()
+        if not left <= 10 * tolerance * (float(theirs[:, index].std()) or spread):
+            return
+        if abs(slope - 1) > tolerance or abs(offset) > tolerance * spread:
+            told.append(f"the original's {label} is {slope:.4g} times this policy's plus {offset:.4g}")
+    if told:
+        yield f"The denormalisation differs (statistics, units or order of the elements): {'; '.join(told[:6])}."
+
+
+def _of_inputs(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
+    """Try what a wrong preprocessing of a single input would do."""
+    for words, change in _changes(policy):
+        if _equal(policy, samples, change, tolerance):
+            yield words
+
+
+def _changes(policy: Policy) -> Iterator[tuple[str, Change]]:
+    """Yield a cause, and what the network would take if it were so."""
+    inputs = policy.spec.inputs
+    for tensor in inputs:
+        name = tensor.name
+        if tensor.kind != "text" and tensor.normalisation != "none":
+            words = f"The normalisation of '{name}' differs: the original takes it as it is, this policy with "
+            yield words + f"{tensor.normalisation}.", _as_it_is(name)
+        if tensor.dtype == "uint8" and tensor.shape[-1] == 3:
+            yield f"The channels of '{name}' differ: with red and blue exchanged both are equal.", _mirrored(name)
+    for place, one in enumerate(inputs):
+        for other in inputs[place + 1 :]:
+            if (one.shape, one.dtype) == (other.shape, other.dtype):
+                words = f"The inputs '{one.name}' and '{other.name}' are exchanged."
+                yield words, _exchanged(one.name, other.name)
+
+
+def _as_it_is(name: str) -> Change:
+    return lambda sample: {**sample.encoded, name: _physical(sample, name)}
+
+
+def _mirrored(name: str) -> Change:
+    return lambda sample: {**sample.encoded, name: np.ascontiguousarray(sample.encoded[name][..., ::-1])}
+
+
+def _exchanged(one: str, other: str) -> Change:
+    return lambda sample: {**sample.encoded, one: sample.encoded[other], other: sample.encoded[one]}
+
+
+def _physical(sample: Sample, name: str) -> Array:
+    encoded = sample.encoded[name]
+    return np.asarray(sample.observation[name], encoded.dtype).reshape(encoded.shape)
+
+
+def _equal(policy: Policy, samples: Sequence[Sample], change: Change, tolerance: float) -> bool:
+    """Say whether both are equal when the network takes other inputs; only what forgets can be asked twice."""
+    from vlatool.verify._compare import error_of
+
+    if policy.program.keeps:
+        return False
+    differing = [sample for sample in samples if not sample.error <= tolerance]
+    chosen = [*differing[:TRIED], *samples[:TRIED]]
+    for sample in chosen:
+        try:
+            values = policy.program.run({name: value.copy() for name, value in change(sample).items()}, sample.noise)
+            chunk = policy.decode(values[policy.spec.action.name])
+        except VlatoolError:
+            return False
+        if not error_of(policy, chunk.astype(sample.wanted.dtype)[: len(sample.wanted)], sample.wanted) <= tolerance:
+            return False
+    return True
+
+
+def _of_texts(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
+    """Say when the difference depends on the text alone."""
+    for tensor in policy.spec.inputs:
+        if tensor.kind != "text":
+            continue
+        wrong = {str(each.observation[tensor.name]) for each in samples if not each.error <= tolerance}
+        right = {str(each.observation[tensor.name]) for each in samples if each.error <= tolerance}
+        if right and not wrong & right:
+            first = min(wrong)
+            yield (
+                f"The tokenizer of '{tensor.name}' seems to differ: {len(wrong)} texts differ always and {len(right)} "
+                f"never; the first is {first[:60]!r}."
+            )

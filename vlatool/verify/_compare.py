@@ -1,0 +1,190 @@
+"""Both sides on the same observations, in this process: actions, and what can be told of the stages between."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle import Bundle
+from vlatool.data import CALIBRATION, EVALUATION, Recording, read_recording, synthetic_observations
+from vlatool.export._torch_policy import torch_policy
+from vlatool.runtime.policy import Policy, relative_error
+from vlatool.runtime.program import draw
+from vlatool.spec import PolicySpec
+from vlatool.verify._causes import causes
+from vlatool.verify._original import Original, as_fed
+
+Array = NDArray[Any]
+LARGEST = 1e9
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One observation and what both sides made of it.
+
+    Args:
+        number: Its place in the recording.
+        observation: Physical values.
+        noise: What both were given in the place of noise of their own.
+        encoded: What this policy's network takes, with a batch axis.
+        raw: What its network gives.
+        chunk: Its action: (T, A) float64, or (T,) int64.
+        wanted: The original's, the same, as many leading steps as it gives.
+        inputs: What the original's network takes, as far as it tells it.
+        wanted_raw: What that gives, None when it does not tell it.
+        error: Relative error of the action.
+    """
+
+    number: int
+    observation: dict[str, Any]
+    noise: dict[str, Array]
+    encoded: dict[str, Array]
+    raw: Array
+    chunk: Array
+    wanted: Array
+    inputs: dict[str, Array] = field(default_factory=dict)
+    wanted_raw: Array | None = None
+    error: float = 0.0
+
+
+def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Run both on the observations of a job; return what was found, as JSON values."""
+    bundle = Bundle.open(Path(job["bundle"]))
+    seed, tolerance = int(job["seed"]), float(job["tolerance"])
+    policy = Policy.open(bundle, threads=1, seed=seed) if bundle.manifest.graphs else torch_policy(bundle, seed)
+    original = Original(job["against"], Path(job["folder"]), policy.spec)
+    recording = _recording(bundle, Path(job["data"]) if job["data"] else None)
+    random = np.random.default_rng(seed)
+    samples = []
+    for place, (number, observation, begins) in enumerate(_observations(policy, recording, int(job["samples"]))):
+        tell("running both", place / int(job["samples"]))
+        if begins:
+            policy.reset()
+            original.reset()
+        samples.append(_sample(policy, original, number, observation, random))
+    stages = _stages(policy, samples, tolerance)
+    differing = [sample for sample in samples if not sample.error <= tolerance]
+    found = causes(policy, samples, stages, tolerance) if differing else ([], True)
+    return {
+        "samples": len(samples), "differing": len(differing), "first": differing[0].number if differing else -1,
+        "error": _worst([sample.error for sample in samples]), "elements": _elements(policy.spec, samples),
+        "stages": stages, "causes": found[0], "certain": found[1], "hooks": original.hooks,
+        "observations": "recorded observations" if recording else "random observations",
+        "warnings": _warnings(policy, original, recording),
+    }  # fmt: skip
+
+
+def _recording(bundle: Bundle, data: Path | None) -> Recording | None:
+    own = [bundle.path / name for name in (EVALUATION, CALIBRATION) if name in bundle.manifest.files]
+    path = data or next(iter(own), None)
+    return None if path is None else read_recording(path, bundle.manifest.spec)
+
+
+def _observations(
+    policy: Policy, recording: Recording | None, count: int
+) -> Iterator[tuple[int, dict[str, Any], bool]]:
+    """Yield the place of each observation, the observation, and whether an episode begins with it.
+
+    A policy that keeps values sees observations that follow each other.
+    """
+    keeps = policy.program.keeps
+    if recording is None:
+        for number, observation in enumerate(synthetic_observations(policy.spec, count)):
+            yield number, observation, not keeps or number == 0
+        return
+    before = None
+    for number in range(min(count, len(recording))) if keeps else recording.spread(count):
+        episode = None if recording.episodes is None else int(recording.episodes[number])
+        yield number, recording.observation(number), not keeps or number == 0 or episode != before
+        before = episode
+
+
+def _sample(
+    policy: Policy, original: Original, number: int, observation: dict[str, Any], random: np.random.Generator
+) -> Sample:
+    steps = policy.bundle.manifest.program
+    noise = {name: draw(wanted, random) for step in steps for name, wanted in step.noise.items()}
+    encoded = {name: value.copy() for name, value in policy.encode(observation).items()}
+    action = policy.infer(observation, noise=noise)
+    wanted = original.act(observation, noise, number)
+    chunk = action.chunk.astype(wanted.dtype)[: len(wanted)]
+    tensors = {tensor.name: tensor for tensor in policy.spec.inputs}
+    inputs = {name: as_fed(tensors[name], value) for name, value in original.preprocess(observation, number).items()}
+    return Sample(
+        number, observation, noise, encoded, action.outputs[policy.spec.action.name], chunk, wanted, inputs,
+        original.raw(observation, noise, number), error_of(policy, chunk, wanted),
+    )  # fmt: skip
+
+
+def error_of(policy: Policy, got: Array, wanted: Array) -> float:
+    """Return the relative error of an action: by the spread of each element; the share of others where discrete."""
+    if policy.spec.action.kind == "discrete":
+        return float(np.mean(got != wanted))
+    return min(policy.chunk_error(got, wanted), LARGEST)
+
+
+def _elements(spec: PolicySpec, samples: list[Sample]) -> list[dict[str, Any]]:
+    """Return the largest difference of each element of the action, and where it is."""
+    if spec.action.kind == "discrete":
+        return []
+    labels = spec.action.labels or tuple(str(index) for index in range(spec.action.width))
+    errors = np.stack([np.abs(sample.chunk - sample.wanted).max(axis=0) for sample in samples])
+    sizes = np.max([np.abs(sample.wanted).max(axis=0) for sample in samples], axis=0)
+    found = []
+    for index, (label, unit) in enumerate(zip(labels, spec.action.units(), strict=True)):
+        worst = int(errors[:, index].argmax())
+        largest = float(errors[worst, index])
+        found.append({"element": label, "unit": unit, "max error": round(largest, 9),
+                      "relative": round(largest / (float(sizes[index]) or 1.0), 9),
+                      "observation": samples[worst].number})  # fmt: skip
+    return found
+
+
+def _stages(policy: Policy, samples: list[Sample], tolerance: float) -> list[dict[str, Any]]:
+    """Return the stages that could be compared, in the order in which an observation goes through them."""
+    found = []
+    for tensor in policy.spec.inputs:
+        if all(tensor.name in sample.inputs for sample in samples):
+            what = f"tokenizer of '{tensor.name}'" if tensor.kind == "text" else (
+                f"normalisation of '{tensor.name}' ({tensor.normalisation})")  # fmt: skip
+            errors = [_error(sample.encoded[tensor.name], sample.inputs[tensor.name]) for sample in samples]
+            found.append(_stage(what, tensor.name, samples, errors, tolerance))
+    if all(sample.wanted_raw is not None for sample in samples):
+        errors = [_error(sample.raw, np.asarray(sample.wanted_raw)) for sample in samples]
+        found.append(_stage("network", "", samples, errors, tolerance))
+    errors = [sample.error for sample in samples]
+    found.append(_stage(f"action ({policy.spec.action.normalisation})", "", samples, errors, tolerance))
+    return found
+
+
+def _stage(what: str, name: str, samples: list[Sample], errors: list[float], tolerance: float) -> dict[str, Any]:
+    differing = [sample.number for sample, error in zip(samples, errors, strict=True) if not error <= tolerance]
+    return {"stage": what, "input": name, "relative error": _worst(errors), "differs": len(differing),
+            "first": differing[0] if differing else -1}  # fmt: skip
+
+
+def _error(got: Array, wanted: Array) -> float:
+    """Return the relative L2 difference; the largest number for other sizes, of which a batch axis is none."""
+    return min(relative_error(got, wanted), LARGEST)
+
+
+def _worst(errors: list[float]) -> float:
+    return float(np.nanmax([LARGEST if error != error else error for error in errors], initial=0.0))
+
+
+def _warnings(policy: Policy, original: Original, recording: Recording | None) -> list[str]:
+    found = []
+    if recording is None:
+        found.append("there is no recording, so both ran on random observations: pass --data FILE.npz to compare on "
+                     "what the policy is for")  # fmt: skip
+    if any(step.noise for step in policy.bundle.manifest.program) and not original.takes_noise:
+        found.append("the policy draws noise, and act() takes none: the difference is also that of the noise; write "
+                     "act(observation, noise) with noise, a dict of arrays by the names in policy.yaml")  # fmt: skip
+    if policy.program.keeps and original._reset is None:
+        found.append("the policy keeps values from step to step, and the original has no reset() beside act()")
+    return found

@@ -1,0 +1,162 @@
+"""The code that a policy was made from: ``act``, and where they are beside it ``preprocess``, ``raw``, ``reset``."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import SourceError, VlatoolError
+from vlatool.printable import message_of
+from vlatool.sources._factory import exits_told, import_factory
+from vlatool.spec import PolicySpec, TensorSpec
+
+Array = NDArray[Any]
+
+
+class Original:
+    """Calls a user's functions; what they raise, and what is no answer, becomes one sentence.
+
+    Args:
+        factory: ``original.py:act`` or ``package.module:act``.
+        folder: What a path counts from.
+        spec: Of the policy that is compared.
+
+    Raises:
+        SourceError, MissingExtra: when it cannot be imported.
+    """
+
+    def __init__(self, factory: str, folder: Path, spec: PolicySpec) -> None:
+        self._name = factory
+        self._spec = spec
+        self._act = import_factory(factory, folder)
+        beside = getattr(self._act, "__globals__", {})
+        self._preprocess = _function(beside, "preprocess")
+        self._raw = _function(beside, "raw")
+        self._reset = _function(beside, "reset")
+        self.takes_noise = _takes(self._act, "noise")
+
+    @property
+    def hooks(self) -> bool:
+        """Whether both stages between observation and action can be asked for."""
+        return self._preprocess is not None and self._raw is not None
+
+    def reset(self) -> None:
+        """Begin an episode, where the code has a function for it."""
+        if self._reset is not None:
+            self._called(self._reset, "reset", -1)
+
+    def act(self, observation: Mapping[str, Any], noise: Mapping[str, Array], number: int) -> Array:
+        """Return its action: (T, A) float64 in physical units, T at most the chunk; or (T,) int64 indices."""
+        given = self._called(self._act, "act", number, observation, **self._noise(self._act, noise))
+        return self._indices(given, number) if self._spec.action.kind == "discrete" else self._chunk(given, number)
+
+    def preprocess(self, observation: Mapping[str, Any], number: int) -> dict[str, Array]:
+        """Return what its network takes, as far as it tells it: input name -> array; nothing when it has no function.
+
+        Raises:
+            SourceError: when it gives something else than a mapping of inputs to arrays.
+        """
+        if self._preprocess is None:
+            return {}
+        given = self._called(self._preprocess, "preprocess", number, observation)
+        names = [tensor.name for tensor in self._spec.inputs]
+        if not isinstance(given, Mapping) or not given or not set(given) <= set(names):
+            got = ", ".join(map(str, given)) if isinstance(given, Mapping) else f"a {type(given).__name__}"
+            raise SourceError(
+                f"preprocess() beside '{self._name}' gives {got or 'nothing'}; wanted a dict with some of "
+                f"{', '.join(names)}.",
+                "return what the network takes, by the names in policy.yaml",
+            )
+        return {name: self._array(value, f"preprocess()['{name}']", number) for name, value in given.items()}
+
+    def raw(self, observation: Mapping[str, Any], noise: Mapping[str, Array], number: int) -> Array | None:
+        """Return what its network gives, before it is un-normalised; None when it has no function for that."""
+        if self._raw is None:
+            return None
+        given = self._called(self._raw, "raw", number, observation, **self._noise(self._raw, noise))
+        return self._array(given, "raw()", number)
+
+    def _noise(self, function: Callable[..., Any], noise: Mapping[str, Array]) -> dict[str, Any]:
+        return {"noise": {name: value.copy() for name, value in noise.items()}} if _takes(function, "noise") else {}
+
+    def _called(
+        self, function: Callable[..., Any], name: str, number: int, *arguments: Mapping[str, Any], **more: Any
+    ) -> Any:
+        where = f"{name}() of '{self._name}'" + (f", on observation {number}," if number >= 0 else "")
+        try:
+            with exits_told(where):
+                return function(*(copy.deepcopy(dict(each)) for each in arguments), **more)
+        except (VlatoolError, MemoryError):
+            raise
+        except Exception as error:  # the seam: user code may raise anything
+            raise SourceError(f"{where} failed: {type(error).__name__}: {message_of(error)}.") from error
+
+    def _array(self, value: Any, what: str, number: int) -> Array:
+        """Return an array of finite numbers, of a tensor as well."""
+        for step in ("detach", "cpu", "numpy"):
+            value = getattr(value, step)() if callable(getattr(value, step, None)) else value
+        try:
+            array = np.asarray(value)
+        except Exception as error:  # the seam: an object may refuse in any way
+            raise SourceError(f"{what} of '{self._name}' gives a {type(value).__name__}, which is no array.") from error
+        if array.dtype.kind not in "biuf" or not array.size:
+            raise SourceError(f"{what} of '{self._name}' gives {_told(value, array)}; wanted an array of numbers.")
+        if not np.isfinite(array).all():
+            raise SourceError(f"{what} of '{self._name}' gives NaN or infinity on observation {number}.")
+        return array
+
+    def _chunk(self, given: Any, number: int) -> Array:
+        array, action = self._array(given, "act()", number), self._spec.action
+        width, most = action.width, self._spec.chunk
+        wide = array if array.ndim else array[None]
+        if wide.shape[-1] != width or not 1 <= wide.size // width <= most:
+            raise SourceError(
+                f"act() of '{self._name}' gives the shape {list(array.shape)}; wanted [{most}, {width}], or fewer "
+                f"leading steps, or [{width}] for the first.",
+                "return the chunk in physical units, without what was planned beyond it",
+            )
+        return wide.astype(np.float64).reshape(-1, width)
+
+    def _indices(self, given: Any, number: int) -> Array:
+        labels, action = self._spec.action.labels, self._spec.action
+        if isinstance(given, str):
+            given = [labels.index(given)] if given in labels else [given]
+        array = np.asarray(given) if isinstance(given, list) else self._array(given, "act()", number)
+        flat = array.reshape(-1)
+        right = flat.dtype.kind in "iu" and 1 <= flat.size <= self._spec.chunk
+        if not right or not ((flat >= 0) & (flat < len(labels))).all():
+            raise SourceError(
+                f"act() of '{self._name}' gives {_told(given, array)} for '{action.name}'; wanted an index from 0 to "
+                f"{len(labels) - 1}, or one of {', '.join(labels)}.",
+                "return argmax of the logits",
+            )
+        return flat.astype(np.int64)
+
+
+def as_fed(tensor: TensorSpec, value: Array) -> Array:
+    """Return an array with the batch axis that the network's input has."""
+    return value[None] if value.ndim == len(tensor.shape) - 1 else value
+
+
+def _function(beside: Mapping[str, Any], name: str) -> Callable[..., Any] | None:
+    found = beside.get(name)
+    return found if callable(found) else None
+
+
+def _takes(function: Callable[..., Any], name: str) -> bool:
+    try:
+        return name in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def _told(value: Any, array: Array) -> str:
+    if isinstance(value, Mapping):
+        return f"a dict of {', '.join(map(str, value))}"[:120]
+    return repr(value)[:60] if array.size <= 4 else f"an array of {array.dtype} with the shape {list(array.shape)}"
