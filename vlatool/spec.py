@@ -159,7 +159,7 @@ class TensorSpec:
 
 
 def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
-    """Labels of actions without names, such as 256 action tokens: the indices of the last axis; none when it is free."""
+    """Labels of actions without names, such as 256 action tokens: the indices of the last axis, unless it is free."""
     width = shape[-1] if shape else 0
     return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MOST_INDICES else ()
 

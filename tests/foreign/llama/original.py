@@ -1,4 +1,4 @@
-"""What somebody has: a Llama (random weights, small) that writes seven action tokens, and what generate() makes of prompts."""
+"""What somebody has: a Llama (random weights, small) that writes seven action tokens, and what generate() writes."""
 
 from pathlib import Path
 

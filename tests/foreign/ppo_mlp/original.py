@@ -1,4 +1,4 @@
-"""Somebody's training: PPO from Stable-Baselines3 on Pendulum-v1, and what its own predict() does on recorded states."""
+"""Somebody's training: PPO from Stable-Baselines3 on Pendulum-v1, and what its own predict() does."""
 
 from pathlib import Path
 

@@ -4,9 +4,7 @@ import torch
 from torch import nn
 from transformers import ResNetConfig, ResNetModel
 
-RESNET_18 = ResNetConfig(
-    embedding_size=64, hidden_sizes=[64, 128, 256, 512], depths=[2, 2, 2, 2], layer_type="basic"
-)
+RESNET_18 = ResNetConfig(embedding_size=64, hidden_sizes=[64, 128, 256, 512], depths=[2, 2, 2, 2], layer_type="basic")
 
 
 class Recurrent(nn.Module):
