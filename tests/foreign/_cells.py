@@ -88,7 +88,7 @@ def _measured(policy: Foreign, float32: str, int8: str) -> Iterator[Cell]:
         yield Cell("evaluate closed-loop", ("evaluate", "closed-loop", int8, *episodes), codes=JUDGED)
     yield Cell("explain", ("explain", int8, "--baseline", float32, "--samples", "4", "--seconds", "30", *data))
     yield Cell("benchmark latency", ("benchmark", "latency", float32, "--against", int8, *few))
-    yield Cell("benchmark overhead", ("benchmark", "overhead", float32, "--iterations", "50"))
+    yield Cell("benchmark overhead", ("benchmark", "overhead", float32, "--iterations", "100"))
     yield Cell("compare", ("compare", float32, int8, "--iterations", "20"))
     yield Cell("rebuild", ("rebuild", int8, "--source", policy.exported, "--check"))
     yield Cell("gate init", ("gate", "init", f"{folder}/repository", "--baseline", "models/base", "--force"))
@@ -101,4 +101,4 @@ def _measured(policy: Foreign, float32: str, int8: str) -> Iterator[Cell]:
 
 def gate_file(policy: Foreign) -> str:
     """Contents of a gate with recordings to judge by."""
-    return f"accuracy: {{data: ../../{policy.name}/evaluation.npz, max_drop: 50%}}\nlatency: {{margin: 50%}}\n"
+    return f"accuracy: {{data: ../../{policy.name}/evaluation.npz, max_drop: 0.5}}\nlatency: {{margin: 0.5}}\n"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from _cells import ANSWERS, Cell
 
 WORKS, REFUSED, BARE, WRONG, FAULT, MISSING = "works", "refused", "refused without remedy", "WRONG", "FAULT", "not run"
-GOOD = (WORKS, REFUSED)
+GOOD = (WORKS, REFUSED, MISSING)
 REFUSING = (2, 3, 4)
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -54,7 +54,7 @@ def _said(err: str) -> str:
     """The error and its remedy in one line; the last line where there is no error message."""
     lines = [COLOUR.sub("", line).strip() for line in err.splitlines() if line.strip()]
     starts = [index for index, line in enumerate(lines) if line.startswith("error:")]
-    return " ".join(lines[starts[-1] :]) if starts else (lines[-1] if lines else "it said nothing")
+    return " ".join(lines[starts[-1] :] if starts else lines[-2:]) or "it said nothing"
 
 
 def markdown(columns: Sequence[tuple[str, str]], rows: Sequence[str], found: dict[tuple[str, str], Verdict]) -> str:

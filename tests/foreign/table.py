@@ -27,7 +27,7 @@ from pathlib import Path
 from _cells import ANSWERS, VLATOOL, Cell, cells, gate_file
 from _foreign import HERE, POLICIES, Foreign
 from _guide import GUIDES, GuideError, follow
-from _verdict import FAULT, GOOD, Verdict, judge, markdown
+from _verdict import FAULT, GOOD, MISSING, Verdict, judge, markdown
 
 LIMIT_S = 1800.0
 """A command that takes longer is a fault."""
@@ -128,7 +128,9 @@ def variables(folder: Path, venv: Path) -> dict[str, str]:
 
 
 def tried(cell: Cell, folder: Path, venv: Path) -> Verdict:
-    """Run a cell's command and say what its end means."""
+    """Run a cell's command and say what its end means; what needs a bundle that was refused before is not run."""
+    if cell.program == ANSWERS and not (folder / cell.words[0]).is_dir():
+        return Verdict(MISSING)
     programs = {VLATOOL: [str(venv / "bin/vlatool")], ANSWERS: [str(venv / "bin/python"), str(HERE / "_answers.py")]}
     force = ["--force"] if cell.program == VLATOOL and "-o" in cell.words and "--force" not in cell.words else []
     command = [*programs[cell.program], *cell.words, *force]
