@@ -11,7 +11,8 @@ from _cells import ANSWERS, Cell
 
 WORKS, REFUSED, BARE, WRONG, FAULT, MISSING = "works", "refused", "refused without remedy", "WRONG", "FAULT", "not run"
 GOOD = (WORKS, REFUSED, MISSING)
-REFUSING = (2, 3, 4)
+REFUSING = (1, 2, 3, 4)
+"""Exit codes of a refusal; 1 is that of a bundle which was written and found to be wrong."""
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 

@@ -30,7 +30,8 @@ TOLD = "... exporting\nerror: The file x.npz has no 'ids'.\n  fix: record them\n
         (3, "error: The file x.npz has no 'ids'.\n", BARE),
         (3, "Traceback\nKeyError: 'zeros'", FAULT),
         (70, TOLD, FAULT),
-        (1, TOLD, FAULT),
+        (1, TOLD, REFUSED),
+        (1, "Traceback", FAULT),
         (-11, "", FAULT),
     ],
 )
