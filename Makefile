@@ -10,8 +10,9 @@ SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 BASE ?=
 ARM64 ?=
 LADDER ?=
+FOREIGN ?= --guides
 
-.PHONY: gate peers python310 arm64 ladder help install demo test check robot docs format clean metaworld
+.PHONY: foreign gate peers python310 arm64 ladder help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -70,6 +71,19 @@ peers:  ## measure other tools and our bundles on six workloads, interleaved (ab
 	@test -x $(OUT)/peers/venv/bin/python || $(PYTHON) -m venv $(OUT)/peers/venv
 	$(OUT)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/peers/requirements.txt -e '.[ort,build]'
 	PYTHONPATH=. $(OUT)/peers/venv/bin/python tests/peers/table.py
+
+$(OUT)/foreign/common/.made: tests/foreign/common.txt pyproject.toml
+	@test -x $(OUT)/foreign/common/bin/python || $(PYTHON) -m venv $(OUT)/foreign/common
+	$(OUT)/foreign/common/bin/python -m pip install --quiet --disable-pip-version-check -r tests/foreign/common.txt -e '.[ort,openvino,build,text]'
+	@touch $@
+
+$(OUT)/foreign/lerobot/.made: tests/foreign/lerobot.txt pyproject.toml
+	@test -x $(OUT)/foreign/lerobot/bin/python || $(PYTHON) -m venv $(OUT)/foreign/lerobot
+	$(OUT)/foreign/lerobot/bin/python -m pip install --quiet --disable-pip-version-check -r tests/foreign/lerobot.txt -e '.[ort,openvino,build,text]'
+	@touch $@
+
+foreign: $(OUT)/foreign/common/.made $(OUT)/foreign/lerobot/.made  ## seven policies of others through every command, and the guides as written (hours, 15 GB; FOREIGN="--only ppo_mlp")
+	$(PYTHON) tests/foreign/table.py --common $(OUT)/foreign/common --lerobot $(OUT)/foreign/lerobot -o $(OUT)/foreign/made $(FOREIGN)
 
 docs: $(VENV)/.dev  ## write docs/reference from the code
 	$(BIN)/python docs/generate.py

@@ -60,7 +60,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
         ("{deadline: {ms: 0}}", "deadline.ms: Input should be greater than 0"),
         ("{deadline: {ms: 5, percent: 98}}", "percent must be one of 50, 90, 95, 99, 99.9"),
         ("{deadline: {}}", "deadline.ms: Field required"),
-        ("{accuracy: {max_drop: 2}}", "accuracy.max_drop: Input should be less than or equal to 1"),
+        ("{accuracy: {max_drop: 2}}", "accuracy.max_drop: Input should be less than or equal to 1 (got 2)"),
         ("{latency: null, accuracy: null, answers: null, memory: null, size: null}", "every claim is null"),
         ("{schema: 2}", "schema: Input should be less than or equal to 1"),
         ("{latency: {margin: fast}}", "latency.margin: Input should be a valid number"),
@@ -73,6 +73,15 @@ def test_what_is_impossible_is_named(tmp_path: Path, text: str, says: str) -> No
         read_gate(written(tmp_path, text))
     assert says in caught.value.message
     assert "gate.yaml" in caught.value.message
+
+
+def test_a_percentage_is_told_how_a_share_is_written(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"max_drop: .* \(got '1%'\)") as caught:
+        read_gate(written(tmp_path, "{accuracy: {max_drop: 1%}}"))
+    assert "0.05 is 5 %" in caught.value.fix
+    with pytest.raises(RecipeError) as caught:
+        read_gate(written(tmp_path, "{accuracy: {max_drop: 2}}"))
+    assert caught.value.fix == "docs/reference/gate.md says what each key takes"
 
 
 def test_a_missing_gate_says_how_to_write_one(tmp_path: Path) -> None:

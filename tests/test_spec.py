@@ -69,7 +69,10 @@ def test_the_action_is_the_first_output_and_the_rate_follows_from_what_is_execut
         ({"unit": ["m"]}, "1 unit for a last axis of 2"),
         ({"normalisation": "mean_std"}, "'statistics' is ''"),
         ({"normalisation": "mean_std", "statistics": "stats.json"}, "FILE#KEY"),
-        ({"kind": "discrete"}, "needs 'labels'"),
+        ({"kind": "discrete", "shape": [1, "n"]}, "needs 'labels'"),
+        ({"kind": "discrete", "labels": []}, "needs 'labels'"),
+        ({"kind": "discrete", "shape": [1, True]}, "each axis is a whole number|needs 'labels'"),
+        ({"kind": "discrete", "shape": [1, 10**15]}, "limit 'elements'"),
         ({"colour": "red"}, "unknown key 'colour'"),
         ({"shape": [1, 10**9]}, "1000000000 elements; the limit 'elements'"),
         ({"shape": [2**62, 2**62]}, "more than 2"),
@@ -85,6 +88,12 @@ def test_an_impossible_tensor_is_refused(change, message):
     with pytest.raises(SpecError, match=message) as caught:
         TensorSpec.from_dict({"name": "state", "shape": [1, 2], **change})
     assert caught.value.exit_code == 3
+
+
+def test_a_discrete_output_without_labels_has_the_indices_as_labels():
+    tokens = TensorSpec.from_dict({"name": "tokens", "kind": "discrete", "shape": [1, 7, 256]})
+    assert tokens.labels == tuple(str(index) for index in range(256))
+    assert TensorSpec.from_dict(tokens.to_dict()) == tokens
 
 
 @pytest.mark.parametrize(

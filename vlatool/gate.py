@@ -108,6 +108,19 @@ class Gate(BaseModel):
         return text
 
 
+def _problem(key: str, got: object, message: str) -> str:
+    """One sentence about one key; what was got is shown where it is one value."""
+    shown = f" (got {got!r})" if key and isinstance(got, str | int | float) else ""
+    return f"{key or 'gate'}: {message}{shown}"
+
+
+def _fix(error: ValidationError) -> str:
+    """What to write instead; a percentage is what people write who know --max-drop 1%."""
+    shares = [item for item in error.errors() if str(item["input"]).strip().endswith("%")]
+    share = "write a share as a number: 0.05 is 5 %; " if shares else ""
+    return f"{share}docs/reference/gate.md says what each key takes"
+
+
 def read_gate(path: Path) -> Gate:
     """Read a gate file; paths in it are relative to its directory.
 
@@ -120,8 +133,8 @@ def read_gate(path: Path) -> Gate:
     try:
         gate = Gate.model_validate(data)
     except ValidationError as error:
-        problems = [f"{'.'.join(map(str, item['loc'])) or 'gate'}: {item['msg']}" for item in error.errors()]
-        raise RecipeError(f"The gate {path}: {'; '.join(problems)}.") from error
+        problems = [_problem(".".join(map(str, item["loc"])), item["input"], item["msg"]) for item in error.errors()]
+        raise RecipeError(f"The gate {path}: {'; '.join(problems)}.", _fix(error)) from error
     folder = path.parent
     accuracy = gate.accuracy
     if accuracy is not None:

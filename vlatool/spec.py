@@ -16,6 +16,8 @@ KINDS = ("tensor", "text", "discrete")
 NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
 STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
 MODES = ("", "delta", "absolute", "velocity", "relative")
+MOST_INDICES = 2**18
+"""Labels that are made up for a discrete output that names none: more than any vocabulary of tokens has."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class TensorSpec:
         kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
             of logits over ``labels``; the action is the index of the largest).
         unit: One unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
-        labels: A name for each element of the last axis.
+        labels: A name for each element of the last axis; the indices, when a discrete output names none.
         mode: How a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
         normalisation: How the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
             ``mean_std``, ``min_max`` or ``quantiles``.
@@ -106,7 +108,10 @@ class TensorSpec:
                 f"got '{self.tokenizer}' and {self.max_tokens}."
             )
         if self.kind == "discrete" and not self.labels:
-            raise SpecError(f"The discrete output '{self.name}' needs 'labels', one for each action.")
+            raise SpecError(
+                f"The discrete output '{self.name}' needs 'labels', one for each action.",
+                "name them, or give the last axis of 'shape' as a number: the labels are then its indices",
+            )
 
     def assets(self) -> list[str]:
         """Return the files, relative to the assets, that this tensor needs."""
@@ -144,11 +149,19 @@ class TensorSpec:
                 values[key] = tuple(values[key])
         if "name" not in values or not isinstance(values.get("shape"), tuple):
             raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {shown(values.get('shape'))}.")
+        if values.get("kind") == "discrete":
+            values.setdefault("labels", _indices(values["shape"]))
         return cls(**values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields that differ from their defaults, lists for tuples."""
         return _plain(self)
+
+
+def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
+    """Labels of actions without names, such as 256 action tokens: the indices of the last axis, unless it is free."""
+    width = shape[-1] if shape else 0
+    return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MOST_INDICES else ()
 
 
 @dataclass(frozen=True)
