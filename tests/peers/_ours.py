@@ -10,6 +10,9 @@ MARK = "ours:"
 OPENVINO = ("quantize", "static-int8", "{bundle}", "--layout", "openvino", "--compute", "bfloat16")
 COMMANDS: dict[str, tuple[str, ...]] = {
     "optimize, relative_error 0.04": ("optimize", "{policy}", "--max-drop", "relative_error=0.04"),
+    "optimize for ONNX Runtime, relative_error 0.04": (
+        *("optimize", "{policy}", "--profile", "raspberry-pi-5", "--max-drop", "relative_error=0.04"),
+    ),
     "openvino bf16": OPENVINO,
     "openvino bf16, mse": (*OPENVINO, "--method", "mse"),
     "openvino bf16, attention": (*OPENVINO, "--attention"),

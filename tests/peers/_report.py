@@ -78,8 +78,19 @@ class Table:
         return f"{self.relative(row, other):.3f}{bounds}"
 
     def dominates(self, row: Contestant, other: Contestant) -> bool:
-        """Say whether a row is faster by more than the tolerance and at most as wrong."""
-        return row.error <= other.error and self.relative(row, other) < 1 - TOLERANCE
+        """Say whether a row is faster, by more than the tolerance and beyond chance, and at most as wrong."""
+        faster = self.relative(row, other) < 1 - TOLERANCE and self._beyond_chance(row, other)
+        return row.error <= other.error and faster
+
+    def _beyond_chance(self, row: Contestant, other: Contestant) -> bool:
+        """Say whether the ratio's interval leaves equality out; without turns together, whether theirs are apart."""
+        ratios = self._ratios(row, other)
+        if ratios is None:
+            _, low, _ = self.speedup(row)
+            _, _, high = self.speedup(other)
+            return low is not None and high is not None and low > high
+        _, _, high = quantile_interval(ratios, 0.5)
+        return high is not None and high < 1
 
     def dominated_by(self, row: Contestant) -> Contestant | None:
         """Return the fastest of the other side that dominates the row."""
