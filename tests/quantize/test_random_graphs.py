@@ -6,8 +6,12 @@ import pytest
 from _graph_trials import METHODS, float_graph, trial
 from _random_graphs import RandomGraph
 
+from vlatool.finish import reference_policy
 from vlatool.launch import run_transform
+from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
+from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
 from vlatool.stage import Context
 
 WEIGHTS = ("int4", "int4-qdq", "hqq", "gptq", "gptq-qdq", "awq", "awq-qdq")
@@ -118,6 +122,57 @@ def test_a_weight_that_is_read_in_two_ways_is_stored_for_each(method, tmp_path):
     made = run_transform(stage, source, tmp_path / "out", Context())
     nodes = [node for node in onnx.load(made.path / "graphs/main.onnx").graph.node if node.op_type == "MatMulNBits"]
     assert nodes[0].input[1] != nodes[1].input[1]
+
+
+def residual_block(g, value, out):
+    """Of a Diffusion policy: Conv, GroupNorm, Mish, a scale and shift from the conditioning, and a 1x1 Conv beside."""
+    batch, channels, length = g.shapes[value]
+    shape, found = (batch, out, length), value
+    for width in (channels, out):
+        weight, bias = g.weight(out, width, 5, fan=5 * width), g.constant(g.random.normal(size=out) / 4)
+        found = g.node("Conv", [found, weight, bias], shape, kernel_shape=[5], pads=[2, 2])
+        parts = g.node("Reshape", [found, g.constant([0, 4, -1], np.int64)], (batch, 4, out * length // 4))
+        parts = g.node(
+            "InstanceNormalization", [parts, g.constant(np.ones(4)), g.constant(np.zeros(4))], g.shapes[parts]
+        )
+        found = g.node("Reshape", [parts, g.constant(shape, np.int64)], shape)
+        found = g.node("Mish", [found], shape)
+        if width == channels:
+            found = g.node("Mul", [found, g.constant(g.random.uniform(0.5, 2, (1, out, 1)))], shape)
+            found = g.node("Add", [found, g.constant(g.random.normal(size=(1, out, 1)))], shape)
+    beside = g.node("Conv", [value, g.weight(out, channels, 1, fan=channels)], shape)
+    return g.node("Add", [found, beside], shape)
+
+
+def unet(g, value):
+    """The U-Net of a Diffusion policy, of two levels."""
+    turned = g.node("Transpose", [value], (1, 6, 16), perm=[0, 2, 1])
+    first = residual_block(g, turned, 16)
+    small = g.node("Conv", [first, g.weight(16, 16, 3, fan=48)], (1, 16, 8), kernel_shape=[3], pads=[1, 1], strides=[2])
+    small = residual_block(g, residual_block(g, small, 32), 16)
+    inputs = [small, g.weight(16, 16, 4, fan=32)]
+    wide = g.node("ConvTranspose", inputs, (1, 16, 16), kernel_shape=[4], pads=[1, 1], strides=[2])
+    joined = g.node("Concat", [wide, first], (1, 32, 16), axis=1)
+    last = g.node("Conv", [residual_block(g, joined, 16), g.weight(6, 16, 1, fan=16)], (1, 6, 16))
+    return g.node("Transpose", [last], (1, 16, 6), perm=[0, 2, 1])
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"activations": "int8"}, {"activations": "uint8"}, {"elementwise": True}], ids=str
+)
+def test_openvino_computes_the_unet_of_a_diffusion_policy_as_it_is_written(options, tmp_path):
+    source = float_graph(Written(unet, (1, 16, 6)), tmp_path / "graph")
+    recording = source.path.parent / "recording.npz"
+    stage = StaticInt8(layout="openvino", calibration=recording, **options)
+    made = run_transform(stage, source, tmp_path / "out", Context())
+    assert made.manifest.findings == ()
+    observation = {"input0": np.load(recording)["input0"][0]}
+    wanted, written, given = (
+        policy.infer(observation).outputs[made.manifest.spec.action.name]
+        for policy in (load(source.path, threads=1), reference_policy(made), load(made.path, threads=1))
+    )
+    assert relative_error(written, wanted) < 0.06
+    assert relative_error(given, wanted) < 0.06
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -48,8 +48,8 @@ class Style:
     """How layers are written.
 
     Args:
-        activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, uint8 with the zero point
-            0 for what is never negative, and uint8 with a zero point for what a convolution reads.
+        activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, and uint8 with the zero
+            point 0 for what is never negative.
         per_channel: One weight scale for each output channel.
         reduce_range: 7-bit weights.
         fused_convolutions: Quantize a convolution's bias and output too: ONNX Runtime then computes it in int8.
@@ -57,6 +57,7 @@ class Style:
         signed_second: Write the second of two activations that are multiplied (keys and values of attention) in 7 bits
             and signed, whatever the others are: ONNX Runtime multiplies uint8 with int8 twice as fast as with uint8 on
             x86, and within 63 no processor saturates.
+        unsigned_convolutions: Write what convolutions read as uint8 with a zero point, whatever the others are.
     """
 
     activations: Literal["uint8", "int8", "symmetric"] = "uint8"
@@ -65,6 +66,7 @@ class Style:
     fused_convolutions: bool = False
     hoist: bool = False
     signed_second: bool = False
+    unsigned_convolutions: bool = False
 
 
 def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elementwise: bool = False) -> list[Layer]:
@@ -184,12 +186,14 @@ def wanted_values(layers: Iterable[Layer], style: Style, moved: Mapping[str, str
     return list(found)
 
 
-def convolved(layers: Iterable[Layer], moved: Mapping[str, str]) -> set[str]:
-    """Return the values that are quantized for a convolution.
+def convolved(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> set[str]:
+    """Return the values that are written as uint8 because a convolution reads them.
 
     On x86 processors without AMX, OpenVINO (2025.2 to 2026.4) turns signed inputs of convolutions into unsigned ones,
     and loses their scale where a Concat is near; unsigned ones it computes as they are written, everywhere.
     """
+    if not style.unsigned_convolutions:
+        return set()
     return {moved.get(name, name) for layer in layers if layer.kind == "Conv" for name in layer.activations}
 
 
