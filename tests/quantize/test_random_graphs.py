@@ -157,11 +157,47 @@ def unet(g, value):
     return g.node("Transpose", [last], (1, 16, 6), perm=[0, 2, 1])
 
 
+def attended(g, queries, memory):
+    """Attention of 4 heads with a bias for each projection, as torch's MultiheadAttention is exported."""
+    found = []
+    for value, axes in ((queries, [0, 2, 1, 3]), (memory, [0, 2, 3, 1]), (memory, [0, 2, 1, 3])):
+        count = g.shapes[value][1]
+        made = g.node("MatMul", [value, g.weight(32, 32)], (1, count, 32))
+        made = g.node("Add", [made, g.constant(g.random.normal(size=32))], (1, count, 32))
+        split = g.node("Reshape", [made, g.constant([1, count, 4, 8], np.int64)], (1, count, 4, 8))
+        found.append(g.node("Transpose", [split], tuple((1, count, 4, 8)[axis] for axis in axes), perm=axes))
+    scores = g.node("MatMul", found[:2], (1, 4, g.shapes[queries][1], g.shapes[memory][1]))
+    weights = g.node("Softmax", [scores], g.shapes[scores], axis=-1)
+    mixed = g.node("MatMul", [weights, found[2]], (1, 4, g.shapes[queries][1], 8))
+    turned = g.node("Transpose", [mixed], (1, g.shapes[queries][1], 4, 8), perm=[0, 2, 1, 3])
+    wide = g.node("Reshape", [turned, g.constant(g.shapes[queries], np.int64)], g.shapes[queries])
+    return g.node("MatMul", [wide, g.weight(32, 32)], g.shapes[queries])
+
+
+def act(g, value):
+    """The decoder of ACT: its first layer attends among learned queries, which depend on no input."""
+    zeros, learned = g.constant(np.zeros((1, 6, 32))), g.constant(g.random.normal(size=(1, 6, 32)))
+    queries = g.node("Add", [zeros, learned], (1, 6, 32))
+    queries = g.node("Add", [zeros, attended(g, queries, queries)], (1, 6, 32))
+    queries = g.node("Add", [queries, learned], (1, 6, 32))
+    return linear(g, attended(g, queries, value))
+
+
+@pytest.mark.parametrize("options", [{}, {"activations": "int8"}, {"attention": True, "elementwise": True}], ids=str)
+def test_openvino_computes_learned_queries_as_they_are_written(options, tmp_path):
+    errors_of(Written(act, (1, 9, 32)), options, tmp_path)
+
+
 @pytest.mark.parametrize(
     "options", [{}, {"activations": "int8"}, {"activations": "uint8"}, {"elementwise": True}], ids=str
 )
 def test_openvino_computes_the_unet_of_a_diffusion_policy_as_it_is_written(options, tmp_path):
-    source = float_graph(Written(unet, (1, 16, 6)), tmp_path / "graph")
+    errors_of(Written(unet, (1, 16, 6)), options, tmp_path)
+
+
+def errors_of(graph, options, tmp_path):
+    """Hold what OpenVINO computes against float32, and what the quantized graph says."""
+    source = float_graph(graph, tmp_path / "graph")
     recording = source.path.parent / "recording.npz"
     stage = StaticInt8(layout="openvino", calibration=recording, **options)
     made = run_transform(stage, source, tmp_path / "out", Context())

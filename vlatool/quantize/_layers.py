@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vlatool.errors import GraphError, require
-from vlatool.quantize._nodes import reads
+from vlatool.quantize._nodes import reads, varying
 from vlatool.quantize._value_types import FLOAT, float_names
 
 LOWEST_OPSET = 13
@@ -72,6 +72,9 @@ class Style:
 def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elementwise: bool = False) -> list[Layer]:
     """Return the layers of a graph that can be computed in int8, in the order of the graph.
 
+    What depends on no input stays as it is: engines compute it once, and OpenVINO (2026.4) fails on a graph in which
+    such a value is quantized, or computes it wrongly.
+
     Args:
         model: An ``onnx.ModelProto``.
         ops: ``MatMul``, ``Gemm``, ``Conv``: operators with constant weights that are wanted.
@@ -86,7 +89,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
             raise GraphError(f"The graph has opset {entry.version}; int8 needs opset {LOWEST_OPSET} or later.")
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     floats = float_names(model) if elementwise else set()
-    readers = _readers(model)
+    readers, live = _readers(model), varying(model)
     found = []
     for node in model.graph.node:
         if node.op_type in ops or (node.op_type == "MatMul" and attention):
@@ -96,7 +99,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
             layer = Layer(node.name, "Add", tuple(node.input)) if both else None
         else:
             layer = None
-        if layer is not None:
+        if layer is not None and live.issuperset(layer.activations):
             found.append(_with_output(layer, node, readers))
     return found
 

@@ -23,6 +23,16 @@ def read_names(nodes: Iterable[Any]) -> set[str]:
     return {name for node in nodes for name in reads(node)}
 
 
+def varying(model: Any) -> set[str]:
+    """Return the values that depend on an input of a graph, or on chance; all others are computed once, or could be."""
+    constants = {tensor.name for tensor in model.graph.initializer}
+    found = {value.name for value in model.graph.input} - constants
+    for node in model.graph.node:
+        if node.op_type.startswith("Random") or any(name in found for name in reads(node)):
+            found.update(name for name in node.output if name)
+    return found
+
+
 def name_nodes(model: Any) -> None:
     """Give every node without a name, or with one that came before, a name of its own, in place.
 
