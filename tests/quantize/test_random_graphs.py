@@ -105,6 +105,16 @@ def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_pat
     assert 0 < found.drift < 0.25
 
 
+@pytest.mark.parametrize("word", ["smooth", "float16", "static", "static-qdq", "static-openvino", "dynamic"])
+def test_a_weight_that_the_graph_gives_stays_what_it_is(word, tmp_path):
+    graph = Written(weight_given, (1, 32))
+    source = float_graph(graph, tmp_path / "graph")
+    assert trial(graph, source, word).verdict == "right"
+    observation = {"input0": np.ones((1, 32), np.float32)}
+    wanted, got = (load(tmp_path / "graph" / name, threads=1).infer(observation).outputs for name in ("float", word))
+    np.testing.assert_allclose(got[graph.outputs[1]], wanted[graph.outputs[1]], rtol=1e-3, atol=1e-3)
+
+
 def test_nodes_without_names_are_quantized_and_can_be_chosen(tmp_path):
     source = float_graph(Written(both_ways, (1, 32), named=False), tmp_path / "graph")
     recording = source.path.parent / "recording.npz"

@@ -23,7 +23,7 @@ from vlatool.errors import BundleError, GraphError, RecipeError, VlatoolError, n
 from vlatool.export.onnx import FOLDED
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
-from vlatool.quantize._nodes import name_nodes
+from vlatool.quantize._nodes import name_nodes, part_outputs
 from vlatool.quantize._phase import cut_phases
 from vlatool.quantize._precision import precision_shares
 from vlatool.stage import Context, Transform, source_of
@@ -208,7 +208,7 @@ def load(path: Path) -> Any:
 
 
 def read(path: Path, *, weights: bool = True) -> Any:
-    """Read an ONNX model, with a name of its own for every node.
+    """Read an ONNX model, with a name of its own for every node; what it gives is no constant but read from one.
 
     Raises:
         GraphError: when a file with its weights is missing.
@@ -222,6 +222,7 @@ def read(path: Path, *, weights: bool = True) -> Any:
             f"The weights of {path} cannot be read: {reason}.", "put the file with its weights beside the graph"
         ) from error
     name_nodes(model)
+    part_outputs(model)
     return model
 
 

@@ -46,6 +46,28 @@ def name_nodes(model: Any) -> None:
         seen.add(node.name)
 
 
+def part_outputs(model: Any) -> None:
+    """Put an Identity between a constant and an output of the graph that it is, in place: methods change constants."""
+    outputs = {value.name for value in model.graph.output}
+    given = [tensor for tensor in model.graph.initializer if tensor.name in outputs]
+    taken = {tensor.name for tensor in model.graph.initializer} | {
+        name for node in model.graph.node for name in node.output
+    }
+    for tensor in given:
+        name, copy = tensor.name, free_name(tensor.name, 0, taken)
+        for node in model.graph.node:
+            for place, read in enumerate(node.input):
+                if read == name:
+                    node.input[place] = copy
+        tensor.name = copy
+        node = model.graph.node.add()
+        node.op_type, node.name = "Identity", f"{copy}/Identity"
+        node.input.append(copy)
+        node.output.append(name)
+        first = model.graph.node.pop()
+        model.graph.node.insert(0, first)
+
+
 def free_name(wanted: str, number: int, taken: set[str]) -> str:
     """Return a name for the node with that place in a graph which is none of those that are taken, and take it."""
     name = f"{wanted}_{number}"
