@@ -12,6 +12,7 @@ from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
 from vlatool.export._torch_policy import load_modules, torch_policy
 from vlatool.export.onnx import ExportOnnx
+from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
@@ -363,3 +364,78 @@ def test_a_chunk_that_the_shape_does_not_hold_is_not_exported(source, tmp_path: 
     bundle = source(PLAIN_PY.replace("BODY", "return self.linear(x)"), PLAIN_YAML + "  chunk: 8\n")
     with pytest.raises(SpecError, match="chunk 8; the shape"):
         export(bundle, tmp_path / "out")
+
+
+NORMALISED_PY = """\
+import torch
+from torch import nn
+
+class Cnn(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.conv1, self.bn1 = nn.Conv1d(1, 4, 3), nn.BatchNorm1d(4)
+        self.conv2, self.bn2 = nn.Conv1d(4, 4, 1), nn.BatchNorm1d(4)
+
+    def forward(self, x):
+        return self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
+
+class Policy(nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.cnn, self.head = Cnn(), nn.Linear(4, 2)
+
+    def forward(self, x):
+        return self.head(self.cnn(x[:, None]).flatten(1))
+
+def make():
+    return Policy()
+"""
+
+
+@pytest.fixture(scope="module")
+def normalised(tmp_path_factory) -> Bundle:
+    """A policy whose exporter folds the BatchNorms into the convolutions before them."""
+    folder = tmp_path_factory.mktemp("normalised")
+    described = PLAIN_YAML + "parts:\n  first: ['cnn.bn1']\n  second: ['cnn.conv2']\n"
+    (folder / "policy.yaml").write_text(described)
+    (folder / "policy.py").write_text(NORMALISED_PY)
+    np.savez(folder / "calibration.npz", x=np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32))
+    for name in ("source", "float"):
+        (folder / name).mkdir()
+    source = TorchModule(policy=folder).run(None, folder / "source", Context())
+    return ExportOnnx().run(source, folder / "float", Context())
+
+
+def test_a_layer_keeps_its_name_when_a_normalisation_is_folded_into_it(normalised):
+    names = [node.name for node in onnx.load(normalised.path / "graphs/main.onnx").graph.node]
+    assert {"cnn.conv1/Conv", "cnn.conv2/Conv", "head/Gemm"} <= set(names)
+    assert not [name for name in names if "bn" in name]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"exclude": ("cnn.conv1*",)},
+        {"exclude": ("cnn.conv1",)},
+        {"exclude": ("cnn.bn1*",)},
+        {"exclude": ("cnn.bn1",)},
+        {"exclude": ("cnn.bn1/Conv",)},
+        {"include": ("*bn2", "head")},
+        {"exclude": ("cnn.bn1",), "include": ("cnn.*", "head")},
+    ],
+    ids=str,
+)
+def test_a_folded_layer_is_met_by_both_of_its_names(normalised, options):
+    names = ["cnn.conv1/Conv", "cnn.conv2/Conv", "head/Gemm"]
+    assert StaticInt8(**options).selected(names, normalised) == {"cnn.conv2/Conv", "head/Gemm"}
+
+
+@pytest.mark.parametrize(("part", "layer"), [("first", "cnn.conv1/Conv"), ("second", "cnn.conv2/Conv")])
+def test_a_part_may_name_either_of_them(normalised, part, layer):
+    assert StaticInt8(parts=(part,)).selected(["cnn.conv1/Conv", "cnn.conv2/Conv"], normalised) == {layer}
+
+
+def test_a_pattern_that_meets_neither_is_refused_with_the_near_names(normalised):
+    with pytest.raises(RecipeError, match=r"No node matches 'cnn.conf1'; did you mean 'cnn.conv1/Conv'\?"):
+        StaticInt8(exclude=("cnn.conf1",)).selected(["cnn.conv1/Conv", "head/Gemm"], normalised)

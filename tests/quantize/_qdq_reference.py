@@ -19,11 +19,12 @@ OPS = ("MatMul", "Gemm", "Conv")
 STYLES = {
     "uint8": Style(),
     "int8": Style("int8"),
-    "symmetric": Style("symmetric"),
+    "symmetric": Style("symmetric", unsigned_convolutions=True),
+    "int8 but for convolutions": Style("int8", unsigned_convolutions=True),
     "per tensor": Style(per_channel=False),
     "seven bits": Style(reduce_range=True),
     "fused": Style(fused_convolutions=True),
-    "hoist": Style("symmetric", hoist=True),
+    "hoist": Style("symmetric", hoist=True, unsigned_convolutions=True),
 }
 
 
@@ -61,7 +62,9 @@ def rounded(values: Array, style: Style, low: float = -3.0, high: float = 3.0, c
     """Reference: an activation after quantization; ``convolved`` when a convolution reads it."""
     kind = style.activations
     if kind == "symmetric":
-        kind = "uint8" if low >= 0 or convolved else "int8"
+        kind = "uint8" if low >= 0 else "int8"
+    if convolved and style.unsigned_convolutions:
+        kind = "uint8"
     if kind == "int8":
         low, high = -max(-low, high), max(-low, high)
     first, last = (0, 255) if kind == "uint8" else (-127, 127)

@@ -240,12 +240,13 @@ NEAR_CONCAT = {
 }
 
 
+@pytest.mark.parametrize("kind", ["symmetric", "int8"])
 @pytest.mark.parametrize("text", NEAR_CONCAT.values(), ids=NEAR_CONCAT)
-def test_openvino_computes_convolutions_near_a_concat_as_they_are_written(text, tmp_path):
+def test_openvino_computes_convolutions_near_a_concat_as_they_are_written(text, kind, tmp_path):
     known = {"w": weight(16, 16, 1, 1, scale=0.2), "k": weight(16), "to": np.array([1, 16, 64])}
     known["token"] = weight(1, 1, 16, seed=3)
     used = {name: value for name, value in known.items() if f"{name})" in text or f"{name}," in text}
-    model, _ = quantized(graph(text, **used), Style("symmetric", hoist=True), {})
+    model, _ = quantized(graph(text, **used), Style(kind, hoist=True, unsigned_convolutions=True), {})
     onnx.save(model, tmp_path / "graph.onnx")
     feeds = {value.name: weight(*(each.dim_value for each in value.type.tensor_type.shape.dim), seed=seed, scale=0.7)
              for seed, value in enumerate(model.graph.input)}  # fmt: skip

@@ -6,8 +6,12 @@ import pytest
 from _graph_trials import METHODS, float_graph, trial
 from _random_graphs import RandomGraph
 
+from vlatool.finish import reference_policy
 from vlatool.launch import run_transform
+from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
+from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
 from vlatool.stage import Context
 
 WEIGHTS = ("int4", "int4-qdq", "hqq", "gptq", "gptq-qdq", "awq", "awq-qdq")
@@ -101,6 +105,16 @@ def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_pat
     assert 0 < found.drift < 0.25
 
 
+@pytest.mark.parametrize("word", ["smooth", "float16", "static", "static-qdq", "static-openvino", "dynamic"])
+def test_a_weight_that_the_graph_gives_stays_what_it_is(word, tmp_path):
+    graph = Written(weight_given, (1, 32))
+    source = float_graph(graph, tmp_path / "graph")
+    assert trial(graph, source, word).verdict == "right"
+    observation = {"input0": np.ones((1, 32), np.float32)}
+    wanted, got = (load(tmp_path / "graph" / name, threads=1).infer(observation).outputs for name in ("float", word))
+    np.testing.assert_allclose(got[graph.outputs[1]], wanted[graph.outputs[1]], rtol=1e-3, atol=1e-3)
+
+
 def test_nodes_without_names_are_quantized_and_can_be_chosen(tmp_path):
     source = float_graph(Written(both_ways, (1, 32), named=False), tmp_path / "graph")
     recording = source.path.parent / "recording.npz"
@@ -118,6 +132,93 @@ def test_a_weight_that_is_read_in_two_ways_is_stored_for_each(method, tmp_path):
     made = run_transform(stage, source, tmp_path / "out", Context())
     nodes = [node for node in onnx.load(made.path / "graphs/main.onnx").graph.node if node.op_type == "MatMulNBits"]
     assert nodes[0].input[1] != nodes[1].input[1]
+
+
+def residual_block(g, value, out):
+    """Of a Diffusion policy: Conv, GroupNorm, Mish, a scale and shift from the conditioning, and a 1x1 Conv beside."""
+    batch, channels, length = g.shapes[value]
+    shape, found = (batch, out, length), value
+    for width in (channels, out):
+        weight, bias = g.weight(out, width, 5, fan=5 * width), g.constant(g.random.normal(size=out) / 4)
+        found = g.node("Conv", [found, weight, bias], shape, kernel_shape=[5], pads=[2, 2])
+        parts = g.node("Reshape", [found, g.constant([0, 4, -1], np.int64)], (batch, 4, out * length // 4))
+        parts = g.node(
+            "InstanceNormalization", [parts, g.constant(np.ones(4)), g.constant(np.zeros(4))], g.shapes[parts]
+        )
+        found = g.node("Reshape", [parts, g.constant(shape, np.int64)], shape)
+        found = g.node("Mish", [found], shape)
+        if width == channels:
+            found = g.node("Mul", [found, g.constant(g.random.uniform(0.5, 2, (1, out, 1)))], shape)
+            found = g.node("Add", [found, g.constant(g.random.normal(size=(1, out, 1)))], shape)
+    beside = g.node("Conv", [value, g.weight(out, channels, 1, fan=channels)], shape)
+    return g.node("Add", [found, beside], shape)
+
+
+def unet(g, value):
+    """The U-Net of a Diffusion policy, of two levels."""
+    turned = g.node("Transpose", [value], (1, 6, 16), perm=[0, 2, 1])
+    first = residual_block(g, turned, 16)
+    small = g.node("Conv", [first, g.weight(16, 16, 3, fan=48)], (1, 16, 8), kernel_shape=[3], pads=[1, 1], strides=[2])
+    small = residual_block(g, residual_block(g, small, 32), 16)
+    inputs = [small, g.weight(16, 16, 4, fan=32)]
+    wide = g.node("ConvTranspose", inputs, (1, 16, 16), kernel_shape=[4], pads=[1, 1], strides=[2])
+    joined = g.node("Concat", [wide, first], (1, 32, 16), axis=1)
+    last = g.node("Conv", [residual_block(g, joined, 16), g.weight(6, 16, 1, fan=16)], (1, 6, 16))
+    return g.node("Transpose", [last], (1, 16, 6), perm=[0, 2, 1])
+
+
+def attended(g, queries, memory):
+    """Attention of 4 heads with a bias for each projection, as torch's MultiheadAttention is exported."""
+    found = []
+    for value, axes in ((queries, [0, 2, 1, 3]), (memory, [0, 2, 3, 1]), (memory, [0, 2, 1, 3])):
+        count = g.shapes[value][1]
+        made = g.node("MatMul", [value, g.weight(32, 32)], (1, count, 32))
+        made = g.node("Add", [made, g.constant(g.random.normal(size=32))], (1, count, 32))
+        split = g.node("Reshape", [made, g.constant([1, count, 4, 8], np.int64)], (1, count, 4, 8))
+        found.append(g.node("Transpose", [split], tuple((1, count, 4, 8)[axis] for axis in axes), perm=axes))
+    scores = g.node("MatMul", found[:2], (1, 4, g.shapes[queries][1], g.shapes[memory][1]))
+    weights = g.node("Softmax", [scores], g.shapes[scores], axis=-1)
+    mixed = g.node("MatMul", [weights, found[2]], (1, 4, g.shapes[queries][1], 8))
+    turned = g.node("Transpose", [mixed], (1, g.shapes[queries][1], 4, 8), perm=[0, 2, 1, 3])
+    wide = g.node("Reshape", [turned, g.constant(g.shapes[queries], np.int64)], g.shapes[queries])
+    return g.node("MatMul", [wide, g.weight(32, 32)], g.shapes[queries])
+
+
+def act(g, value):
+    """The decoder of ACT: its first layer attends among learned queries, which depend on no input."""
+    zeros, learned = g.constant(np.zeros((1, 6, 32))), g.constant(g.random.normal(size=(1, 6, 32)))
+    queries = g.node("Add", [zeros, learned], (1, 6, 32))
+    queries = g.node("Add", [zeros, attended(g, queries, queries)], (1, 6, 32))
+    queries = g.node("Add", [queries, learned], (1, 6, 32))
+    return linear(g, attended(g, queries, value))
+
+
+@pytest.mark.parametrize("options", [{}, {"activations": "int8"}, {"attention": True, "elementwise": True}], ids=str)
+def test_openvino_computes_learned_queries_as_they_are_written(options, tmp_path):
+    errors_of(Written(act, (1, 9, 32)), options, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"activations": "int8"}, {"activations": "uint8"}, {"elementwise": True}], ids=str
+)
+def test_openvino_computes_the_unet_of_a_diffusion_policy_as_it_is_written(options, tmp_path):
+    errors_of(Written(unet, (1, 16, 6)), options, tmp_path)
+
+
+def errors_of(graph, options, tmp_path):
+    """Hold what OpenVINO computes against float32, and what the quantized graph says."""
+    source = float_graph(graph, tmp_path / "graph")
+    recording = source.path.parent / "recording.npz"
+    stage = StaticInt8(layout="openvino", calibration=recording, **options)
+    made = run_transform(stage, source, tmp_path / "out", Context())
+    assert made.manifest.findings == ()
+    observation = {"input0": np.load(recording)["input0"][0]}
+    wanted, written, given = (
+        policy.infer(observation).outputs[made.manifest.spec.action.name]
+        for policy in (load(source.path, threads=1), reference_policy(made), load(made.path, threads=1))
+    )
+    assert relative_error(written, wanted) < 0.06
+    assert relative_error(given, wanted) < 0.06
 
 
 @pytest.mark.parametrize("seed", SEEDS)

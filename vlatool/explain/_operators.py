@@ -17,7 +17,7 @@ from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, require
 from vlatool.host import onednn_max_cpu_isa
 from vlatool.instruction_sets import ENGINE
-from vlatool.runtime.engines.openvino import DEVICE, settings_for
+from vlatool.runtime.engines.openvino import compiled, settings_for
 from vlatool.runtime.policy import DEFAULT_ENGINE, Policy
 from vlatool.runtime.program import Program
 
@@ -198,7 +198,7 @@ class _OpenvinoProfiled:
             core = openvino.Core()
             model = core.read_model(str(path))
             known = {node.get_friendly_name(): str(node.get_type_name()) for node in model.get_ops()}
-            self._compiled = core.compile_model(model, DEVICE, settings)
+            self._compiled = compiled(core, model, settings)
             self._request = self._compiled.create_infer_request()
             self._fused = fused_names(self._compiled, known)
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours

@@ -41,6 +41,10 @@ EXTERNAL_DATA_BYTES = 1_500_000_000
 """Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
 
 
+FOLDED = "vlatool.folded"
+"""Key of a node's metadata: the module that was folded into it."""
+
+
 class ExportOnnx(Transform):
     """Export every graph of a torch policy to ONNX (dynamo exporter, static shapes).
 
@@ -157,7 +161,8 @@ def name_by_module(model: Any) -> None:
     """Name every node after the torch module that it comes from, so that globs can choose layers.
 
     ``blocks.0.mlp.fc1/MatMul``; a second node of that type in the module is ``blocks.0.mlp.fc1/MatMul_1``. What belongs
-    to no module keeps the exporter's name.
+    to no module keeps the exporter's name. A layer with a normalisation folded in comes from the module that holds its
+    weights; the normalisation's is noted beside it (``FOLDED``).
     """
     seen: Counter[str] = Counter()
     for node in model.graph.all_nodes():
@@ -165,9 +170,20 @@ def name_by_module(model: Any) -> None:
         found = ast.literal_eval(scopes) if scopes.startswith("[") else []
         if len(found) < 2 or not found[-2]:
             continue
-        base = f"{found[-2]}/{node.op_type}"
+        module = _folded_into(node) or found[-2]
+        if module != found[-2]:
+            node.metadata_props[FOLDED] = found[-2]
+        base = f"{module}/{node.op_type}"
         node.name = base if not seen[base] else f"{base}_{seen[base]}"
         seen[base] += 1
+
+
+def _folded_into(node: Any) -> str:
+    """Return the module whose weights a node has that an exporter folded a BatchNorm into; nothing for others."""
+    if "BatchNorm" not in node.metadata_props.get("pkg.onnxscript.rewriter.rule_name", ""):
+        return ""
+    weight = node.inputs[1].name if len(node.inputs) > 1 and node.inputs[1] is not None else ""
+    return weight.removesuffix(".weight") if weight.endswith(".weight") else ""
 
 
 def strip_notes(model: Any) -> None:
@@ -179,7 +195,10 @@ def strip_notes(model: Any) -> None:
         graph.doc_string = None
         values = [*graph.inputs, *graph.outputs, *graph.initializers.values()]
         for node in graph.all_nodes():
+            folded = node.metadata_props.get(FOLDED)
             node.metadata_props.clear()
+            if folded:
+                node.metadata_props[FOLDED] = folded
             node.doc_string = None
             values.extend(node.outputs)
         for value in values:

@@ -20,9 +20,10 @@ from pydantic import Field
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, GraphError, RecipeError, VlatoolError, nearest, require
+from vlatool.export.onnx import FOLDED
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
-from vlatool.quantize._nodes import name_nodes
+from vlatool.quantize._nodes import name_nodes, part_outputs
 from vlatool.quantize._phase import cut_phases
 from vlatool.quantize._precision import precision_shares
 from vlatool.stage import Context, Transform, source_of
@@ -118,8 +119,8 @@ class Quantization(Transform):
     def selected(self, names: Iterable[str], bundle: Bundle) -> set[str]:
         """Return which of those nodes are quantized, by include, exclude and parts.
 
-        A pattern is held against the whole name (``blocks.0.mlp.fc1/MatMul``) and against the module's
-        (``blocks.0.mlp.fc1``).
+        A pattern is held against the whole name (``blocks.0.mlp.fc1/MatMul``), the module's (``blocks.0.mlp.fc1``) and
+        that of a module that was folded into it.
 
         Raises:
             RecipeError: when a pattern matches no node, or a part is unknown, so that a typing error does not pass in
@@ -132,18 +133,23 @@ class Quantization(Transform):
                 "float32 weight.",
                 "look at --ops and --graphs, and at the precision of the graphs: vlatool inspect BUNDLE",
             )
+        folded = _folded(bundle) if self.include or self.exclude or self.parts else {}
+
+        def meets(name: str, patterns: tuple[str, ...]) -> bool:
+            return _any(name, patterns) or (name in folded and _any(folded[name], patterns))
+
         for pattern in (*self.include, *self.exclude):
-            if not any(_any(name, (pattern,)) for name in candidates):
+            if not any(meets(name, (pattern,)) for name in candidates):
                 raise RecipeError(f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.")
         parts = bundle.manifest.parts
         for part in self.parts:
             if part not in parts:
                 raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.")
         globs = tuple(pattern for part in self.parts for pattern in parts[part])
-        kept = {name for name in candidates if not self.include or _any(name, self.include)}
+        kept = {name for name in candidates if not self.include or meets(name, self.include)}
         if self.parts:
-            kept = {name for name in kept if _any(name, globs)}
-        kept = {name for name in kept if not _any(name, self.exclude)}
+            kept = {name for name in kept if meets(name, globs)}
+        kept = {name for name in kept if not meets(name, self.exclude)}
         if not kept:
             raise RecipeError(
                 f"No layer is left to quantize: include, exclude and parts rule out all {len(candidates)}.",
@@ -202,7 +208,7 @@ def load(path: Path) -> Any:
 
 
 def read(path: Path, *, weights: bool = True) -> Any:
-    """Read an ONNX model, with a name of its own for every node.
+    """Read an ONNX model, with a name of its own for every node; what it gives is no constant but read from one.
 
     Raises:
         GraphError: when a file with its weights is missing.
@@ -216,6 +222,7 @@ def read(path: Path, *, weights: bool = True) -> Any:
             f"The weights of {path} cannot be read: {reason}.", "put the file with its weights beside the graph"
         ) from error
     name_nodes(model)
+    part_outputs(model)
     return model
 
 
@@ -275,6 +282,18 @@ def foreign_errors(graph: str) -> Iterator[None]:
     except Exception as error:  # the seam: onnx and ONNX Runtime raise many foreign types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
         raise GraphError(f"The graph '{graph}' cannot be quantized: {type(error).__name__}: {reason}.") from error
+
+
+def _folded(bundle: Bundle) -> dict[str, str]:
+    """Return node -> ``MODULE/TYPE`` of the module that was folded into it when the policy was exported."""
+    found = {}
+    for name, graph in bundle.manifest.graphs.items():
+        with foreign_errors(name):
+            for node in read(bundle.file(graph.file), weights=False).graph.node:
+                noted = {each.key: each.value for each in node.metadata_props}
+                if FOLDED in noted:
+                    found[node.name] = f"{noted[FOLDED]}/{node.op_type}"
+    return found
 
 
 def _any(name: str, patterns: tuple[str, ...]) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vlatool.errors import GraphError, require
-from vlatool.quantize._nodes import reads
+from vlatool.quantize._nodes import reads, varying
 from vlatool.quantize._value_types import FLOAT, float_names
 
 LOWEST_OPSET = 13
@@ -48,8 +48,8 @@ class Style:
     """How layers are written.
 
     Args:
-        activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, uint8 with the zero point
-            0 for what is never negative, and uint8 with a zero point for what a convolution reads.
+        activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, and uint8 with the zero
+            point 0 for what is never negative.
         per_channel: One weight scale for each output channel.
         reduce_range: 7-bit weights.
         fused_convolutions: Quantize a convolution's bias and output too: ONNX Runtime then computes it in int8.
@@ -57,6 +57,7 @@ class Style:
         signed_second: Write the second of two activations that are multiplied (keys and values of attention) in 7 bits
             and signed, whatever the others are: ONNX Runtime multiplies uint8 with int8 twice as fast as with uint8 on
             x86, and within 63 no processor saturates.
+        unsigned_convolutions: Write what convolutions read as uint8 with a zero point, whatever the others are.
     """
 
     activations: Literal["uint8", "int8", "symmetric"] = "uint8"
@@ -65,10 +66,14 @@ class Style:
     fused_convolutions: bool = False
     hoist: bool = False
     signed_second: bool = False
+    unsigned_convolutions: bool = False
 
 
 def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elementwise: bool = False) -> list[Layer]:
     """Return the layers of a graph that can be computed in int8, in the order of the graph.
+
+    What depends on no input stays as it is: engines compute it once, and OpenVINO (2026.4) fails on a graph in which
+    such a value is quantized, or computes it wrongly.
 
     Args:
         model: An ``onnx.ModelProto``.
@@ -84,7 +89,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
             raise GraphError(f"The graph has opset {entry.version}; int8 needs opset {LOWEST_OPSET} or later.")
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     floats = float_names(model) if elementwise else set()
-    readers = _readers(model)
+    readers, live = _readers(model), varying(model)
     found = []
     for node in model.graph.node:
         if node.op_type in ops or (node.op_type == "MatMul" and attention):
@@ -94,7 +99,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
             layer = Layer(node.name, "Add", tuple(node.input)) if both else None
         else:
             layer = None
-        if layer is not None:
+        if layer is not None and live.issuperset(layer.activations):
             found.append(_with_output(layer, node, readers))
     return found
 
@@ -184,12 +189,14 @@ def wanted_values(layers: Iterable[Layer], style: Style, moved: Mapping[str, str
     return list(found)
 
 
-def convolved(layers: Iterable[Layer], moved: Mapping[str, str]) -> set[str]:
-    """Return the values that are quantized for a convolution.
+def convolved(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> set[str]:
+    """Return the values that are written as uint8 because a convolution reads them.
 
     On x86 processors without AMX, OpenVINO (2025.2 to 2026.4) turns signed inputs of convolutions into unsigned ones,
     and loses their scale where a Concat is near; unsigned ones it computes as they are written, everywhere.
     """
+    if not style.unsigned_convolutions:
+        return set()
     return {moved.get(name, name) for layer in layers if layer.kind == "Conv" for name in layer.activations}
 
 

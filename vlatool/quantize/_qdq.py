@@ -57,7 +57,7 @@ class _Writer:
         self.graph = self.model.graph
         self.constants = {tensor.name: tensor for tensor in self.graph.initializer}
         self.outputs = {value.name for value in self.graph.output}
-        self.convolved = convolved(self.layers.values(), self.moved)
+        self.convolved = convolved(self.layers.values(), self.style, self.moved)
         self.signed = signed(self.layers.values(), self.style)
 
     def write(self) -> None:
@@ -126,7 +126,9 @@ class _Writer:
         low, high = self.ranges[name]
         kind: str = self.style.activations
         if kind == "symmetric":
-            kind = "uint8" if low >= 0 or name in self.convolved else "int8"
+            kind = "uint8" if low >= 0 else "int8"
+        if name in self.convolved:
+            kind = "uint8"
         if name in self.signed:
             kind = "int7"
         if kind != "uint8":  # its zero point is 0, so that a range to one side would lose half of it

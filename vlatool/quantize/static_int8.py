@@ -55,7 +55,8 @@ class StaticInt8(Calibrated):
     percentile: float = Field(99.99, gt=50, le=100, description="for the method percentile")
     activations: Literal["auto", "uint8", "int8"] = Field(
         "auto",
-        description="activation type; auto: uint8, and for openvino int8 into products, where its kernels are faster",
+        description="activation type; auto: uint8, and for openvino int8 into products, where its kernels are faster "
+        "(convolutions there always read uint8)",
     )
     per_channel: bool = Field(True, description="one weight scale for each output channel")
     reduce_range: bool = Field(False, description="7-bit weights, for x86 processors without VNNI")
@@ -85,8 +86,9 @@ class StaticInt8(Calibrated):
             kind = "symmetric"
         second = self.layout == "ort" and kind == "uint8"
         return Style(
-            kind, self.per_channel, self.reduce_range, fused_convolutions=not own, hoist=own, signed_second=second
-        )
+            kind, self.per_channel, self.reduce_range, fused_convolutions=not own, hoist=own, signed_second=second,
+            unsigned_convolutions=own,
+        )  # fmt: skip
 
     def used_packages(self) -> tuple[str, ...]:
         """OpenVINO too, where it runs the graphs."""
@@ -121,7 +123,7 @@ class StaticInt8(Calibrated):
                 if self.style.activations == "uint8":
                     pixels = fold_frames(model, {layer.name for layer in layers[name]})
             chosen = self._rewritten(model, layers[name])
-            unsigned = convolved(chosen, hoisted(model, chosen, self.style))
+            unsigned = convolved(chosen, self.style, hoisted(model, chosen, self.style))
             insert_qdq(model, chosen, {**self.ranges(found[name], unsigned), **pixels}, self.style)
             if self.layout == "ort":
                 quantize_early(model)
@@ -151,7 +153,7 @@ class StaticInt8(Calibrated):
                 each,
                 self.method,
                 self.percentile,
-                kind == "int8" or (kind == "symmetric" and name not in unsigned),
+                kind in ("int8", "symmetric") and name not in unsigned,
                 kind == "symmetric",
             )
             for name, each in statistics.items()

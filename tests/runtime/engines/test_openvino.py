@@ -66,6 +66,18 @@ def test_ports_have_the_names_of_the_file_where_a_reshape_beside_them_is_removed
         session.run({"z": fed["z"]})
 
 
+MISH = """g (float[1,4] x) => (float[1,4] y) <float[4,4] w = {1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1}>
+{ a = MatMul(x, w)  b = Mish(a)  y = MatMul(b, w) }"""
+
+
+def test_mish_between_two_linear_layers_is_computed(tmp_path: Path) -> None:
+    """The step encoder of a Diffusion policy; OpenVINO 2026.4 alone refuses it."""
+    path = graph(tmp_path / "mish.onnx", MISH)
+    fed = {"x": np.array([[-2.0, -0.5, 0.0, 3.0]], np.float32)}
+    wanted = fed["x"] * np.tanh(np.log1p(np.exp(fed["x"])))
+    np.testing.assert_allclose(OpenvinoSession(path, threads=1).run(fed)["y"], wanted, atol=1e-5)
+
+
 def test_feeds_may_be_strided(session: OpenvinoSession) -> None:
     strided = np.arange(6, dtype=np.float32).reshape(1, 6)[:, ::2]
     np.testing.assert_array_equal(session.run({**feeds(0), "x": strided})["y"], [[0, 4, 8]])

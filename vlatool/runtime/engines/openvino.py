@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import io
 import os
@@ -54,7 +55,7 @@ class OpenvinoSession:
             wanted = path if opened is None else opened
             model = core.read_model(io.BytesIO(wanted) if isinstance(wanted, bytes) else str(wanted))
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
-            self._compiled = core.compile_model(model, DEVICE, settings)
+            self._compiled = compiled(core, model, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
             words = f"OpenVINO {version_of(openvino)} refuses {path}: {_last_line(error)}"
@@ -201,6 +202,23 @@ def _remedy(error: Exception) -> str:
             f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if it stands for no board"
         )
     return f"this processor lacks {lacks}"
+
+
+def compiled(core: Any, model: Any, settings: dict[str, Any]) -> Any:
+    """Compile a model for the CPU; where that fails, once more without kernels generated for several operators.
+
+    OpenVINO (2026.4) takes Linear, Mish, Linear for a sequence that it can generate code for, and then has none for
+    Mish.
+
+    Raises:
+        RuntimeError: what the first attempt raised, when the second fails too.
+    """
+    try:
+        return core.compile_model(model, DEVICE, settings)
+    except Exception as error:
+        with contextlib.suppress(Exception):
+            return core.compile_model(model, DEVICE, {**settings, "SNIPPETS_MODE": "DISABLE"})
+        raise error
 
 
 def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
