@@ -19,8 +19,10 @@ from vlatool.bundle import DIGEST, Bundle, digest_of, hash_file, seal
 from vlatool.data import recorded_observations
 from vlatool.differences import compare_bundles, explain, listed
 from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import history, save_npz
 from vlatool.launch import cached_transform, run_transform
+from vlatool.pipeline import source_stage
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.rebuild import Rebuilt, build_record, rebuild, version_changes
@@ -202,6 +204,23 @@ def test_a_changed_added_or_missing_file_of_the_source_is_named(int8_bundle, pol
     assert f"weights.safetensors: got no such file, recorded sha256:{recorded['weights.safetensors'][:16]}" in message
     assert "other.safetensors: got sha256:" in message
     assert "recorded no such file" in message
+
+
+def test_an_unrelated_new_file_beside_the_policy_changes_nothing(float_bundle, policy_dir, again):
+    (policy_dir / "experiment.py").write_text("raise SystemExit('never imported')\n")
+    assert again(float_bundle, policy_dir).identical
+
+
+def test_a_changed_helper_that_the_policy_imports_is_named(policy_dir, again, tmp_path):
+    (policy_dir / "helper.py").write_text("SCALE = 1.0\n")
+    code = (policy_dir / "policy.py").read_text()
+    (policy_dir / "policy.py").write_text(f"import helper\n{code}")
+    source = cached_transform(source_stage(str(policy_dir))[0], None, tmp_path / "cache", Context())
+    made = cached_transform(ExportOnnx(), source, tmp_path / "cache", Context())
+    assert again(made, policy_dir).identical
+    (policy_dir / "helper.py").write_text("SCALE = 2.0\n")
+    with pytest.raises(SourceError, match=r"helper.py: got sha256:.*, recorded sha256:"):
+        again(made, policy_dir)
 
 
 def test_another_kind_of_source_and_another_factory_are_refused(int8_bundle, policy_dir, onnx_policy, again):

@@ -17,7 +17,7 @@ from vlatool.yaml_files import read_mapping
 FILE = "policy.yaml"
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
-    "parts", "calibration", "evaluation", "weights",
+    "parts", "calibration", "evaluation", "weights", "files",
 )  # fmt: skip
 
 
@@ -35,6 +35,7 @@ class Description:
         calibration, evaluation: Recorded observations, or None.
         weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
+        files: Globs of the files that the factory reads; None: every file of weights beside it.
     """
 
     folder: Path
@@ -51,6 +52,7 @@ class Description:
     description: str = ""
     license: str = ""
     weights: str = ""
+    files: tuple[str, ...] | None = None
 
     def assets(self) -> set[str]:
         """Files, relative to the folder, that the spec needs on the robot."""
@@ -97,7 +99,21 @@ def read_description(path: Path) -> Description:
         description=str(data.get("description", "")),
         license=str(data.get("license", "")),
         weights=_weights(file, data.get("weights", "")),
+        files=_files(file, data.get("files")),
     )
+
+
+def _files(file: Path, patterns: Any) -> tuple[str, ...] | None:
+    """Globs inside the policy's folder."""
+    if patterns is None:
+        return None
+    each = [patterns] if isinstance(patterns, str) else patterns
+    inside = isinstance(each, list) and all(
+        isinstance(one, str) and one and not one.startswith("/") and ".." not in one.split("/") for one in each
+    )
+    if not inside:
+        raise SourceError(f"{file}: 'files' must be globs inside the folder, as [weights.pt]; got {patterns!r}.")
+    return tuple(each)
 
 
 def _weights(file: Path, pattern: Any) -> str:

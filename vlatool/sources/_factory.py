@@ -17,6 +17,9 @@ from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, 
 from vlatool.printable import message_of
 from vlatool.sources._fresh import compile_afresh
 
+OWN_NAME = "vlatool_source_"
+"""How the names begin that files of a policy are imported under."""
+
 
 def split_factory(factory: str) -> tuple[str, str]:
     """Split ``WHERE:FUNCTION``.
@@ -145,7 +148,7 @@ def _check_own(found: Any, factory: str) -> None:
 
 def _import_path(path: Path) -> ModuleType:
     digest = hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:16]
-    name = f"vlatool_source_{digest}_{path.stem}"
+    name = f"{OWN_NAME}{digest}_{path.stem}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)

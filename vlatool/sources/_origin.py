@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -12,7 +14,7 @@ from vlatool import trust
 from vlatool.bundle import Bundle, hash_file
 from vlatool.errors import SourceError
 from vlatool.sources._description import read_description, read_location
-from vlatool.sources._factory import call_factory, factory_file, split_factory
+from vlatool.sources._factory import OWN_NAME, call_factory, factory_file, split_factory
 
 AGAIN = "start again from the source"
 
@@ -50,8 +52,29 @@ class Origin:
                 raise SourceError(f"{file} has changed since the source bundle was made.", AGAIN)
 
     def made(self) -> Any:
-        """Call the factory."""
-        return call_factory(self.factory, self.folder, dict(self.arguments))
+        """Call the factory.
+
+        Raises:
+            SourceError: when it fails, or imports a file of its folder that was not recorded.
+        """
+        before = set(sys.modules)
+        made = call_factory(self.factory, self.folder, dict(self.arguments))
+        self._check_imports({name: module for name, module in sys.modules.items() if name not in before})
+        return made
+
+    def _check_imports(self, loaded: Mapping[str, Any]) -> None:
+        path = factory_file(self.factory, self.folder)
+        for name, module in loaded.items():
+            file = Path(str(getattr(module, "__file__", None) or os.devnull))
+            if path is None or name.startswith(OWN_NAME) or not file.resolve().is_relative_to(path.parent):
+                continue
+            place = file.resolve().relative_to(path.parent)
+            if place.suffix == ".py" and "site-packages" not in place.parts and place.as_posix() not in self.code:
+                raise SourceError(
+                    f"The factory '{self.factory}' imports {place}, which no import statement of its files names, so "
+                    "its changes would not be noticed.",
+                    f"import it with an import statement, or name it in policy.yaml: files: [{place}]",
+                )
 
 
 def factory_of(source: Bundle | None) -> str:
@@ -105,6 +128,6 @@ def _code(bundle: Bundle) -> dict[str, str]:
     if not isinstance(code, Mapping):
         raise SourceError(f"{bundle.path} records the policy's code in a way that makes no sense.", AGAIN)
     for name in code:
-        if PurePosixPath(name).name != name:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or str(PurePosixPath(name)) != name:
             raise SourceError(f"{bundle.path} records code as {name!r}, which is no file beside the factory.", AGAIN)
     return {str(name): str(digest) for name, digest in code.items()}

@@ -18,13 +18,15 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.sources._description import Description, read_description, write_location
 from vlatool.sources._factory import factory_file, split_factory
+from vlatool.sources._imports import imported_files
 from vlatool.sources._shards import fingerprint, sampled_hash, shard_files
 from vlatool.stage import Context, Transform
 
 if TYPE_CHECKING:
     from vlatool.profile import Profile
 
-CODE = ("*.py", "*.safetensors", "*.pt", "*.pth", "*.bin", "*.ckpt")
+DATA = ("*.safetensors", "*.pt", "*.pt2", "*.pth", "*.bin", "*.ckpt")
+"""Files beside the factory that it may read, where ``files`` in policy.yaml does not say which it does."""
 
 
 class TorchModule(Transform):
@@ -60,7 +62,8 @@ class TorchModule(Transform):
         self.name_it()
         copy_assets(described, out)
         factory = self._factory(described)
-        code = {path.name: hash_file(path) for path in self._code(described)}
+        root = self._root(described)
+        code = {path.relative_to(root).as_posix(): hash_file(path) for path in self._code(described)}
         write_location(out, described.folder)
         manifest = Manifest(
             name=described.name,
@@ -94,11 +97,36 @@ class TorchModule(Transform):
         return factory
 
     def _code(self, described: Description) -> list[Path]:
+        """Return the code that the policy and its environment import from its folder, and the data that they read."""
         path = factory_file(self._factory(described), described.folder)
         if path is None:
             return []
+        folder = self._root(described)
+        environment = str(described.environment.get("make", "")).rpartition(":")[0]
+        beside = (described.folder / environment).resolve() if environment.endswith(".py") else path
+        roots = [path, *([beside] if beside.is_relative_to(folder) else [])]
         shards = set(described.folder.resolve().glob(described.weights)) if described.weights else set()
-        return sorted({found for pattern in CODE for found in path.parent.glob(pattern)} - shards)
+        return sorted((imported_files(roots, folder) | self._data(described, folder)) - shards)
+
+    def _data(self, described: Description, folder: Path) -> set[Path]:
+        """Return the files that the factory reads: those that ``files`` names, else all that hold weights."""
+        if described.files is None:
+            return {found for pattern in DATA for found in folder.glob(pattern)}
+        found: set[Path] = set()
+        for pattern in described.files:
+            files = {file for file in described.folder.resolve().glob(pattern) if file.is_file()}
+            if not files or not all(file.is_relative_to(folder) for file in files):
+                raise SourceError(
+                    f"{described.folder} says files: {pattern}, of which there is none beside the factory.",
+                    "name files or globs below the folder of the factory",
+                )
+            found |= files
+        return found
+
+    def _root(self, described: Description) -> Path:
+        """Return the folder that the factory's imports begin in."""
+        path = factory_file(self._factory(described), described.folder)
+        return path.parent if path is not None else described.folder.resolve()
 
 
 def _shards(described: Description) -> str:
