@@ -147,7 +147,10 @@ def test_nothing_but_the_reports_names_a_place_of_this_machine(from_torch, polic
 
 
 def test_json_is_all_that_is_printed_and_equals_the_report_on_disk(from_torch):
-    assert json.loads(from_torch.stdout) == json.loads((from_torch.out / "reports/report.json").read_text())
+    printed = json.loads(from_torch.stdout)
+    kept = json.loads((from_torch.out / "reports/report.json").read_text())
+    assert printed.pop("raw_samples")["file"] == str(from_torch.out / "reports/report.json")
+    assert printed == {**kept, "rows": [{**row, "raw": {}} for row in kept["rows"]]}, "all but the raw samples"
     assert Report.from_json(from_torch.stdout).kind == "optimize"
 
 
@@ -214,7 +217,8 @@ def test_a_metric_that_is_not_measured_is_refused_before_the_search(run):
 
 
 def test_a_metric_without_observations_is_refused_before_the_search(model, tmp_path):
-    (model.parent / "evaluation.npz").unlink()
+    for name in ("evaluation.npz", "calibration.npz"):
+        (model.parent / name).unlink()
     wrong = optimize(model, tmp_path / "out", tmp_path / "cache", "--max-drop", "relative_error=0.1")
     assert wrong.code == 3
     assert "needs recorded observations" in wrong.stderr
@@ -302,7 +306,8 @@ def test_a_candidate_outside_the_budget_is_kept_as_the_nearest_with_exit_status_
     assert made.report.verdict == "fail"
     assert made.row("bad").role == "chosen"
     assert "outside the limits" in made.row("bad").reason
-    assert "No candidate keeps to the limits; the nearest, bad, was kept." in made.report.summary
+    assert made.report.summary[0].startswith("No candidate keeps to the limits; the nearest, bad, was kept. It is ")
+    assert "Predicted for raspberry-pi-5, not measured there: " in made.report.summary[0]
     assert "error: No candidate keeps to the limits" in made.stderr
     assert Bundle.open(made.out).manifest.made_by["candidate"] == "bad"
 
@@ -333,10 +338,30 @@ def test_a_distance_that_is_not_allowed_is_outside(run, recipe):
 
 
 def test_without_any_accuracy_nothing_is_inside(run, recipe, model):
-    (model.parent / "evaluation.npz").unlink()
+    for name in ("evaluation.npz", "calibration.npz"):
+        (model.parent / name).unlink()
     made = run("--max-drop", "100%", *recipe(DYNAMIC))
     assert made.code == 1
     assert "its accuracy is unmeasured" in made.row("mine").reason
+
+
+def test_with_calibration_data_alone_the_error_against_float32_on_a_held_out_half_is_the_accuracy(
+    run, recipe, model, tmp_path
+):
+    (model.parent / "evaluation.npz").unlink()
+    with np.load(model.parent / "calibration.npz") as data:
+        kept = {name: data[name] for name in data.files if name != "action"}
+    np.savez(model.parent / "calibration.npz", **kept)
+    asked = recipe("candidates: {mine: [quantize.static_int8: {}]}")
+    made = run("--max-drop", "100%", "--max-distance", "100%", "--no-search", *asked)
+    assert made.code == 0, made.stderr
+    row = made.row("mine")
+    assert row.get("error_baseline").samples == 12
+    assert "the action differs from float32's by" in row.reason
+    assert any("12 of the 24 observations for calibration, held out of it" in told for told in made.report.warnings)
+    assert "error vs baseline" in made.stdout
+    (bundle,) = (tmp_path / "cache" / "stages").glob("quantize.static_int8-*")
+    assert Bundle.open(bundle).manifest.made_by["calibration"]["samples"] == 12
 
 
 def test_a_candidate_that_cannot_be_made_is_a_row_that_says_why(run, recipe):

@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from vlatool.bundle import Bundle
+from vlatool.data import EVALUATION
 from vlatool.evaluate._paired import compare_success, with_chance
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.evaluate.recorded import EVALUATION, Recorded
+from vlatool.evaluate.recorded import Recorded, carries_recordings
 from vlatool.launch import cached_measure
 from vlatool.report import Measurement, Row
 from vlatool.stage import Context
@@ -35,7 +36,7 @@ def with_accuracy(
     found: dict[str, Row] = {}
     for name, bundle in bundles.items():
         row = rows[name]
-        found[name] = replace(row, measurements=(*row.measurements, *_recorded(bundle, baseline, cache, context)))
+        found[name] = replace(row, measurements=(*row.measurements, *_recorded(bundle, baseline, loop, cache, context)))
         if loop is None:
             continue
         success[name] = cached_measure(loop, bundle, cache, context).rows[-1]
@@ -47,16 +48,23 @@ def with_accuracy(
     return found
 
 
-def _recorded(bundle: Bundle, baseline: Bundle, cache: Path, context: Context) -> tuple[Measurement, ...]:
-    if EVALUATION not in bundle.manifest.files:
+def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:
+    """Say whether recordings judge a bundle: its own, or where nothing else would, half of its calibration data."""
+    return EVALUATION in bundle.manifest.files or (loop is None and carries_recordings(bundle))
+
+
+def _recorded(
+    bundle: Bundle, baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context
+) -> tuple[Measurement, ...]:
+    if not is_recorded(bundle, loop):
         return ()
     stage = Recorded(baseline=None if bundle is baseline else baseline.path)
     return cached_measure(stage, bundle, cache, context).rows[-1].measurements
 
 
-def unjudged(baseline: Bundle, cache: Path, context: Context) -> tuple[str, ...]:
+def unjudged(baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> tuple[str, ...]:
     """Return what the recordings leave unjudged of the baseline's actions, and so of any candidate's."""
-    if EVALUATION not in baseline.manifest.files:
+    if not is_recorded(baseline, loop):
         return ()
     return cached_measure(Recorded(), baseline, cache, context).warnings
 

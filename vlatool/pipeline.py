@@ -14,8 +14,8 @@ from vlatool.credibility import Credibility, credibility
 from vlatool.engines_apart import about_int8, choose_apart, placed
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.evaluate.recorded import EVALUATION, Recorded
-from vlatool.evidence import unjudged, with_accuracy
+from vlatool.evaluate.recorded import Recorded
+from vlatool.evidence import is_recorded, unjudged, with_accuracy
 from vlatool.explain import explanation
 from vlatool.export.onnx import ExportOnnx
 from vlatool.finish import reseal
@@ -284,7 +284,7 @@ def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
     limits = plan.recipe.limits
     if not limits.metric:
         return
-    if EVALUATION not in baseline.manifest.files:
+    if not is_recorded(baseline, plan.closed_loop):
         raise DataError(
             f"--max-drop names '{limits.metric}', which needs recorded observations; the policy brings none to be "
             "evaluated on.",
@@ -376,7 +376,7 @@ def _measure(
     rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
     rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
-    warnings = (*warnings, *unjudged(bundles[BASELINE], plan.cache, context))
+    warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
     if plan.profile:
         foretold = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}

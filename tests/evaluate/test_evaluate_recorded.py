@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from vlatool.bundle import Bundle, restate, seal
+from vlatool.data import evaluation_recording, recorded_observations
 from vlatool.errors import DataError, GraphError
 from vlatool.evaluate import recorded
 from vlatool.evaluate.recorded import Recorded, compare, run_recorded
@@ -114,12 +115,44 @@ def test_data_without_expert_actions_or_episodes_is_still_run(float_bundle, poli
 
 def test_without_data_the_remedy_is_named(float_bundle, copied):
     bare = copied(float_bundle)
-    (bare.path / "data/evaluation.npz").unlink()
+    for name in ("evaluation", "calibration"):
+        (bare.path / f"data/{name}.npz").unlink()
     bare = seal(bare.path, bare.manifest)
     with pytest.raises(DataError, match="carries no evaluation data") as caught:
         Recorded().check(Bundle.open(bare.path), None)
     assert caught.value.fix == "pass --data FILE.npz"
     Recorded().check(None, None)
+
+
+def test_with_calibration_data_alone_a_half_that_calibration_does_not_see_is_evaluated_on(float_bundle, copied):
+    bare = copied(float_bundle)
+    (bare.path / "data/evaluation.npz").unlink()
+    bare = seal(bare.path, bare.manifest)
+    Recorded().check(bare, None)
+    report = Recorded(baseline=float_bundle.path).run(bare, Context())
+    assert report.rows[-1].get("error_baseline").samples == 12
+    assert report.rows[-1].value("error_baseline") == 0.0
+    assert report.title == "tiny on 12 calibration observations"
+    assert "12 of the 24 observations for calibration, held out of it" in report.warnings[0]
+    seen = {tuple(each["proprio"]) for each in recorded_observations(bare, 99)}
+    held_out = {tuple(each["proprio"]) for each in evaluation_recording(bare)[0]}
+    assert len(seen) == len(held_out) == 12
+    assert not seen & held_out
+    assert len(recorded_observations(float_bundle, 99)) == 24, (
+        "a bundle with an evaluation recording calibrates with all"
+    )
+
+
+def test_a_few_calibration_observations_are_not_split_and_that_is_said(float_bundle, copied):
+    bare = copied(float_bundle)
+    (bare.path / "data/evaluation.npz").unlink()
+    with np.load(bare.path / "data/calibration.npz") as data:
+        np.savez(bare.path / "data/calibration.npz", **{name: data[name][:15] for name in data.files})
+    bare = seal(bare.path, bare.manifest)
+    report = Recorded(baseline=float_bundle.path).run(bare, Context())
+    assert report.rows[-1].get("error_baseline").samples == 15
+    assert "what calibrates is what evaluates" in report.warnings[0]
+    assert len(recorded_observations(bare, 99)) == 15
 
 
 def test_continuous_actions_by_hand():

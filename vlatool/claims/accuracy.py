@@ -11,11 +11,11 @@ import numpy as np
 from vlatool.bundle import Bundle
 from vlatool.claims._found import CONFIDENCE, Found, worst
 from vlatool.credibility import DECIDE, credibility
-from vlatool.data import read_recording
+from vlatool.data import EVALUATION, read_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._losses import drop, losses
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.evaluate.recorded import EVALUATION, alone, run_recorded
+from vlatool.evaluate.recorded import alone, run_recorded
 from vlatool.gate import AccuracyClaim
 from vlatool.report import Measurement, Row
 from vlatool.stage import Context

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from vlatool.data._doubts import doubts
 from vlatool.data._drawn import DRAWN, OTHER, RECORDED, Drawer, Drawn, read_drawn, save_drawn
+from vlatool.data._halves import halves
 from vlatool.data._observations import (
     CALIBRATION,
     EVALUATION,
     calibration_recording,
+    evaluation_recording,
     observations_for,
     recorded_observations,
     synthetic_observations,
@@ -25,6 +27,8 @@ __all__ = [
     "Recording",
     "calibration_recording",
     "doubts",
+    "evaluation_recording",
+    "halves",
     "observations_for",
     "read_drawn",
     "read_recording",

@@ -9,7 +9,9 @@ from typing import Any, overload
 import numpy as np
 
 from vlatool.bundle import Bundle
+from vlatool.data._halves import LEAST, halves
 from vlatool.data._recording import Recording, read_recording
+from vlatool.errors import DataError
 from vlatool.spec import PolicySpec, TensorSpec
 
 CALIBRATION = "data/calibration.npz"
@@ -19,12 +21,50 @@ EVALUATION = "data/evaluation.npz"
 def calibration_recording(source: Bundle, path: Path | None = None) -> Recording | None:
     """Return the calibration recording of a bundle, or the one at ``path``; None when there is neither.
 
+    Of a bundle that brings no evaluation recording it is the half that is not held out (see ``halves``).
+
     Raises:
         DataError: when it is missing, corrupt, or does not fit the spec.
     """
     own = source.path / CALIBRATION if CALIBRATION in source.manifest.files else None
     chosen = path or own
-    return None if chosen is None else read_recording(chosen, source.manifest.spec)
+    if chosen is None:
+        return None
+    recording = read_recording(chosen, source.manifest.spec)
+    return recording if path or EVALUATION in source.manifest.files else halves(recording)[0]
+
+
+def evaluation_recording(source: Bundle, path: Path | None = None) -> tuple[Recording, str]:
+    """Return the recording to evaluate a bundle on, and a reservation about it, empty when there is none.
+
+    Args:
+        source: With an evaluation recording, or a calibration recording of which a half is held out.
+        path: A recording to read in the place of the bundle's own.
+
+    Raises:
+        DataError: when there is none, or it is missing, corrupt, or does not fit the spec.
+    """
+    files, spec = source.manifest.files, source.manifest.spec
+    if path is not None or EVALUATION in files:
+        return read_recording(path or source.path / EVALUATION, spec), ""
+    if CALIBRATION not in files:
+        raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
+    whole = read_recording(source.path / CALIBRATION, spec)
+    _, held_out = halves(whole)
+    return held_out, _reservation(held_out, whole)
+
+
+def _reservation(held_out: Recording, whole: Recording) -> str:
+    if held_out is not whole:
+        return (
+            f"there is no evaluation recording: the errors are taken on {len(held_out)} of the {len(whole)} "
+            "observations for calibration, held out of it; to use others: evaluation: FILE.npz in policy.yaml"
+        )
+    return (
+        f"there is no evaluation recording, and {len(whole)} calibration observations are too few to hold out a half: "
+        f"what calibrates is what evaluates, which flatters it; record {2 * LEAST} or more, or name others: "
+        "evaluation: FILE.npz in policy.yaml"
+    )
 
 
 class Observations(Sequence[dict[str, Any]]):

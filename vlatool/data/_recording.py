@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,17 @@ class Recording:
             name: str(values[index]) if values.dtype.kind == "U" else values[index]
             for name, values in self.inputs.items()
         }
+
+    def only(self, chosen: NDArray[np.bool_]) -> Recording:
+        """Return the observations that are chosen, in their order.
+
+        Args:
+            chosen: (N,) of each observation.
+        """
+        inputs = {name: values[chosen] for name, values in self.inputs.items()}
+        actions = None if self.actions is None else self.actions[chosen]
+        episodes = None if self.episodes is None else self.episodes[chosen]
+        return replace(self, inputs=inputs, actions=actions, episodes=episodes)
 
     @property
     def unjudged(self) -> tuple[str, ...]:

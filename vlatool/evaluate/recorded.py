@@ -14,7 +14,7 @@ from pydantic import Field
 
 from vlatool.bundle import MANIFEST, Bundle
 from vlatool.credibility import Credibility, credibility
-from vlatool.data import Recording, read_recording
+from vlatool.data import CALIBRATION, EVALUATION, Recording, evaluation_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._losses import agreeing, scale_of
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from vlatool.profile import Profile
 
 Array = NDArray[Any]
-EVALUATION = "data/evaluation.npz"
 KEPT = 4
 NEVER_VARIES = {
     "expert": "the expert's action never varies, so no error relative to its spread",
@@ -44,7 +43,10 @@ REFERENCES: dict[tuple[Any, ...], Array] = {}
 class Recorded(Measure):
     """Run a bundle on recorded observations and compare its actions with the expert's and with a baseline's."""
 
-    data: Path | None = Field(None, description="recorded observations and actions; the bundle's own when not given")
+    data: Path | None = Field(
+        None,
+        description="recorded observations and actions; the bundle's own, or half of its calibration, when not given",
+    )
     baseline: Path | None = Field(None, description="bundle to compare with, usually float32")
     samples: int = Field(100_000, ge=1, description="largest number of samples, spread over the recording")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
@@ -55,12 +57,12 @@ class Recorded(Measure):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to evaluate on."""
-        if source is not None:
-            self._data(source)
+        if source is not None and self.data is None and not carries_recordings(source):
+            raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Evaluate and return a row for the bundle, and one for the baseline when there is one."""
-        recording = read_recording(self._data(source), source.manifest.spec)
+        recording, reservation = evaluation_recording(source, self.data)
         indices = recording.spread(self.samples)
         action = source.manifest.spec.action
         expert = None if recording.actions is None else recording.actions[indices]
@@ -76,22 +78,24 @@ class Recorded(Measure):
         if reference is not None:
             measurements += compare(action, got, reference, "baseline")
         rows.append(Row(source.manifest.name, measurements=tuple(measurements)))
-        title = f"{source.manifest.name} on {len(indices)} recorded observations"
+        kind = "calibration" if reservation else "recorded"
+        title = f"{source.manifest.name} on {len(indices)} {kind} observations"
         trust = credibility(rows[0]) if self.baseline else Credibility("unknown")
         text = f"{title}: {_summary(rows[-1])}."
         verdict = "inconclusive" if trust.fails else "info"
         said = (*trust.sentences, text)
-        warnings = (*trust.warnings, *recording.unjudged, *found_wrong(source))
+        told = (reservation,) if reservation else ()
+        warnings = (*told, *trust.warnings, *recording.unjudged, *found_wrong(source))
         return Report("evaluate", title, verdict, said, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _reference(
         self, baseline: Bundle, source: Bundle, recording: Recording, indices: Sequence[int], context: Context
     ) -> Array:
         """Run the baseline, once in a process: a search compares many bundles with it."""
-        data = self._data(source)
-        state = data.stat()
+        state = recording.path.stat()
         spec = json.dumps(source.manifest.spec.to_dict(), sort_keys=True)
-        key = (baseline.hash, spec, data, state.st_mtime_ns, state.st_size, tuple(indices), self.engine)
+        file = (recording.path, state.st_mtime_ns, state.st_size, len(recording))
+        key = (baseline.hash, spec, file, tuple(indices), self.engine)
         if key not in REFERENCES:
             context.tell("running the baseline", None)
             while len(REFERENCES) >= KEPT:
@@ -100,12 +104,10 @@ class Recorded(Measure):
             REFERENCES[key].setflags(write=False)
         return REFERENCES[key]
 
-    def _data(self, source: Bundle) -> Path:
-        own = source.path / EVALUATION if EVALUATION in source.manifest.files else None
-        chosen = self.data or own
-        if chosen is None:
-            raise DataError(f"{source.path} carries no evaluation data.", "pass --data FILE.npz")
-        return chosen
+
+def carries_recordings(bundle: Bundle) -> bool:
+    """Say whether a bundle brings observations to evaluate it on: recorded for it, or for calibration."""
+    return EVALUATION in bundle.manifest.files or CALIBRATION in bundle.manifest.files
 
 
 def _summary(row: Row) -> str:
