@@ -56,6 +56,9 @@ def cells(policy: Foreign) -> Iterator[Cell]:
     yield Cell("export", ("export", source, "-o", float32))
     yield Cell("infer, ONNX Runtime", (float32, policy.name, "ort_cpu"), ANSWERS, drift=1e-5)
     yield Cell("infer, OpenVINO", (float32, policy.name, "openvino"), ANSWERS, drift=1e-4)
+    if policy.verified:
+        against = ("--against", f"{policy.name}/original.py:act", "--data", f"{policy.name}/evaluation.npz")
+        yield Cell("verify", ("verify", source, *against, "--samples", "8"))
     yield Cell("inspect", ("inspect", float32, "--probe"))
     yield Cell("hwselect SOURCE", ("hwselect", source, "--hz", "10"), codes=JUDGED)
     yield Cell("hwselect BUNDLE", ("hwselect", float32, "--hz", "10"), codes=JUDGED)

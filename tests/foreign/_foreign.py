@@ -19,6 +19,7 @@ class Foreign:
         source: What `vlatool export` is given, relative to the folder's parent; the folder when empty.
         scripts: What makes it from nothing, in order; all run in the folder.
         environment: Whether it can play episodes.
+        verified: Whether original.py has an ``act`` to verify the wrapper against.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Foreign:
     source: str = ""
     scripts: tuple[str, ...] = ("original.py",)
     environment: bool = False
+    verified: bool = False
 
     @property
     def exported(self) -> str:
@@ -36,12 +38,12 @@ class Foreign:
 
 LEROBOT = ("original.py", "describe.py")
 POLICIES = (
-    Foreign("lerobot_act", "LeRobot ACT", "lerobot", scripts=LEROBOT),
+    Foreign("lerobot_act", "LeRobot ACT", "lerobot", scripts=LEROBOT, verified=True),
     Foreign("lerobot_diffusion", "LeRobot Diffusion", "lerobot", scripts=LEROBOT),
     Foreign("lerobot_smolvla", "LeRobot SmolVLA", "lerobot", scripts=LEROBOT),
     Foreign("resnet_gru", "ResNet-18 + GRU", "common"),
-    Foreign("ppo_mlp", "SB3 PPO, MLP", "common", environment=True),
-    Foreign("ppo_cnn", "SB3 PPO, CNN", "common", environment=True),
+    Foreign("ppo_mlp", "SB3 PPO, MLP", "common", environment=True, verified=True),
+    Foreign("ppo_cnn", "SB3 PPO, CNN", "common", environment=True, verified=True),
     Foreign("clip", "CLIP, ONNX file", "common", source="clip/clip.onnx"),
-    Foreign("llama", "Llama, KV cache", "common"),
+    Foreign("llama", "Llama, KV cache", "common", verified=True),
 )

@@ -42,7 +42,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--rows", nargs="+", default=["*"], metavar="GLOB", help="rows by name")
     parser.add_argument("--fresh", action="store_true", help="run again what was run before")
     parser.add_argument("--report", action="store_true", help="run nothing: print what was found last")
-    parser.add_argument("--guides", action="store_true", help="also follow the guides, command by command")
+    parser.add_argument("--guides", nargs="*", metavar="GLOB", help="also follow the guides, all or by name")
     parser.add_argument("-o", "--output", type=Path, required=True, help="where everything is made")
     return parser.parse_args(arguments)
 
@@ -55,13 +55,14 @@ def main() -> int:
     if not asked.report:
         for policy in chosen:
             run(policy, asked, folder)
-    found = {(policy.name, row): verdict for policy in chosen for row, verdict in kept(folder, policy).items()}
+    found = {place: verdict for policy in chosen for place, verdict in verdicts(policy, folder).items()}
     text = markdown([(policy.name, policy.title) for policy in chosen], rows_of(chosen, found), found)
     (folder / "table.md").write_text(text, encoding="utf-8")
     print(text)
-    guides = not asked.guides or followed(asked, folder)
+    guides = asked.guides is None or followed(asked, folder)
     bad = [f"{name}: {row}" for (name, row), verdict in found.items() if verdict.kind not in GOOD]
-    print(f"{len(found)} cells, {len(bad)} not good" + "".join(f"\n  {line}" for line in bad))
+    done = sum(verdict.kind != MISSING for verdict in found.values())
+    print(f"{done} of {len(found)} cells run, {len(bad)} not good" + "".join(f"\n  {line}" for line in bad))
     return 1 if bad or not guides else 0
 
 
@@ -110,6 +111,12 @@ def kept(folder: Path, policy: Foreign) -> dict[str, Verdict]:
     return {row: Verdict(**said) for row, said in json.loads(file.read_text()).items()} if file.exists() else {}
 
 
+def verdicts(policy: Foreign, folder: Path) -> dict[tuple[str, str], Verdict]:
+    """(Policy, row) -> what was found, for every cell of a policy."""
+    done = kept(folder, policy)
+    return {(policy.name, cell.row): done.get(cell.row, Verdict(MISSING)) for cell in cells(policy)}
+
+
 def make(policy: Foreign, folder: Path, venv: Path) -> None:
     """Copy the policy's files, and let its scripts make checkpoint and recordings where they are not there yet."""
     place, gate = folder / policy.name, folder / "out" / policy.name / "gate.yaml"
@@ -151,7 +158,7 @@ def tried(cell: Cell, folder: Path, venv: Path) -> Verdict:
 
 def followed(asked: argparse.Namespace, folder: Path) -> bool:
     """Follow every guide; return whether all of them ran."""
-    return False not in [guide(name, asked, folder) for name in GUIDES]
+    return False not in [guide(name, asked, folder) for name in GUIDES if wanted(name, asked.guides or ["*"])]
 
 
 def guide(name: str, asked: argparse.Namespace, folder: Path) -> bool:

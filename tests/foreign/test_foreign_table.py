@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,21 @@ def test_a_guide_shows_the_files_that_are_run(guide):
     assert {name: shown[name] for name in there} == there
     assert "policy.yaml" in there
     assert set(shown) - set(there) <= {"robot.py"}
+
+
+PINS = re.compile(r"^([a-z-]+)(?:\[\w+\])?==([\w.]+)", re.MULTILINE)
+
+
+@pytest.mark.parametrize(("packages", "guide"), [("lerobot", "lerobot"), ("common", "hugging-face")])
+def test_a_guide_installs_what_is_run(packages, guide):
+    pins = dict(PINS.findall((HERE / f"{packages}.txt").read_text()))
+    (line,) = re.findall(r"^pip install .*", GUIDES[guide].page.read_text(), re.MULTILINE)
+    told = dict(word.split("==") for word in line.split() if "==" in word)
+    assert told
+    assert told == {name: pins[name] for name in told}
+    least = re.search(r"torch>=2\.(\d+)", (HERE.parents[1] / "pyproject.toml").read_text())
+    assert least
+    assert int(least[1]) <= int(pins["torch"].split(".")[1])
 
 
 def test_a_lerobot_checkpoint_becomes_a_report_in_five_commands_at_most():

@@ -35,11 +35,11 @@ def observations(network, seed, count):
 if __name__ == "__main__":
     torch.manual_seed(0)
     tower = {"hidden_size": 64, "intermediate_size": 128, "num_hidden_layers": 3, "num_attention_heads": 4}
-    text = {**tower, "vocab_size": 100, "max_position_embeddings": 12, "eos_token_id": 99}
+    text = {**tower, "vocab_size": 100, "max_position_embeddings": 12, "bos_token_id": 1, "eos_token_id": 99}
     config = CLIPConfig(
         text_config=text, vision_config={**tower, "image_size": 64, "patch_size": 16}, projection_dim=32
     )
-    network = Similarity(CLIPModel(config).eval())
+    network = Similarity(CLIPModel(config)).eval()
     example = (torch.zeros(1, 3, 64, 64), torch.full((1, 12), 99))
     names = {"input_names": ["pixels", "ids"], "output_names": ["action"]}
     torch.onnx.export(network, example, HERE / "clip.onnx", dynamo=True, external_data=False, **names)

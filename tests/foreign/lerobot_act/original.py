@@ -1,5 +1,6 @@
 """Somebody's checkpoint: a LeRobot ACT (random weights) with its processors, and what select_action() does."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,18 @@ def statistics():
     joints = {"mean": torch.linspace(-20, 30, JOINTS), "std": torch.linspace(5, 25, JOINTS)}
     picture = {"mean": torch.tensor([0.485, 0.456, 0.406])[:, None, None], "std": torch.full((3, 1, 1), 0.225)}
     return {"observation.state": joints, "action": dict(joints), "observation.images.front": picture}
+
+
+@functools.cache
+def loaded():
+    """The policy and its processors from the checkpoint."""
+    policy = ACTPolicy.from_pretrained(HERE / "checkpoint").eval()
+    return policy, *make_pre_post_processors(policy.config, pretrained_path=str(HERE / "checkpoint"))
+
+
+def act(observation):
+    """State (6,) in degrees and picture (96, 128, 3) uint8 to a chunk (50, 6) in degrees."""
+    return chunk(*loaded(), observation["state"], observation["front"])
 
 
 def chunk(policy, before, after, state, front):

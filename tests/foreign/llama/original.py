@@ -1,5 +1,6 @@
 """What somebody has: a Llama (random weights, small) that writes seven action tokens, and what generate() writes."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,14 @@ HERE = Path(__file__).parent
 PROMPT, TOKENS = 16, 7
 
 
+@functools.cache
+def loaded():
+    return LlamaForCausalLM.from_pretrained(HERE / "checkpoint").eval()
+
+
 def act(observation):
-    """Prompt ids (16,) to token ids (1, 7), as transformers' own generate() writes them."""
-    model = LlamaForCausalLM.from_pretrained(HERE / "checkpoint").eval()
-    return written(model, observation["ids"])
+    """Prompt ids (16,) to token ids (7,), as transformers' own generate() writes them."""
+    return written(loaded(), observation["ids"])
 
 
 def written(model, ids):

@@ -1,5 +1,6 @@
 """Somebody's training: PPO from Stable-Baselines3 on pictures, and what its own predict() does on recorded ones."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,14 @@ from stable_baselines3 import PPO
 HERE = Path(__file__).parent
 
 
+@functools.cache
+def loaded():
+    return PPO.load(HERE / "ppo.zip", device="cpu")
+
+
 def act(observation):
     """Picture (84, 84, 3) uint8 to the index of a move (1,)."""
-    action, _ = PPO.load(HERE / "ppo.zip", device="cpu").predict(observation["image"], deterministic=True)
+    action, _ = loaded().predict(observation["image"], deterministic=True)
     return np.asarray(action).reshape(1)
 
 

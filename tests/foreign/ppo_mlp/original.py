@@ -1,5 +1,6 @@
 """Somebody's training: PPO from Stable-Baselines3 on Pendulum-v1, and what its own predict() does."""
 
+import functools
 from pathlib import Path
 
 import gymnasium
@@ -9,9 +10,14 @@ from stable_baselines3 import PPO
 HERE = Path(__file__).parent
 
 
+@functools.cache
+def loaded():
+    return PPO.load(HERE / "ppo.zip", device="cpu")
+
+
 def act(observation):
     """State (3,) to torque (1, 1)."""
-    action, _ = PPO.load(HERE / "ppo.zip", device="cpu").predict(observation["state"], deterministic=True)
+    action, _ = loaded().predict(observation["state"], deterministic=True)
     return np.asarray(action, np.float32).reshape(1, 1)
 
 
