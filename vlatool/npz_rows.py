@@ -155,6 +155,28 @@ class Packed:
         return Plain(kept, 0)
 
 
+class Chosen:
+    """Some rows of an array, as if they were all that there are.
+
+    Args:
+        source: Where the array is.
+        places: Number of each row in it, ascending.
+        row: Bytes of a row.
+    """
+
+    def __init__(self, source: Source, places: NDArray[np.intp], row: int) -> None:
+        self._source, self._places, self._row = source, places, row
+
+    def read_into(self, buffer: memoryview, at: int) -> int:
+        """Fill a buffer with the bytes from the start of one of the rows; return how many there were."""
+        done = 0
+        first = at // self._row
+        for place in self._places[first : first + math.ceil(len(buffer) / self._row)]:
+            part = buffer[done : done + self._row]
+            done += self._source.read_into(part, int(place) * self._row)
+        return done
+
+
 class Rows:
     """An array on the disk whose first axis counts samples; what is asked for is read, and nothing is kept.
 
@@ -217,6 +239,16 @@ class Rows:
         if array.nbytes and self._source.read_into(room, first * (array.nbytes // count)) < array.nbytes:
             raise DataError(f"{self.where} was changed while it was read.", "run it again once nothing writes there")
         return array.astype(self.dtype, copy=False)
+
+    def only(self, chosen: NDArray[np.bool_]) -> Rows:
+        """Return the rows that are chosen, which stay on the disk too.
+
+        Args:
+            chosen: (N,) of each row.
+        """
+        places = np.flatnonzero(chosen)
+        row = math.prod(self.shape[1:]) * self._stored.itemsize
+        return Rows(Chosen(self._source, places, row), (len(places), *self.shape[1:]), self._stored, self.where)
 
     def without_second_axis(self) -> Rows:
         """Return the same rows where each has a further axis of one element in front."""

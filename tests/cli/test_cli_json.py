@@ -51,6 +51,10 @@ LINES = {
     "hwselect select": "{policy}",
     "hwselect score": "{points}",
     "hwselect fit": "{points} -o {out} --seconds 0",
+    "cache size": "",
+    "cache list": "",
+    "cache prune": "--all --dry-run",
+    "verify": "{policy} --against {original}:act",
     "inspect": "{bundle} --probe",
     "rebuild": "{bundle} --check --source {policy}",
     "doctor": "",
@@ -116,7 +120,10 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
     with pytest.raises(SystemExit) as left:
         main(["export", str(noisy), "-o", str(here / "bundle")])
     assert not left.value.code
-    return SimpleNamespace(policy=noisy, bundle=here / "bundle", gate=here / "gate.yaml", here=here)
+    original = "import vlatool\npolicy = vlatool.load(BUNDLE)\ndef act(given):\n    return policy.infer(given).chunk\n"
+    (here / "original.py").write_text(original.replace("BUNDLE", repr(str(here / "bundle"))))
+    made = {"bundle": here / "bundle", "original": here / "original.py", "gate": here / "gate.yaml"}
+    return SimpleNamespace(policy=noisy, **made, here=here)
 
 
 def validate(value: Any, name: str) -> None:
@@ -182,6 +189,9 @@ BAD = {
     "hwselect select": "{nothing}",
     "hwselect score": "{nothing}",
     "hwselect fit": "{nothing} -o {out}",
+    "cache": "--cache {nothing}",
+    "cache prune": "--all --cache {nothing}",
+    "verify": "{nothing} --against {nothing}:act",
     "inspect": "{nothing}",
     "rebuild": "{nothing} --check",
     "simulate": "{nothing} --profile raspberry-pi-5",

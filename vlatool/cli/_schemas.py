@@ -30,6 +30,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "hwselect select": ("report",),
     "hwselect score": ("score", "scores"),
     "hwselect fit": ("written",),
+    "cache size": ("cache_size",),
+    "cache list": ("cache_list",),
+    "cache prune": ("cache_pruned",),
+    "verify": ("report",),
     "inspect": ("manifest",),
     "rebuild": ("rebuilt",),
     "doctor": ("checks",),
@@ -81,6 +85,7 @@ PHASE = record(name=TEXT, runs=INTEGER, ms=NUMBER, shares=by_name(NUMBER), parts
 SHIFT = record(recorded=TEXT, installed=TEXT)
 GAUGE = record(unit=TEXT, min=NUMBER, mean=NUMBER, max=NUMBER, times=many(NUMBER), values=many(NUMBER), note=TEXT)
 COUNTER = record(unit=TEXT, difference=NUMBER, seconds=NUMBER, note=TEXT)
+CACHE: dict[str, Schema] = {"cache": TEXT, "bytes": INTEGER, "shared_bytes": INTEGER, "unknown": many(TEXT)}
 RAW = record(omitted={"type": "integer", "minimum": 1}, file={"type": ["string", "null"]}, fix=TEXT)
 
 
@@ -125,6 +130,14 @@ def _documents() -> dict[str, Schema]:
             bundle=TEXT, source=TEXT, identical=FLAG, hash=record(recorded=TEXT, rebuilt=TEXT), left_out=many(TEXT),
             versions=by_name(SHIFT), stages=many(record(stage=TEXT, graphs_identical=FLAG)), files=files,
             output={"type": ["string", "null"]},
+        ),
+        "cache_size": a("What the cache holds, stage by stage.", **CACHE, stages=many(
+            record(stage=TEXT, entries=INTEGER, bytes=INTEGER))),
+        "cache_list": a("What the cache holds, the least recently used first.", **CACHE, entries=many(
+            record(name=TEXT, stage=TEXT, used=TEXT, bytes=INTEGER, shared_bytes=INTEGER))),
+        "cache_pruned": a(
+            "What was removed from the cache, or would be; stays: name -> why.",
+            cache=TEXT, dry_run=FLAG, removed=many(TEXT), freed_bytes=INTEGER, bytes=INTEGER, stays=by_name(TEXT),
         ),
         "checks": many(record(name=TEXT, status=status, finding=TEXT, fix=TEXT)),
         "simulation": a(

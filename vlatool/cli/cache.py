@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import time
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlatool.cli._document import document
 from vlatool.errors import DataError, UsageError, nearest
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def size(cache: Place = None, as_json: AsJson = False) -> None:
     """Say how large the cache is, stage by stage; a recording that stages share is counted once."""
     held = _contents(cache)
     if as_json:
-        typer.echo(json.dumps(_head(held) | {"stages": [_sum(held, what) for what in _kinds(held)]}, indent=1))
+        document(_head(held) | {"stages": [_sum(held, what) for what in _kinds(held)]})
         return
     for what in _kinds(held):
         told = _sum(held, what)
@@ -45,7 +45,7 @@ def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
     """List what is kept, the least recently used first: age, size of its own, size that it shares, name."""
     held = _contents(cache)
     if as_json:
-        typer.echo(json.dumps(_head(held) | {"entries": [_told(held, entry) for entry in held.entries]}, indent=1))
+        document(_head(held) | {"entries": [_told(held, entry) for entry in held.entries]})
         return
     typer.echo(f"{'age':>6}  {'own':>9}  {'shared':>9}  name")
     for entry in held.entries:
@@ -78,7 +78,7 @@ def prune(
     removed = kept.prune(place, older_than_s=age, most_bytes=most, dry_run=dry_run)
     left = kept.contents(place).bytes - (removed.freed if dry_run else 0)
     if as_json:
-        typer.echo(json.dumps(_told_removed(place, removed, left, dry_run), indent=1))
+        document(_told_removed(place, removed, left, dry_run))
         return
     for entry in removed.entries:
         typer.echo(f"{'would remove' if dry_run else 'removed'} {entry.name}")

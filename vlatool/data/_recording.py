@@ -65,7 +65,10 @@ class Recording:
         Args:
             chosen: (N,) of each observation.
         """
-        inputs = {name: values[chosen] for name, values in self.inputs.items()}
+        inputs = {
+            name: values.only(chosen) if isinstance(values, Rows) else values[chosen]
+            for name, values in self.inputs.items()
+        }
         actions = None if self.actions is None else self.actions[chosen]
         episodes = None if self.episodes is None else self.episodes[chosen]
         return replace(self, inputs=inputs, actions=actions, episodes=episodes)
