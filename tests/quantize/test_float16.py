@@ -220,7 +220,7 @@ def test_values_beyond_float16_are_named_and_stay_in_float32(float_bundle, copie
 
 
 def test_a_sample_that_does_not_fit_is_named(float_bundle):
-    observations = recorded_observations(float_bundle, 2)
+    observations = list(recorded_observations(float_bundle, 2))
     observations[1]["proprio"] = np.zeros(5, np.float32)
     with pytest.raises(DataError, match="Calibration sample 1"):
         find_beyond(float_bundle, ["main"], observations, 1.0, Context())
