@@ -115,11 +115,16 @@ def test_when_nothing_is_inside_the_most_accurate_plan_stays(search) -> None:
     assert list(found) == [least.name]
 
 
+def made_at(cache: Path) -> dict[Path, int]:
+    """Return when each file of the stages in a cache was written."""
+    return {path: path.stat().st_mtime_ns for path in (cache / "stages").rglob("*") if path.is_file()}
+
+
 def test_a_second_search_makes_and_measures_nothing_again(search, tmp_path) -> None:
     search().run({})
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").iterdir()}
+    before = made_at(tmp_path)
     search().run({})
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").iterdir()} == before
+    assert made_at(tmp_path) == before
 
 
 def test_an_interrupted_search_goes_on_where_it_was(search, tmp_path) -> None:
@@ -134,10 +139,10 @@ def test_an_interrupted_search_goes_on_where_it_was(search, tmp_path) -> None:
     first.context = Context(stop)
     with pytest.raises(KeyboardInterrupt):
         first.run({})
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "stages").iterdir()}
+    kept = made_at(tmp_path)
     assert kept
     search().run({})
-    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert made_at(tmp_path).items() >= kept.items()
     assert "of at most" in told[0]
 
 

@@ -93,13 +93,17 @@ class Workshop:
         """A policy in ONNX with a product whose shape is not static."""
         folder = self.root / "shapeless"
         folder.mkdir()
-        shape = [1, "tokens", 4]
-        nodes = [helper.make_node("MatMul", ["state", "w"], ["hidden"]),
-                 helper.make_node("ReduceMean", ["hidden"], ["action"], axes=[1], keepdims=1)]  # fmt: skip
+        nodes = [helper.make_node("NonZero", ["state"], ["places"]),
+                 helper.make_node("Cast", ["places"], ["numbers"], to=TensorProto.FLOAT),
+                 helper.make_node("Transpose", ["numbers"], ["rows"]),
+                 helper.make_node("MatMul", ["rows", "w"], ["hidden"]),
+                 helper.make_node("ReduceMean", ["hidden"], ["mean"], axes=[0], keepdims=1),
+                 helper.make_node("Unsqueeze", ["mean", "first"], ["action"])]  # fmt: skip
         graph = helper.make_graph(
-            nodes, "g", [helper.make_tensor_value_info("state", TensorProto.FLOAT, shape)],
+            nodes, "g", [helper.make_tensor_value_info("state", TensorProto.FLOAT, [1, 3, 4])],
             [helper.make_tensor_value_info("action", TensorProto.FLOAT, [1, 1, 2])],
-            [helper.make_tensor("w", TensorProto.FLOAT, [4, 2], [0.5] * 8)],
+            [helper.make_tensor("w", TensorProto.FLOAT, [3, 2], [0.5] * 6),
+             helper.make_tensor("first", TensorProto.INT64, [1], [0])],
         )  # fmt: skip
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
         onnx.save(model, folder / "shapeless.onnx")

@@ -157,10 +157,10 @@ def test_gptq_and_awq_lose_less_of_the_product(form, inputs):
     assert by_activation.inputs.shape == (inputs,)
 
 
-def test_gptq_keeps_the_weights_it_was_given_and_drops_dead_inputs():
+def test_gptq_keeps_the_weights_it_was_given_and_those_of_dead_inputs():
     weight, seen = weights(32 * 64).reshape(32, 64), activations(256, 64)
     seen[:, 5] = 0
     before = weight.copy()
     made = gptq(weight, seen, Format(), METHODS["searched"])
     np.testing.assert_array_equal(weight, before)
-    np.testing.assert_array_equal(made.meant[:, 5], 0)
+    assert np.linalg.norm(made.meant[:, 5] - weight[:, 5]) < 0.2 * np.linalg.norm(weight[:, 5])

@@ -73,7 +73,7 @@ def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
 
 def _identical(recording: Recording, numbers: Sequence[int]) -> bool:
     return all(
-        bool((values[number] == values[numbers[0]]).all()) for values in recording.inputs.values() for number in numbers
+        np.array_equal(values[number], values[numbers[0]]) for values in recording.inputs.values() for number in numbers
     )
 
 

@@ -209,8 +209,11 @@ def run(candidate: Path, baseline: Path, config: Path) -> tuple[int, str]:
 
 
 def failed(report: str) -> str:
-    """Return the claims of a report that fail, each with its sentence."""
-    claims = json.loads(report)["rows"][1]["details"]["claims"]
+    """Return the claims of a document that fail, each with its sentence; the error where the gate judged nothing."""
+    told = json.loads(report)
+    if "rows" not in told:
+        return f"error: {told['error']['message']}"
+    claims = told["rows"][1]["details"]["claims"]
     return "; ".join(f"{each['claim']}: {each['found']}" for each in claims if each["verdict"] == "fail")
 
 
