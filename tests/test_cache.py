@@ -11,7 +11,7 @@ from _tiny import observations
 from vlatool.bundle import Bundle
 from vlatool.cache import contents, prune
 from vlatool.evaluate.recorded import Recorded
-from vlatool.hwselect._stored import write_workload
+from vlatool.hwselect._stored import LAYOUT, write_workload
 from vlatool.hwselect._workload import workload
 from vlatool.in_use import hold, release
 from vlatool.kept_files import FILES
@@ -228,3 +228,16 @@ def test_unfinished_work_is_an_entry_that_its_lock_protects(cache: Path):
     age(cache)
     assert [entry.what for entry in prune(cache, older_than_s=0).entries] == ["unfinished work"]
     assert not place.exists()
+
+
+@pytest.mark.parametrize(("change", "ours"), [(("", ""), True), (('"layout": LAYOUT', '"layout": 3'), True),
+                                              (("graphs", "others"), False), (("{", "["), False)])  # fmt: skip
+def test_a_count_of_an_earlier_layout_is_vlatools_too(cache, float_bundle, change, ours) -> None:
+    file = cache / "workloads" / f"{'1' * 32}.json"
+    write_workload(file, workload(float_bundle))
+    old, new = (part.replace("LAYOUT", str(LAYOUT)) for part in change)
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new) if old else file.read_text())
+    held = contents(cache)
+    assert (f"workloads/{file.name}" in {entry.name for entry in held.entries}) is ours
+    assert (f"workloads/{file.name}" in held.unknown) is not ours

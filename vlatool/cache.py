@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlatool.hwselect._stored import read_workload
+from vlatool.hwselect._stored import is_workload
 from vlatool.in_use import alone
 from vlatool.kept_files import DIGEST, FILES, STAGES, TAG
 from vlatool.writing import sweep
@@ -187,7 +187,7 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
         files = _own_files(path, STREAM_FILES) if (path / STREAM_FILES[0]).is_file() else {}
         used = (path / STREAM_FILES[0]).stat().st_mtime if files else 0.0
         return Entry(name, "unfinished work", used, files) if files else None
-    if not stat.S_ISREG(status.st_mode) or read_workload(path) is None:
+    if not stat.S_ISREG(status.st_mode) or not is_workload(path):
         return None
     return Entry(name, "count of a policy", status.st_mtime, {"": _inode(status)})
 

@@ -47,6 +47,17 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
     return from_values(data)
 
 
+def is_workload(file: Path) -> bool:
+    """Say whether a file is one of this package's, of an earlier layout too, which nobody reads any more."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    if not isinstance(data, dict) or not isinstance(data.get("layout"), int):
+        return False
+    return from_values(data) is not None if data["layout"] >= LAYOUT else isinstance(data.get("graphs"), dict)
+
+
 def from_values(data: Any) -> Workload | None:
     """Return the workload of what ``to_values`` gave; None when it is something else."""
     if not isinstance(data, dict) or data.get("layout") != LAYOUT:
