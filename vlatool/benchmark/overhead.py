@@ -42,9 +42,15 @@ class Overhead(Measure):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The program is one graph that runs once, so that there is one bare call to compare with."""
         if source is not None and (len(source.manifest.program) != 1 or source.manifest.program[0].repeat != 1):
-            raise UsageError("The overhead is measured on a policy of one graph that runs once for each inference.")
+            raise UsageError(
+                "The overhead is measured on a policy of one graph that runs once for each inference.",
+                "vlatool benchmark latency measures all of what infer() does, the program of several graphs included",
+            )
         if source is not None and source.manifest.engine not in ("", "ort_cpu"):
-            raise UsageError(f"The overhead is measured on ONNX Runtime; the bundle is for {source.manifest.engine}.")
+            raise UsageError(
+                f"The overhead is measured on ONNX Runtime; the bundle is for {source.manifest.engine}.",
+                "make the bundle with --layout ort, or measure it with vlatool benchmark latency",
+            )
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Return the median of the paired differences in microseconds."""
