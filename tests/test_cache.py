@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from _tiny import observations
 
+from vlatool import cache as cache_module
 from vlatool.bundle import Bundle
 from vlatool.cache import contents, prune
 from vlatool.evaluate.recorded import Recorded
@@ -201,11 +203,29 @@ def test_drafts_of_killed_writers_are_removed_and_those_of_living_ones_stay(kept
     (cache / FILES).mkdir()
     dead = cache / FILES / f".{'a' * 64}.{int(gone.stdout)}-0123abcd.part"
     living = cache / FILES / f".{'a' * 64}.{os.getpid()}-0123abcd.part"
-    for path in (dead, living):
+    elsewhere = cache / FILES / f".{'a' * 64}.{int(gone.stdout)}-4567abcd.part"
+    for path in (dead, living, elsewhere):
         path.write_text("half")
+    long_ago = time.time_ns() / 1e9 - DAY
+    for path in (dead, living):
+        os.utime(path, (long_ago, long_ago))
     prune(cache, older_than_s=1000 * DAY)
-    assert (dead.exists(), living.exists()) == (False, True)
+    assert [path.exists() for path in (dead, living, elsewhere)] == [False, True, True]
     assert contents(cache).unknown == ()
+
+
+def test_what_another_process_removes_meanwhile_is_no_entry(kept: Bundle, cache: Path, monkeypatch: pytest.MonkeyPatch):
+    (cache / FILES).mkdir()
+    gone = {folder: cache / folder / name for folder, name in (
+        ("stages", "export.onnx-" + "0" * 16), ("workloads", "0" * 32 + ".json"), (FILES, "c" * 64))}  # fmt: skip
+    below = cache_module._below
+    monkeypatch.setattr(
+        cache_module, "_below", lambda folder: below(folder) + [gone[name] for name in gone if name == folder.name]
+    )
+    before = {path.relative_to(cache).as_posix() for path in below(cache / "stages")}
+    found = contents(cache)
+    assert {entry.name for entry in found.entries if entry.name.startswith("stages")} == before
+    assert (found.kept, found.unknown) == ({}, ())
 
 
 def test_a_file_that_only_looks_like_a_shared_one_stays(kept: Bundle, cache: Path):

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from vlatool.engines_apart import IN_OPENVINO, REFERENCE, about_int8, choose_apart, joined, on_board, placed
+from vlatool.engines_apart import IN_OPENVINO, REFERENCE, about_int8, choose_apart, in_int8, joined, on_board, placed
 from vlatool.instruction_sets import compared
 from vlatool.judge import Judged
 from vlatool.report import Measurement, Row
@@ -127,6 +127,15 @@ def test_a_board_without_vnni_is_told_how_int8_does(p50: float, verdict: str):
     assert said.startswith("old has no VNNI: int8 products are added in pairs of 16 bits there")
     assert verdict in said
     assert "as fast as float32 in OpenVINO, of the instruction set of old (AVX2), on another core" in said
+
+
+def test_only_what_multiplies_in_int8_tells_how_int8_does(float_bundle):
+    def computing(precision):
+        graph = replace(float_bundle.manifest.graphs["main"], precision=precision)
+        return replace(float_bundle, manifest=replace(float_bundle.manifest, graphs={"main": graph}))
+
+    bundles = {"weights": computing({"float32": 1.0}), "fast": computing({"int8": 0.9, "float32": 0.1})}
+    assert in_int8(bundles, {"weights": "openvino", "fast": "openvino"}) == {"fast": "openvino"}
 
 
 def test_a_board_without_vnni_and_without_a_plan_is_told_too_and_one_with_vnni_nothing():

@@ -69,6 +69,16 @@ def test_a_process_is_confined_when_the_variable_says_so_and_the_processor_can(b
     assert not found.to_set or not told, "what a person set is not set again"
 
 
+@pytest.mark.parametrize(
+    ("host", "told", "warned"), [(NUC, "AVX512_CORE_AMX", False), (ZEN4, "AVX512_CORE_AMX", True), (NUC, "AVX2", True)]
+)
+def test_a_name_above_what_the_processor_has_confines_nothing(host, told: str, warned: bool):
+    found = compared("nuc", NUC, host, told)
+    assert found.alike is (host == NUC and told != "AVX2")
+    assert bool(found.warnings()) is warned
+    assert ("ONEDNN_MAX_CPU_ISA" in str(found.warnings())) is (told == "AVX2")
+
+
 def test_what_is_said_of_a_confined_run():
     set_, engines = compared("nuc", NUC, ZEN5, "AVX2_VNNI").sentences()
     assert "confined to AVX2_VNNI, the instruction set of nuc: its errors are of that set" in set_

@@ -121,6 +121,14 @@ def test_a_full_disk_is_told_when_a_packed_array_must_be_unpacked(tmp_path: Path
     assert "np.savez instead" in caught.value.fix
 
 
+def test_a_disk_that_takes_a_part_of_a_block_gets_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    np.savez_compressed(tmp_path / "a.npz", image=frames())
+    found, write = rows(tmp_path / "a.npz"), os.write
+    monkeypatch.setattr("vlatool.npz_rows.os.write", lambda handle, block: write(handle, block[:1000]))
+    for at in (9, 7, 5, 3, 1):
+        np.testing.assert_array_equal(found[at], frames()[at])
+
+
 def test_a_packed_array_that_is_read_out_of_order_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
     (tmp_path / "scratch").mkdir()

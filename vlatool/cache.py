@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from vlatool.hwselect._stored import is_workload
@@ -72,8 +73,9 @@ class Contents:
     kept: dict[str, tuple[Inode, int]]
     unknown: tuple[str, ...] = ()
 
+    @cached_property
     def uses(self) -> Counter[Inode]:
-        """Return how many entries hold each file."""
+        """How many entries hold each file."""
         return Counter(inode for entry in self.entries for inode in {inode for inode, _ in entry.files.values()})
 
     @property
@@ -84,9 +86,8 @@ class Contents:
 
     def sizes(self, entry: Entry) -> tuple[int, int]:
         """Return the bytes of an entry that are its own, and those that others have, too."""
-        uses = self.uses()
         files = dict(entry.files.values())
-        own = sum(size for inode, size in files.items() if uses[inode] == 1)
+        own = sum(size for inode, size in files.items() if self.uses[inode] == 1)
         return own, sum(files.values()) - own
 
 
@@ -108,20 +109,33 @@ def contents(cache: Path) -> Contents:
     found, unknown = [], []
     for folder in (STAGES, STREAMS, WORKLOADS):
         for path in _below(cache / folder):
-            entry = _entry(cache, folder, path)
+            try:
+                entry = _entry(cache, folder, path)
+            except FileNotFoundError:  # another process removed it since the folder was read
+                continue
             if entry is not None:
                 found.append(entry)
             elif not DRAFT.fullmatch(path.name):
                 unknown.append(path.relative_to(cache).as_posix())
-    kept = {}
-    for path in _below(cache / FILES):
-        if DIGEST.fullmatch(path.name) and stat.S_ISREG(path.lstat().st_mode):
-            kept[path.relative_to(cache).as_posix()] = _inode(path.lstat())
-        elif not PART.fullmatch(path.name):
-            unknown.append(path.relative_to(cache).as_posix())
+    kept, others = _kept(cache)
+    unknown += others
     known = (STAGES, STREAMS, WORKLOADS, FILES, TAG)
     unknown += [path.name for path in _below(cache) if path.name not in known]
     return Contents(cache, tuple(sorted(found, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
+
+
+def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
+    """Return the shared files by their names below the cache, and the names of what lies beside them."""
+    kept, unknown = {}, []
+    for path in _below(cache / FILES):
+        name = path.relative_to(cache).as_posix()
+        with contextlib.suppress(FileNotFoundError):
+            status = path.lstat()
+            if DIGEST.fullmatch(path.name) and stat.S_ISREG(status.st_mode):
+                kept[name] = _inode(status)
+            elif not PART.fullmatch(path.name):
+                unknown.append(name)
+    return kept, unknown
 
 
 def prune(
@@ -136,7 +150,7 @@ def prune(
         dry_run: Only say what would be removed.
     """
     held = contents(cache)
-    uses = held.uses()
+    uses = Counter(held.uses)
     orphans = {inode: size for inode, size in held.kept.values() if not uses[inode]}
     left = held.bytes - sum(orphans.values())
     removed: list[Entry] = []
@@ -203,9 +217,10 @@ def _own_files(path: Path, names: Iterable[str]) -> dict[str, tuple[Inode, int]]
     for folder, _, files in os.walk(path):
         for file in files:
             name = Path(folder, file).relative_to(path).as_posix()
-            status = os.lstat(Path(folder, file))
-            if name in wanted and stat.S_ISREG(status.st_mode):
-                found[name] = _inode(status)
+            with contextlib.suppress(FileNotFoundError):
+                status = os.lstat(Path(folder, file))
+                if name in wanted and stat.S_ISREG(status.st_mode):
+                    found[name] = _inode(status)
     return found
 
 
@@ -256,5 +271,12 @@ def _drafts(cache: Path) -> Iterator[Path]:
         sweep(cache / STAGES / final)
     for path in _below(cache / FILES):
         found = PART.fullmatch(path.name)
-        if found and stat.S_ISREG(path.lstat().st_mode) and not Path(f"/proc/{found['process']}").exists():
-            yield path
+        with contextlib.suppress(FileNotFoundError):
+            if found and _abandoned(path.lstat(), found["process"]):
+                yield path
+
+
+def _abandoned(status: os.stat_result, process: str) -> bool:
+    """Whether a draft's writer is gone; one in another container has no number here, so a draft must be old too."""
+    old = _now() - status.st_mtime >= NEW_S
+    return old and stat.S_ISREG(status.st_mode) and not Path(f"/proc/{process}").exists()

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from vlatool.bundle import Bundle
 from vlatool.choice import choose, speed_words
 from vlatool.instruction_sets import ENGINE, BoardSet
 from vlatool.judge import Judged, p50
@@ -160,6 +161,15 @@ def _marked(judged: list[Judged], item: Judged, chosen: Judged, reason: str) -> 
     """Return the list with one item replaced by what is said of it as the chosen one."""
     best = replace(chosen, row=replace(chosen.row, role="chosen", reason=reason))
     return [best if each.row.name == item.row.name else each for each in judged]
+
+
+def in_int8(bundles: Mapping[str, Bundle], engines: Mapping[str, str]) -> dict[str, str]:
+    """Return the engines of the bundles that multiply in int8, by name; weights alone in int8 are none."""
+    return {
+        name: engines[name]
+        for name, bundle in bundles.items()
+        if any("int8" in graph.precision for graph in bundle.manifest.graphs.values())
+    }
 
 
 def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> tuple[str, ...]:

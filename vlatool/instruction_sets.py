@@ -44,7 +44,7 @@ class BoardSet:
         wanted: The board's set; empty where there is nothing to compare (no profile, no x86, no OpenVINO on it).
         lacks: The feature that this host's processor would need for it; empty when it has it.
         host: The highest set of this host's processor; empty when it is no x86.
-        told: What ``ONEDNN_MAX_CPU_ISA`` says in this process; empty when it is not set.
+        told: What OpenVINO obeys of ``ONEDNN_MAX_CPU_ISA`` in this process; empty when it confines nothing.
     """
 
     board: str = ""
@@ -159,6 +159,20 @@ def rung(features: Collection[str]) -> str:
     return next((name for name, feature in RUNGS.items() if feature in features), "")
 
 
+def obeyed(told: str, host: Collection[str]) -> str:
+    """Return the set that oneDNN computes in when ``ONEDNN_MAX_CPU_ISA`` says ``told``, on a processor with features.
+
+    A set that the processor lacks is taken for the highest below it; a name that is none of ``RUNGS`` stands as it is.
+
+    Example:
+        >>> obeyed("AVX512_CORE_AMX", ["avx2", "avx_vnni"]), obeyed("AVX2_VNNI", ["avx2", "avx512f", "avx512_vnni"])
+        ('AVX2_VNNI', 'AVX2')
+    """
+    names = list(RUNGS)
+    below = names[names.index(told) :] if told in RUNGS else []
+    return next((name for name in below if RUNGS[name] in host), told)
+
+
 def compared(board: str, features: Collection[str], host: Collection[str], told: str = "") -> BoardSet:
     """Return a board's set beside this host's.
 
@@ -169,8 +183,8 @@ def compared(board: str, features: Collection[str], host: Collection[str], told:
         told: What ``ONEDNN_MAX_CPU_ISA`` says.
     """
     wanted = rung(features)
-    needed = RUNGS.get(wanted, "")
-    return BoardSet(board, wanted, "" if needed in host else needed, rung(host), told)
+    needed, own, told = RUNGS.get(wanted, ""), rung(host), obeyed(told, host)
+    return BoardSet(board, wanted, "" if needed in host else needed, own, "" if told == own else told)
 
 
 def board_set(profile: Profile | None) -> BoardSet:
@@ -201,4 +215,5 @@ def about_onnx_runtime(profile: Profile | None) -> tuple[str, ...]:
 
 def computed_in() -> str:
     """Return what OpenVINO computes in, in this process: what it is confined to, or the processor's highest set."""
-    return onednn_max_cpu_isa() or rung(isa() or ())
+    host = isa() or ()
+    return obeyed(onednn_max_cpu_isa() or "", host) or rung(host)

@@ -145,7 +145,9 @@ class Packed:
         kept = OpenFile(handle, self._file.where)
         try:
             while block := self._stream.read(BLOCK):
-                os.write(handle, block)
+                left = memoryview(block)
+                while left:  # a disk that is nearly full takes a part
+                    left = left[os.write(handle, left) :]
         except OSError as error:
             raise DataError(
                 f"{self._file.where} is packed and is read out of order, for which {Path(name).parent} would need "

@@ -11,7 +11,7 @@ from vlatool import apart
 from vlatool.bundle import Bundle
 from vlatool.choice import choose
 from vlatool.credibility import Credibility, credibility
-from vlatool.engines_apart import about_int8, choose_apart, placed
+from vlatool.engines_apart import about_int8, choose_apart, in_int8, placed
 from vlatool.errors import DataError, RecipeError, SourceError, VlatoolError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
@@ -234,7 +234,7 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     chosen_bundle = baseline if chosen.name == BASELINE else bundles[chosen.name]
     report = _report(plan, baseline, judged, failures, warnings, trust, context)
     where = plan.board_set
-    told = (*about_int8(rows, engines, where), *about_onnx_runtime(plan.profile), *where.sentences())
+    told = (*about_int8(rows, in_int8(bundles, engines), where), *about_onnx_runtime(plan.profile), *where.sentences())
     report = replace(report, summary=(*report.summary, *told, *_needs(chosen_bundle)))
     _write_bundle(plan, chosen, chosen_bundle, draft)
     write_reports(report, draft / "reports")

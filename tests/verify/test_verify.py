@@ -222,6 +222,7 @@ BAD = {
     "leaves": ("raise SystemExit(0)", "sys.exit"),
     "dies": ("import os; os._exit(0)", "ended"),
     "text": ("return 'left'", "wanted an array of numbers"),
+    "bfloat16": ("import torch; return torch.zeros(4, 2, dtype=torch.bfloat16)", "is no array: .*BFloat16"),
 }
 
 

@@ -99,12 +99,15 @@ class Original:
 
     def _array(self, value: Any, what: str, number: int) -> Array:
         """Return an array of finite numbers, of a tensor as well."""
-        for step in ("detach", "cpu", "numpy"):
-            value = getattr(value, step)() if callable(getattr(value, step, None)) else value
         try:
+            for step in ("detach", "cpu", "numpy"):
+                value = getattr(value, step)() if callable(getattr(value, step, None)) else value
             array = np.asarray(value)
         except Exception as error:  # the seam: an object may refuse in any way
-            raise SourceError(f"{what} of '{self._name}' gives a {type(value).__name__}, which is no array.") from error
+            raise SourceError(
+                f"{what} of '{self._name}' gives a {type(value).__name__}, which is no array: {message_of(error)}.",
+                "return a numpy array, or a tensor of float32",
+            ) from error
         if array.dtype.kind not in "biuf" or not array.size:
             raise SourceError(f"{what} of '{self._name}' gives {_told(value, array)}; wanted an array of numbers.")
         if not np.isfinite(array).all():
