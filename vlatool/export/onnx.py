@@ -20,6 +20,7 @@ from vlatool.data import observations_for
 from vlatool.errors import GraphError, SourceError, require, require_present
 from vlatool.export._draws import refuse_draws
 from vlatool.export._failures import export_error
+from vlatool.export._norms import divide_by_roots
 from vlatool.export._torch_policy import TorchSession, load_modules
 from vlatool.finish import carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
@@ -144,6 +145,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
         raise_interrupt(error)
         raise export_error(error, step.graph, module) from error
     refuse_draws(exported.model, step.graph)
+    divide_by_roots(exported.model)
     return exported
 
 
