@@ -109,6 +109,9 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     for line in stage.lines(made):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
+        if not shares:
+            typer.echo(f"  {name}: no matrix product or convolution")
+            continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
     _refuse(made)
 

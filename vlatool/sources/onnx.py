@@ -19,6 +19,7 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.sources._description import Description, read_description
 from vlatool.sources._onnx_axes import fix_axes, opset_of, told, with_opset
+from vlatool.sources._onnx_batch import add_batch_axes
 from vlatool.sources.torch_module import copy_assets
 from vlatool.spec import PolicySpec, TensorSpec
 from vlatool.stage import Context, Transform
@@ -66,6 +67,10 @@ class OnnxFile(Transform):
         model = _load(self.model)
         given = read_description(self.policy) if self.policy else None
         fixed = told(fix_axes(model, given.spec if given else None))
+        further = [] if given else add_batch_axes(model)
+        if further:
+            axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
+            fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
             context.tell(fixed, None)
         described = given or self._described(model)
@@ -92,7 +97,7 @@ class OnnxFile(Transform):
         made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
         observations = _observations(described, out, manifest)
         if converted:
-            _compare(self.model, out, described.spec, observations)
+            _compare(self.model, out, described.spec, observations, further)
         return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
 
     def _described(self, model: Any) -> Description:
@@ -140,8 +145,10 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
                 )
 
 
-def _compare(before: Path, out: Path, spec: PolicySpec, observations: list[dict[str, Any]]) -> None:
-    """Hold the converted graph against the file that it came from.
+def _compare(
+    before: Path, out: Path, spec: PolicySpec, observations: list[dict[str, Any]], unbatched: list[str]
+) -> None:
+    """Hold the converted graph against the file that it came from, which has no batch axis in some tensors.
 
     Raises:
         SourceError: when ONNX Runtime computes something else.
@@ -150,7 +157,10 @@ def _compare(before: Path, out: Path, spec: PolicySpec, observations: list[dict[
     encode = ObservationEncoder(spec, out / "assets")
     for observation in observations:
         feeds = encode(observation)
-        wanted, got = (session.run(feeds)[spec.action.name] for session in sessions)
+        as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
+        wanted, got = (
+            session.run(each)[spec.action.name] for session, each in zip(sessions, (as_before, feeds), strict=True)
+        )
         error = relative_error(got, wanted)
         if not error <= TOLERANCE:
             raise SourceError(

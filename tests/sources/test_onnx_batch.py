@@ -1,0 +1,72 @@
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from vlatool.bundle import Bundle
+from vlatool.runtime import load
+from vlatool.sources.onnx import OnnxFile
+from vlatool.stage import Context
+
+HEAD = '<ir_version: 10, opset_import: ["": 20]> '
+
+
+def bundle_of(folder: Path, text: str, said: list[str] | None = None) -> Bundle:
+    onnx.save(onnx.parser.parse_model(HEAD + text), folder / "a.onnx")
+    (folder / "out").mkdir()
+    tell = Context((lambda words, _share: said.append(words)) if said is not None else Context().tell)
+    return OnnxFile(model=folder / "a.onnx").run(None, folder / "out", tell)
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "chunk"),
+    [
+        ("g (float[3,5] x, float[5] z) => (float[3,5] y) { y = Add(x, z) }", [(1, 3, 5), (1, 5), (1, 3, 5)], 3),
+        ("g (float[5] x, float[1,5] z) => (float[1,5] y) { y = Add(x, z) }", [(1, 5), (1, 5), (1, 5)], 1),
+        ("g (float[4] x, float[4] z) => (float[4] y) { x_observed = Neg(x)  y = Add(x_observed, z) }",
+         [(1, 4), (1, 4), (1, 4)], 1),
+        ("g (float[2,5] x, float[N,5] z) => (float[M,5] y) { y = Concat<axis=0>(x, z) }",
+         [(1, 2, 5), (1, 5), (1, 3, 5)], 3),
+    ],
+    ids=["both", "one", "a name that is taken", "beside a free axis"],
+)  # fmt: skip
+def test_inputs_without_a_batch_axis_get_one(tmp_path: Path, text, shapes, chunk):
+    said: list[str] = []
+    made = bundle_of(tmp_path, text, said)
+    spec = made.manifest.spec
+    assert [tensor.shape for tensor in (*spec.inputs, *spec.outputs)] == shapes
+    assert spec.chunk == chunk
+    assert "no batch axis: one of 1 is put in front" in " ".join(said)
+    chance = np.random.default_rng(0)
+    given = {tensor.name: chance.normal(size=tensor.shape[1:]).astype(np.float32) for tensor in spec.inputs}
+    file = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"), providers=["CPUExecutionProvider"])
+    feeds = {each.name: given[each.name].reshape([axis if isinstance(axis, int) else 1 for axis in each.shape])
+             for each in file.get_inputs()}  # fmt: skip
+    (wanted,) = file.run(None, feeds)
+    got = load(made.path, threads=1).infer(given).chunk
+    np.testing.assert_allclose(got, wanted.reshape(got.shape), rtol=1e-6)
+
+
+def test_such_a_file_is_converted_to_another_opset(tmp_path: Path):
+    text = "g (float[3,5] x, float[5] z) => (float[3,5] y) { y = Add(x, z) }"
+    onnx.save(onnx.parser.parse_model(HEAD + text), tmp_path / "a.onnx")
+    (tmp_path / "out").mkdir()
+    made = OnnxFile(model=tmp_path / "a.onnx", opset=18).run(None, tmp_path / "out", Context())
+    assert made.manifest.graphs["main"].opset == 18
+
+
+def test_a_graph_inside_reads_what_the_input_was(tmp_path: Path):
+    made = bundle_of(tmp_path, """g (float[3] x) => (float[3] y) {
+        s = ReduceSum<keepdims=0>(x)  zero = Constant<value=float {0.0}>()  c = Greater(s, zero)
+        y = If(c) <then_branch = t () => (float[3] a) { a = Neg(x) }, else_branch = e () => (float[3] b) { b = Abs(x) }>
+    }""")  # fmt: skip
+    policy = load(made.path, threads=1)
+    np.testing.assert_allclose(policy.infer({"x": [1, 2, 3]}).chunk, [[-1, -2, -3]])
+    np.testing.assert_allclose(policy.infer({"x": [-1, -2, 3]}).chunk, [[1, 2, 3]])
+
+
+def test_a_batch_axis_that_is_there_stays_as_it_is(tmp_path: Path):
+    made = bundle_of(tmp_path, "g (float[1,5] x) => (float[1,5] y) { y = Neg(x) }")
+    assert [node.op_type for node in onnx.load(made.file("graphs/main.onnx")).graph.node] == ["Neg"]
