@@ -1,3 +1,4 @@
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -185,6 +186,19 @@ def test_an_engine_as_near_to_the_source_as_the_graphs_rounds_otherwise(
     factor = 1.2 if found else 1.5
     assert made.manifest.golden_tolerance == pytest.approx(factor * difference, abs=0.002)
     assert load(tmp_path, threads=1, accept=found).golden_error == pytest.approx(difference, abs=0.002)
+
+
+def test_eight_observations_decide_whether_an_engine_rounds_otherwise(float_bundle, tmp_path, monkeypatch):
+    """The engine gives 0.9 of the source on the golden observations, which is as near as the graphs, and 1.3 later."""
+    real, calls = OrtCpuSession.run, itertools.count()
+
+    def run(self, feeds):
+        by = np.float32((0.9, 1.3)[next(calls) > 1] / 1.1 if self.optimized else 1)
+        return {name: value * by for name, value in real(self, feeds).items()}
+
+    monkeypatch.setattr(OrtCpuSession, "run", run)
+    (found,) = scaled(float_bundle, tmp_path, 1.1).manifest.findings
+    assert found["value"] == pytest.approx(0.182, abs=0.002)
 
 
 def test_where_graphs_are_near_the_source_an_engine_beyond_rounding_is_a_finding(float_bundle, wrong_engine, tmp_path):
