@@ -1,9 +1,12 @@
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 
 from vlatool.bundle import Bundle, hash_file, restate
 from vlatool.data import observations_for
@@ -153,6 +156,55 @@ def test_an_engine_that_is_further_from_the_graph_than_rounding_is_a_finding(flo
     assert (found["name"], found["stage"], found["allowed"]) == ("engine-difference", "quantize.x", 0.045)
     assert found["value"] == pytest.approx(0.1, abs=1e-3)
     assert "the engine ort_cpu computes another action than the graphs say" in found["message"]
+
+
+def scaled(bundle: Bundle, out: Path, factor: float) -> Bundle:
+    """Make a bundle whose graph gives so many times the action of another's."""
+    carry_over(bundle, out, ("assets", "data", "graphs"))
+    path = out / bundle.manifest.graphs["main"].file
+    model = onnx.load(path)
+    (last,) = (node for node in model.graph.node if "action" in node.output)
+    last.output[list(last.output).index("action")] = "unscaled"
+    model.graph.initializer.append(numpy_helper.from_array(np.float32(factor), "factor"))
+    model.graph.node.append(onnx.helper.make_node("Mul", ["unscaled", "factor"], ["action"]))
+    onnx.save(model, path)
+    seen = observations_for(bundle, 2)
+    return finish(bundle, out, made_by={"stage": "quantize.x"}, graphs=bundle.manifest.graphs, observations=seen)
+
+
+@pytest.mark.parametrize(
+    ("engine", "found"), [(0.9, ()), (0.885, ()), (0.86, ("engine-difference",)), (1.22, ("engine-difference",))]
+)
+def test_an_engine_as_near_to_the_source_as_the_graphs_rounds_otherwise(
+    float_bundle, wrong_engine, tmp_path, engine, found
+):
+    """The graphs are 0.1 from the source and the engine 0.12 or more from them, on the other side or further out."""
+    wrong_engine(engine / 1.1)
+    made = scaled(float_bundle, tmp_path, 1.1)
+    assert tuple(each["name"] for each in made.manifest.findings) == found
+    difference = abs(1.1 - engine) / 1.1
+    factor = 1.2 if found else 1.5
+    assert made.manifest.golden_tolerance == pytest.approx(factor * difference, abs=0.002)
+    assert load(tmp_path, threads=1, accept=found).golden_error == pytest.approx(difference, abs=0.002)
+
+
+def test_eight_observations_decide_whether_an_engine_rounds_otherwise(float_bundle, tmp_path, monkeypatch):
+    """The engine gives 0.9 of the source on the golden observations, which is as near as the graphs, and 1.3 later."""
+    real, calls = OrtCpuSession.run, itertools.count()
+
+    def run(self, feeds):
+        by = np.float32((0.9, 1.3)[next(calls) > 1] / 1.1 if self.optimized else 1)
+        return {name: value * by for name, value in real(self, feeds).items()}
+
+    monkeypatch.setattr(OrtCpuSession, "run", run)
+    (found,) = scaled(float_bundle, tmp_path, 1.1).manifest.findings
+    assert found["value"] == pytest.approx(0.182, abs=0.002)
+
+
+def test_where_graphs_are_near_the_source_an_engine_beyond_rounding_is_a_finding(float_bundle, wrong_engine, tmp_path):
+    wrong_engine(0.95 / 1.04)
+    (found,) = scaled(float_bundle, tmp_path, 1.04).manifest.findings
+    assert (found["name"], found["allowed"]) == ("engine-difference", 0.045)
 
 
 def test_a_bundle_with_a_finding_is_refused_unless_it_is_overruled_by_name(float_bundle, wrong_engine, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.runtime.engines._arithmetic import SATURATING, is_int8, machine, told
 from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.policy import DEFAULT_ENGINE, Action, Policy, load_golden, relative_error
+from vlatool.runtime.policy import DEFAULT_ENGINE, Action, Policy, relative_error
 from vlatool.runtime.program import Program, draw
 
 GOLDEN = "golden/golden.npz"
@@ -28,6 +28,17 @@ ROUNDING = 0.045
 """Relative L2 difference of an engine from what the graph says, up to which it is rounding that falls the other way. On
 right engines and processors it was seen to be at most 0.035, on wrong ones at least 0.09, and where int8 products
 saturate from 0.045 on."""
+FARTHER = 1.2
+"""How many times as far from the source as the graphs an engine may be that rounds otherwise, as root mean square of
+``TRIALS`` observations: it draws an error of the same size again. A loop over int8 layers carries a rounding that falls
+the other way into all that follow: in ten steps of a denoising UNet the engine was as far from the graphs (up to 0.09)
+as either was from float32. Of its observations 99 in 100 choices of 8 give at most 1.18; a fault of the engine's own
+beside the rounding, at least as large as it, gives 1.41."""
+TRIALS = 8
+"""Observations on which that is asked, and how many a stage should give ``finish``."""
+REDRAWN = 1.5
+"""How many times that difference is allowed on other machines, where it is drawn again: of 18 observations, the largest
+was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
 LEAST_TOLERANCE = 0.01
 COARSE_TOLERANCE = 0.03
 """The same for graphs whose kernels round otherwise by design from processor to processor: float16 is computed as such
@@ -41,6 +52,23 @@ HANDED_OUT = "optimize"
 """In a build record, the entry of the step in which ``optimize`` hands a candidate out."""
 DECIDED = ("accuracy", "engine")
 """Fields of a manifest that ``optimize`` sets when it hands a candidate out."""
+
+
+@dataclass(frozen=True)
+class Golden:
+    """What the golden file was written from.
+
+    Args:
+        samples: Observations with the noise of each.
+        wanted: What the graphs say.
+        difference: Largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
+        of_chunk: The same of the chunks in physical units.
+    """
+
+    samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]
+    wanted: Sequence[Action]
+    difference: float
+    of_chunk: float
 
 
 def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
@@ -70,7 +98,7 @@ def finish(
         source: What the bundle was made from.
         made_by: Stage, options and versions.
         graphs: Graph name -> graph.
-        observations: Raw observations; the first two become golden.
+        observations: Raw observations; the first two become golden. ``TRIALS`` are looked at where the engine differs.
         changes: Other fields of the manifest that the stage changes, such as program and engine.
 
     Raises:
@@ -81,43 +109,76 @@ def finish(
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
-    difference, of_chunk = write_golden(draft, observations, out)
+    seen = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
     made = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
-    limit = _limit(source, made, difference)
-    found = [] if difference <= limit else [_engine_difference(made, difference, limit)]
+    limit = _limit(source, made, seen)
+    redrawn = seen.difference > limit and _rounds_otherwise(source, made, observations)
+    found = [] if seen.difference <= limit or redrawn else [_engine_difference(made, seen.difference, limit)]
     if is_int8(made.manifest) and ReferenceSession.arithmetic() == SATURATING:
         found.append(_inexact_reference(made))
     kept = [each for each in source.manifest.findings if each["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
     discrete = made.manifest.spec.action.kind == "discrete"
     return restate(made, replace(
-        made.manifest, golden_tolerance=_tolerance(difference, made),
-        golden_chunk_tolerance=0.0 if discrete else _tolerance(of_chunk, made), findings=(*kept, *found),
+        made.manifest, golden_tolerance=_tolerance(seen.difference, made, redrawn),
+        golden_chunk_tolerance=0.0 if discrete else _tolerance(seen.of_chunk, made, redrawn), findings=(*kept, *found),
     ))  # fmt: skip
 
 
-def _tolerance(seen: float, made: Bundle) -> float:
+def _tolerance(seen: float, made: Bundle, redrawn: bool) -> float:
     """Return what a machine may differ where the engine was seen to differ so much, in three decimals; at most 1.
 
-    What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding.
+    What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding, or one that is
+    drawn again on each machine.
     """
     coarse = any(name in graph.precision for graph in made.manifest.graphs.values() for name in COARSE)
-    wanted = max(COARSE_TOLERANCE if coarse else LEAST_TOLERANCE, 1.2 * seen, min(2 * seen, ROUNDING))
+    wanted = max(
+        COARSE_TOLERANCE if coarse else LEAST_TOLERANCE, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING)
+    )
     return math.ceil(wanted * 1000) / 1000 if math.isfinite(wanted) else 1.0
 
 
-def _limit(source: Bundle, made: Bundle, difference: float) -> float:
+def _limit(source: Bundle, made: Bundle, seen: Golden) -> float:
     """Return how far the engine may be from what the graphs say: as far as the graphs are from those of the source.
 
     What is computed in bfloat16 differs by what bfloat16 costs, which is judged as accuracy.
     """
     if any(graph.compute == "bfloat16" for graph in made.manifest.graphs.values()):
         return math.inf
-    if difference <= ROUNDING or not source.manifest.graphs:
+    if seen.difference <= ROUNDING or not source.manifest.graphs:
         return ROUNDING
-    observation, noise, wanted = load_golden(made) or ({}, {}, np.zeros(1))
-    before = reference_policy(source).infer(observation, noise=noise).outputs[made.manifest.spec.action.name]
-    return max(ROUNDING, relative_error(wanted, before))
+    before = _outputs(reference_policy(source), seen.samples)
+    return max(ROUNDING, _worst(_apart(seen.wanted, before, made.manifest.spec.action.name)))
+
+
+def _rounds_otherwise(source: Bundle, made: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
+    """Say whether an engine that is far from the graphs is as near to their source as they are.
+
+    Then it computes the same policy with other roundings, and no other one.
+    """
+    if not source.manifest.graphs:
+        return False
+    samples = _samples(made.manifest, observations, TRIALS)
+    before = _outputs(reference_policy(source), samples)
+    name = made.manifest.spec.action.name
+    graphs = _apart(_outputs(reference_policy(made), samples), before, name)
+    engine = _apart(_outputs(Policy.open(made, threads=1, seed=SEED), samples), before, name)
+    return float(np.linalg.norm(engine)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
+
+
+def _samples(
+    manifest: Manifest, observations: Sequence[Mapping[str, Any]], count: int
+) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Return so many observations, from the first on again where there are fewer, with noise for each."""
+    random = np.random.default_rng(SEED)
+    wanted = [pair for step in manifest.program for pair in step.noise.items()]
+    chosen = [observations[index % len(observations)] for index in range(count)]
+    return [(each, {name: draw(noise, random) for name, noise in wanted}) for each in chosen]
+
+
+def _apart(given: Sequence[Action], wanted: Sequence[Action], name: str) -> list[float]:
+    """Return the relative L2 difference of an output, for each action."""
+    return [relative_error(a.outputs[name], b.outputs[name]) for a, b in zip(given, wanted, strict=True)]
 
 
 def _engine_difference(made: Bundle, difference: float, limit: float) -> dict[str, Any]:
@@ -170,7 +231,7 @@ def reseal(bundle: Bundle, out: Path, manifest: Manifest, folders: Iterable[str]
     return seal(out, manifest)
 
 
-def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> tuple[float, float]:
+def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -> Golden:
     """Run the first observations and store ``in.NAME``, ``noise.NAME``, ``out.NAME`` and ``chunk.NAME``.
 
     Each has a sample axis. The outputs are what the graphs say: the engine that the bundle is made for may compute
@@ -181,31 +242,22 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
         draft: The bundle as written so far; its graphs are what runs.
         observations: Raw observations without the batch axis.
         out: The bundle's directory.
-
-    Returns:
-        The largest relative L2 difference of the engine's actions from those, as the graphs give them and as chunks.
     """
-    random = np.random.default_rng(SEED)
-    steps = draft.manifest.program
-    samples = [
-        (observation, {name: draw(wanted, random) for step in steps for name, wanted in step.noise.items()})
-        for observation in (observations * GOLDEN_COUNT)[:GOLDEN_COUNT]
-    ]
+    samples = _samples(draft.manifest, observations, GOLDEN_COUNT)
     name = draft.manifest.spec.action.name
     policy = Policy.open(draft, threads=1, seed=SEED)
-    given = [_outputs(policy, samples)]
-    given.insert(0, _outputs(reference_policy(draft), samples))
+    own = _outputs(policy, samples)
+    wanted = _outputs(reference_policy(draft), samples)
     arrays: dict[str, list[Any]] = {}
-    for (observation, noise), action in zip(samples, given[0], strict=True):
-        chunk = {name: action.chunk}
-        for prefix, values in (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", chunk)):
-            for name, value in values.items():
-                arrays.setdefault(f"{prefix}.{name}", []).append(value)
+    for (observation, noise), action in zip(samples, wanted, strict=True):
+        parts = (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", {name: action.chunk}))
+        for prefix, values in parts:
+            for each, value in values.items():
+                arrays.setdefault(f"{prefix}.{each}", []).append(value)
     (out / GOLDEN).parent.mkdir(exist_ok=True)
-    save_npz(out / GOLDEN, {name: np.stack([np.asarray(item) for item in items]) for name, items in arrays.items()})
-    pairs = list(zip(*given, strict=True))
-    raw = [relative_error(own.outputs[name], wanted.outputs[name]) for wanted, own in pairs]
-    return _worst(raw), _worst([policy.chunk_error(own.chunk, wanted.chunk) for wanted, own in pairs])
+    save_npz(out / GOLDEN, {each: np.stack([np.asarray(item) for item in items]) for each, items in arrays.items()})
+    of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, wanted, strict=True))
+    return Golden(samples, wanted, _worst(_apart(own, wanted, name)), of_chunk)
 
 
 def _worst(errors: Iterable[float]) -> float:

@@ -85,6 +85,10 @@ FAILS = {
         "if x.sum() > 0:\n    x = x + 1\nreturn self.linear(x)", "GuardOnDataDependent", "if x.sum() > 0:",
         "torch.where",
     ),
+    "a distribution that checks its parameters": (
+        "return torch.distributions.Normal(self.linear(x), 1.0).mean", "data-dependent", "Normal(self.linear(x), 1.0)",
+        "its mean, its logits",
+    ),
     "a shape that depends on values": (
         "y = x[x > 0]\nif y.shape[0] > 2:\n    y = y * 2\nreturn self.linear(x) + y.sum()", "u0 > 2", "y.shape[0] > 2",
         "mask",

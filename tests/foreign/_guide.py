@@ -37,7 +37,7 @@ class Guide:
 
 
 GUIDES = {
-    "lerobot": Guide(DOCS / "lerobot-policy.md", "lerobot_act", "act", "lerobot"),
+    "lerobot": Guide(DOCS / "lerobot-policy.md", "lerobot_act", "act", "lerobot", ("original.py", "made.py")),
     "hugging-face": Guide(DOCS / "hugging-face-policy.md", "llama", "llama", "common"),
     "recurrent": Guide(
         DOCS / "recurrent-policy.md", "resnet_gru", "recurrent", "common", ("original.py", "network.py")

@@ -25,7 +25,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from _cells import ANSWERS, VLATOOL, Cell, cells, gate_file
-from _foreign import HERE, POLICIES, Foreign
+from _foreign import BY_NAME, HERE, POLICIES, Foreign
 from _guide import GUIDES, GuideError, follow
 from _verdict import FAULT, GOOD, MISSING, Verdict, judge, markdown
 
@@ -120,7 +120,9 @@ def verdicts(policy: Foreign, folder: Path) -> dict[tuple[str, str], Verdict]:
 def make(policy: Foreign, folder: Path, venv: Path) -> None:
     """Copy the policy's files, and let its scripts make checkpoint and recordings where they are not there yet."""
     place, gate = folder / policy.name, folder / "out" / policy.name / "gate.yaml"
-    shutil.copytree(HERE / policy.name, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+    place.mkdir(parents=True, exist_ok=True)
+    for file in policy.files.values():
+        shutil.copy(file, place)
     gate.parent.mkdir(parents=True, exist_ok=True)
     gate.write_text(gate_file(policy))
     if not (place / "evaluation.npz").exists():
@@ -170,7 +172,7 @@ def guide(name: str, asked: argparse.Namespace, folder: Path) -> bool:
     given = place / made.folder
     given.mkdir(parents=True)
     for file in made.given:
-        shutil.copy(HERE / made.policy / file, given)
+        shutil.copy(BY_NAME[made.policy].files[file], given)
     subprocess.run([venv / "bin/python", made.given[0]], cwd=given, env=variables(folder, venv), check=True)
     start = time.monotonic()
     try:

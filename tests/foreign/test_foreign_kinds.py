@@ -11,8 +11,11 @@ import torch
 
 from vlatool.bundle import Bundle
 from vlatool.export.onnx import ExportOnnx
+from vlatool.quantize.float8 import Float8
+from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
 from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage import Context
 
@@ -206,6 +209,22 @@ def test_a_diffusion_policy_gives_what_torch_gives_from_the_same_noise(tmp_path)
             sample, wanted = parts["denoise"](sample, torch.tensor([time]), condition)
     got = load(bundle.path).infer({"state": state[0]}, noise={"sample": noise}).chunk
     np.testing.assert_allclose(got, wanted[0].numpy(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", [Float8, StaticInt8])
+def test_a_diffusion_policy_is_no_other_one_in_8_bits(tmp_path, method):
+    """A Relu stands before a convolution: in float8, ONNX Runtime would leave it out."""
+    random = np.random.default_rng(0)
+    state, noise = random.normal(size=(8, 2, 4)).astype(np.float32), random.normal(size=(1, 8, 2)).astype(np.float32)
+    bundle, _ = exported(tmp_path / "policy", DDIM, DDIM_YAML, state=state)
+    (tmp_path / "eighth").mkdir()
+    made = method().run(bundle, tmp_path / "eighth", Context())
+    assert made.manifest.findings == ()
+    got, wanted = (
+        np.array([load(each.path).infer({"state": row}, noise={"sample": noise}).chunk for row in state])
+        for each in (made, bundle)
+    )
+    assert relative_error(got, wanted) < 0.1
 
 
 def test_a_policy_that_writes_tokens_gives_those_of_torch_also_in_8_bits(tmp_path):

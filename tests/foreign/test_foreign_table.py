@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from _cells import ANSWERS, QUANTIZED, Cell, cells, needs_data
-from _foreign import HERE, POLICIES
+from _foreign import BY_NAME, HERE, POLICIES
 from _guide import GUIDES, GuideError, commands, files, follow
 from _verdict import BARE, FAULT, REFUSED, WORKS, WRONG, Verdict, judge, markdown
 from table import rows_of
@@ -71,7 +71,7 @@ def test_the_table_has_a_note_for_each_reason():
 def test_each_policy_is_whole(policy):
     folder = HERE / policy.name
     assert read_description(folder).name
-    assert all((folder / script).is_file() for script in policy.scripts)
+    assert set(policy.scripts) <= set(policy.files)
     assert policy.environment == (folder / "environment.py").is_file()
     listed = [cell.row for cell in cells(policy)]
     assert len(listed) == len(set(listed)) > 40
@@ -82,9 +82,10 @@ def test_each_policy_is_whole(policy):
 @pytest.mark.parametrize("guide", GUIDES.values(), ids=GUIDES)
 def test_a_guide_shows_the_files_that_are_run(guide):
     shown = {Path(name).name: text for name, text in files(guide.page).items() if name.startswith(f"{guide.folder}/")}
-    there = {file.name: file.read_text() for file in (HERE / guide.policy).iterdir() if file.name in shown}
+    there = {name: file.read_text() for name, file in BY_NAME[guide.policy].files.items() if name in shown}
     assert {name: shown[name] for name in there} == there
     assert "policy.yaml" in there
+    assert set(guide.given) <= set(BY_NAME[guide.policy].files)
     assert set(shown) - set(there) <= {"robot.py"}
 
 

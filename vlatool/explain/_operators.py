@@ -18,6 +18,7 @@ from vlatool.errors import GraphError, require
 from vlatool.host import onednn_max_cpu_isa
 from vlatool.instruction_sets import ENGINE
 from vlatool.runtime.engines.openvino import compiled, settings_for
+from vlatool.runtime.engines.ort_cpu import left_out
 from vlatool.runtime.policy import DEFAULT_ENGINE, Policy
 from vlatool.runtime.program import Program
 
@@ -152,7 +153,9 @@ class _OrtProfiled:
         options.enable_profiling = True
         options.profile_file_prefix = str(scratch)
         try:
-            self._session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+            self._session = ort.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"], disabled_optimizers=left_out(path)
+            )
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
             raise GraphError(f"ONNX Runtime cannot profile {path.name}: {str(error)[:200]}") from error
         self._outputs = [node.name for node in self._session.get_outputs()]

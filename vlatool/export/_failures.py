@@ -46,6 +46,17 @@ SCRIPTED = Cause(
     "build the Python module that was scripted and load its weights, or save it with torch.export.save: TorchScript "
     "cannot be exported again",
 )  # fmt: skip
+CHECKED = Cause(
+    "a distribution that checks its parameters", None,
+    "return what the distribution is made of (its mean, its logits), or turn the checks off in policy.py: "
+    "torch.distributions.Distribution.set_default_validate_args(False)",
+)  # fmt: skip
+CONTROL_FLOW = Cause(
+    "data-dependent control flow",
+    r"data-dependent|DataDependent|Dynamic control flow|_local_scalar_dense|Tensor-likes? to a (?:bool|number)",
+    "decide with torch.where() in the place of 'if', a fixed number of turns in the place of 'while'; keep int(), "
+    "float() and .item() of tensors out of forward()",
+)  # fmt: skip
 OTHER = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
 CAUSES = (
     Cause(
@@ -58,12 +69,7 @@ CAUSES = (
         r"Size-like symbols: (?!none)|DynamicOutputShapeException|Unbacked ?[Ss]ym[Nn]ode",
         "keep tensors in their full shape and multiply by a mask, in the place of x[mask], nonzero() or unique()",
     ),
-    Cause(
-        "data-dependent control flow",
-        r"data-dependent|DataDependent|Dynamic control flow|_local_scalar_dense|Tensor-likes? to a (?:bool|number)",
-        "decide with torch.where() in the place of 'if', a fixed number of turns in the place of 'while'; keep int(), "
-        "float() and .item() of tensors out of forward()",
-    ),
+    CONTROL_FLOW,
     Cause(
         "an operator of a package of its own", r"No ONNX function found for <OpOverload\(op='(?!aten\.|prims?\.)",
         "write it with torch's own operators, or use the package's fallback in plain torch: no engine has it",
@@ -160,7 +166,13 @@ def _cause(chain: list[BaseException], module: Any) -> Cause:
         return GENERATE
     if any(type(part).__module__.startswith("torch.jit") for part in module.modules()):
         return SCRIPTED
-    return _told(chain) or OTHER
+    told = _told(chain) or OTHER
+    return CHECKED if told is CONTROL_FLOW and _in_distribution(chain) else told
+
+
+def _in_distribution(chain: list[BaseException]) -> bool:
+    names = (str(frame.f_globals.get("__name__", "")) for frame, _line in _frames(chain[-1]))
+    return any(name.startswith("torch.distributions.") for name in names)
 
 
 def _told(chain: list[BaseException]) -> Cause | None:

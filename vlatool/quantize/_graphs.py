@@ -21,7 +21,7 @@ from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, GraphError, RecipeError, VlatoolError, nearest, require
 from vlatool.export.onnx import FOLDED
-from vlatool.finish import carry_over, finish
+from vlatool.finish import TRIALS, carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
 from vlatool.quantize._nodes import name_nodes, part_outputs
 from vlatool.quantize._phase import cut_phases
@@ -106,7 +106,7 @@ class Quantization(Transform):
             made[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
         context.tell("running the quantized graphs", None)
-        observations = observations_for(bundle, 2)
+        observations = observations_for(bundle, TRIALS)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
         told = made_by or self.made_by()
         return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)

@@ -74,7 +74,7 @@ def external_files(model: bytes | OpenFile) -> set[str]:
     """
     found: set[str] = set()
     seen, most = 0, limit("graph_fields")
-    levels = [("ModelProto", _fields(model, 0, len(model)))] if _may_name(model, 0, len(model)) else []
+    levels = [("ModelProto", parts(model, 0, len(model)))] if _may_name(model, 0, len(model)) else []
     while levels and seen <= most:
         message, fields = levels[-1]
         field, start, end = next(fields, (0, 0, 0))
@@ -85,7 +85,7 @@ def external_files(model: bytes | OpenFile) -> set[str]:
         elif inner == STRING_ENTRY:
             found |= _location(model, start, end)
         elif inner and _may_name(model, start, end):
-            levels.append((inner, _fields(model, start, end)))
+            levels.append((inner, parts(model, start, end)))
             check("graph_depth", len(levels), "The graph", GraphError)
     check("graph_fields", seen, "The graph", GraphError)
     return found
@@ -98,7 +98,7 @@ def _may_name(model: bytes | OpenFile, start: int, end: int) -> bool:
 
 def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
     """Return every value of a key-value pair one of whose keys is ``location``: the last of several would win."""
-    pairs = [(field, model[at : min(to, at + SMALL)]) for field, at, to in _fields(model, start, end)]
+    pairs = [(field, model[at : min(to, at + SMALL)]) for field, at, to in parts(model, start, end)]
     if not any(field == 1 and key == LOCATION for field, key in pairs):
         return set()
     try:
@@ -107,28 +107,29 @@ def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
         raise GraphError("The graph names external data by bytes that are no UTF-8.") from None
 
 
-def _fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
+def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
     """Yield number, start and end of the fields of a message that have a length; others are passed over."""
     while at < end:
         head = model[at : min(end, at + HEAD)]
-        tag, used = _varint(head, 0, 5)
+        tag, used = varint(head, 0, 5)
         field, kind = tag >> 3, tag & 7
         if kind == LENGTH:
-            size, used = _varint(head, used, 10)
+            size, used = varint(head, used, 10)
             at += used
             if size > end - at:
                 raise GraphError("The graph is no ONNX model: a part of it is longer than the whole.")
             yield field, at, at + size
             at += size
         elif kind == VARINT:
-            at += _varint(head, used, 10)[1]
+            at += varint(head, used, 10)[1]
         elif kind in (FIXED32, FIXED64):
             at += used + (4 if kind == FIXED32 else 8)
         if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or at > end or tag >> 32:
             raise GraphError("The graph is no ONNX model: it has a field of an unknown kind.")
 
 
-def _varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
+def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
+    """Return a number of at most so many bytes, and where it ends."""
     value = 0
     for number in range(longest):
         if at >= len(head):

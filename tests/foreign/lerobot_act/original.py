@@ -5,30 +5,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
+from made import JOINTS, PIXELS, SPREAD, batch, features, keep
 
 HERE = Path(__file__).parent
-JOINTS, SIZE, CHUNK = 6, (96, 128), 50
+SIZE, CHUNK = (96, 128), 50
+STATISTICS = {"observation.state": SPREAD, "action": SPREAD, "observation.images.front": PIXELS}
 
 
 def config():
-    features = {
-        "observation.state": PolicyFeature(FeatureType.STATE, (JOINTS,)),
-        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, *SIZE)),
-    }
-    action = {"action": PolicyFeature(FeatureType.ACTION, (JOINTS,))}
     sizes = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "pretrained_backbone_weights": None, "device": "cpu"}
-    return ACTConfig(input_features=features, output_features=action, **sizes)
-
-
-def statistics():
-    """What LeRobot computes of a dataset: here of made-up joints in degrees and of pictures."""
-    joints = {"mean": torch.linspace(-20, 30, JOINTS), "std": torch.linspace(5, 25, JOINTS)}
-    picture = {"mean": torch.tensor([0.485, 0.456, 0.406])[:, None, None], "std": torch.full((3, 1, 1), 0.225)}
-    return {"observation.state": joints, "action": dict(joints), "observation.images.front": picture}
+    return ACTConfig(**features(*SIZE), **sizes)
 
 
 @functools.cache
@@ -45,10 +34,9 @@ def act(observation):
 
 def chunk(policy, before, after, state, front):
     """One chunk (50, 6) as LeRobot's control loop takes it: 50 calls of select_action()."""
-    picture = torch.tensor(front).permute(2, 0, 1).float() / 255
-    batch = before({"observation.state": torch.tensor(state), "observation.images.front": picture})
+    seen = before(batch(state, front))
     policy.reset()
-    return np.stack([after(policy.select_action(batch))[0].numpy() for _ in range(CHUNK)])
+    return np.stack([after(policy.select_action(seen))[0].numpy() for _ in range(CHUNK)])
 
 
 def recording(policy, before, after, seed, count):
@@ -63,9 +51,4 @@ def recording(policy, before, after, seed, count):
 
 if __name__ == "__main__":
     torch.manual_seed(0)
-    policy = ACTPolicy(config()).eval()
-    before, after = make_pre_post_processors(policy.config, dataset_stats=statistics())
-    for part in (policy, before, after):
-        part.save_pretrained(HERE / "checkpoint")
-    np.savez_compressed(HERE / "calibration.npz", **recording(policy, before, after, 1, 32))
-    np.savez_compressed(HERE / "evaluation.npz", **recording(policy, before, after, 2, 16))
+    keep(HERE, ACTPolicy(config()).eval(), STATISTICS, recording)

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+from made import JOINTS, SPREAD, batch, features, keep
 from tokenizers import Tokenizer, models, pre_tokenizers
 from transformers import (
     LlamaConfig,
@@ -20,7 +19,7 @@ from transformers import (
 )
 
 HERE = Path(__file__).parent
-JOINTS, SIDE, CHUNK = 6, 64, 10
+SIDE, CHUNK = 64, 10
 SPECIAL = ["<pad>", "<unk>", "<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>"]
 WORDS = [*SPECIAL, "pick", "place", "the", "red", "green", "cup", "bowl", "up", "into"]
 
@@ -48,29 +47,16 @@ def backbone(folder):
 
 
 def config():
-    features = {
-        "observation.state": PolicyFeature(FeatureType.STATE, (JOINTS,)),
-        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE)),
-    }
-    action = {"action": PolicyFeature(FeatureType.ACTION, (JOINTS,))}
     sizes = {"chunk_size": CHUNK, "n_action_steps": CHUNK, "num_steps": 5, "num_vlm_layers": 4}
     model = {"vlm_model_name": "backbone", "resize_imgs_with_padding": (SIDE, SIDE), "device": "cpu"}
-    return SmolVLAConfig(input_features=features, output_features=action, **sizes, **model)
-
-
-def statistics():
-    """What LeRobot computes of a dataset: here of made-up joints in degrees."""
-    joints = {"mean": torch.linspace(-20, 30, JOINTS), "std": torch.linspace(5, 25, JOINTS)}
-    return {"observation.state": joints, "action": dict(joints)}
+    return SmolVLAConfig(**features(SIDE, SIDE), **sizes, **model)
 
 
 def chunk(policy, before, after, state, front, instruction, noise):
     """One chunk (10, 6) as LeRobot's control loop takes it: calls of select_action()."""
-    picture = torch.tensor(front).permute(2, 0, 1).float() / 255
-    seen = {"observation.state": torch.tensor(state), "observation.images.front": picture, "task": str(instruction)}
-    batch = before(seen)
+    seen = before(batch(state, front, task=str(instruction)))
     policy.reset()
-    calls = (policy.select_action(dict(batch), noise=torch.tensor(noise)) for _ in range(CHUNK))
+    calls = (policy.select_action(dict(seen), noise=torch.tensor(noise)) for _ in range(CHUNK))
     return np.stack([after(action)[0].numpy() for action in calls])
 
 
@@ -83,7 +69,7 @@ def recording(policy, before, after, seed, count):
     noise = random.normal(size=(count, 1, CHUNK, 32)).astype(np.float32)
     rows = zip(state, front, said, noise, strict=True)
     action = [chunk(policy, before, after, *row) for row in rows]
-    return {"state": state, "front": front, "instruction": np.array(said), "action": np.array(action)}, noise
+    return {"state": state, "front": front, "instruction": np.array(said), "action": np.array(action), "noise": noise}
 
 
 if __name__ == "__main__":
@@ -91,11 +77,4 @@ if __name__ == "__main__":
     torch.manual_seed(0)
     backbone("backbone")
     policy = SmolVLAPolicy(config()).eval()
-    before, after = make_pre_post_processors(policy.config, dataset_stats=statistics())
-    for part in (policy, before, after):
-        part.save_pretrained(HERE / "checkpoint")
-    calibration, _ = recording(policy, before, after, 1, 32)
-    evaluation, noise = recording(policy, before, after, 2, 16)
-    np.savez_compressed(HERE / "calibration.npz", **calibration)
-    np.savez_compressed(HERE / "evaluation.npz", **evaluation)
-    np.savez(HERE / "noise.npz", x=noise)
+    keep(HERE, policy, {"observation.state": SPREAD, "action": SPREAD}, recording, noise="x")

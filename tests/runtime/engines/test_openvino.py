@@ -186,6 +186,16 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path, monkeypatch) -> None
     assert not caught.value.fix, "what confines OpenVINO has nothing to do with it"
 
 
+@pytest.mark.parametrize("as_bytes", [False, True])
+def test_a_float8_graph_that_is_refused_goes_to_another_engine(tmp_path: Path, as_bytes: bool) -> None:
+    model = onnx.load(graph(tmp_path / "own.onnx", "g (float[1,3] x) => (float[1,3] y) { y = Own(x, w) }"))
+    model.graph.initializer.append(onnx.helper.make_tensor("w", onnx.TensorProto.FLOAT8E4M3FN, [3], bytes(3), raw=True))
+    onnx.save(model, tmp_path / "own.onnx")
+    with pytest.raises(GraphError, match=r"OpenVINO .* refuses .*own.onnx") as caught:
+        OpenvinoSession(tmp_path / "own.onnx", opened=(tmp_path / "own.onnx").read_bytes() if as_bytes else None)
+    assert "use the engine ort_cpu" in caught.value.fix
+
+
 @pytest.mark.parametrize(
     ("confined", "says"), [("SSE41", "^ONEDNN_MAX_CPU_ISA confines .* SSE41"), (None, "^this proc")]
 )

@@ -6,6 +6,7 @@ import numpy as np
 import onnx
 import onnx.parser
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.errors import GraphError
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
@@ -92,3 +93,25 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"not a model")
     with pytest.raises(GraphError, match=r"ONNX Runtime .* refuses"):
         OrtCpuSession(path)
+
+
+def _float8_of_relu(path: Path, dtype: int) -> Path:
+    scale, zero = numpy_helper.from_array(np.float32(0.5), "s"), helper.make_tensor("z", dtype, [], [0.0])
+    nodes = [
+        helper.make_node("Relu", ["x"], ["r"]),
+        helper.make_node("QuantizeLinear", ["r", "s", "z"], ["q"]),
+        helper.make_node("DequantizeLinear", ["q", "s", "z"], ["y"]),
+    ]
+    ports = [[helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3])] for name in ("x", "y")]
+    graph = helper.make_graph(nodes, "g", *ports, [scale, zero])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10), str(path))
+    return path
+
+
+@pytest.mark.parametrize("dtype", [TensorProto.FLOAT8E4M3FN, TensorProto.FLOAT8E5M2])
+@pytest.mark.parametrize("as_bytes", [False, True])
+def test_a_relu_before_a_float8_quantizer_stays(tmp_path: Path, dtype: int, as_bytes: bool) -> None:
+    path = _float8_of_relu(tmp_path / "relu.onnx", dtype)
+    session = OrtCpuSession(path, 1, opened=path.read_bytes() if as_bytes else None)
+    given = session.run({"x": np.array([[-2, 0, 2]], np.float32)})
+    np.testing.assert_array_equal(given["y"], [[0, 0, 2]])

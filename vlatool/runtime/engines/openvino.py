@@ -18,6 +18,7 @@ from vlatool.errors import GraphError, nearest, require
 from vlatool.host import MAX_CPU_ISA, onednn_max_cpu_isa
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engines import _arithmetic
+from vlatool.runtime.stored_types import has_float8
 
 DEVICE = "CPU"
 GRACE_MS = 1000
@@ -50,16 +51,16 @@ class OpenvinoSession:
     ) -> None:
         openvino = require("openvino", "openvino")
         settings = settings_for(threads, compute)
+        wanted = path if opened is None else opened
         try:
             core = openvino.Core()
-            wanted = path if opened is None else opened
             model = core.read_model(io.BytesIO(wanted) if isinstance(wanted, bytes) else str(wanted))
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
             self._compiled = compiled(core, model, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
             words = f"OpenVINO {version_of(openvino)} refuses {path}: {_last_line(error)}"
-            raise GraphError(words, _remedy(error)) from error
+            raise GraphError(words, _remedy(error) or _without_float8(wanted)) from error
         self.path = path
         self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
         if self.precision != HINTS[compute]:
@@ -202,6 +203,14 @@ def _remedy(error: Exception) -> str:
             f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if it stands for no board"
         )
     return f"this processor lacks {lacks}"
+
+
+def _without_float8(model: Path | bytes) -> str:
+    """Return what to do where a graph in float8 is refused: OpenVINO takes some of them only."""
+    with contextlib.suppress(GraphError, OSError):
+        if has_float8(model):
+            return "OpenVINO computes few graphs in float8: use the engine ort_cpu, or another precision"
+    return ""
 
 
 def compiled(core: Any, model: Any, settings: dict[str, Any]) -> Any:

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from vlatool.errors import GraphError, require
 from vlatool.runtime.contract import Port, port
 from vlatool.runtime.engines import _arithmetic
+from vlatool.runtime.stored_types import has_float8
 
 PROVIDER = "CPUExecutionProvider"
+RELU_REWRITE = "ReluQuantRewrite"
 SMALL = 256 * 1024
 """Bytes of all inputs and outputs up to which a run goes through buffers that are bound once."""
 NUMPY_OF: dict[str, np.dtype[Any]] = {
@@ -240,9 +242,21 @@ def session_options(ort: Any, threads: int | None) -> Any:
     return options
 
 
+def left_out(model: Path | bytes) -> list[str]:
+    """Return the rewritings of ONNX Runtime that would make a graph compute something else than it says.
+
+    ReluQuantRewrite (seen in 1.31) drops a Relu before a QuantizeLinear whose zero point is the smallest number
+    of its type, and takes every float8 for such a type: negative values come through.
+    """
+    with contextlib.suppress(GraphError, OSError):  # a file that is no graph is refused when it is opened
+        return [RELU_REWRITE] if has_float8(model) else []
+    return []
+
+
 def _session(ort: Any, model: Path | bytes, options: Any) -> Any:
     wanted = model if isinstance(model, bytes) else str(model)
-    session = ort.InferenceSession(wanted, options, providers=[PROVIDER], enable_fallback=0)
+    given = {"disabled_optimizers": left_out(model)}
+    session = ort.InferenceSession(wanted, options, providers=[PROVIDER], enable_fallback=0, **given)
     if getattr(session, "_model_bytes", None):
         session._model_bytes = b""  # Python's wrapper would keep the whole content for a fallback, which is off
     return session

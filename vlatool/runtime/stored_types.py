@@ -1,0 +1,75 @@
+"""Whether an ONNX graph holds tensors of a type that an engine must be told of: its bytes are walked, as for files."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from vlatool.errors import GraphError
+from vlatool.limits import check
+from vlatool.runtime.external_data import LENGTH, MESSAGES, SMALL, VARINT, OpenFile, parts, varint
+
+FLOAT8 = (17, 18, 19, 20)
+"""``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
+DATA_TYPE = 2
+"""Number of the field ``TensorProto.data_type``."""
+MARKS = tuple(bytes([DATA_TYPE << 3 | VARINT, code]) for code in FLOAT8)
+"""How such a field begins: a message without these bytes holds no float8 tensor."""
+
+
+def has_float8(model: Path | bytes) -> bool:
+    """Say whether a serialized ``ModelProto``, or the file of one, holds a float8 tensor anywhere.
+
+    A zero point in float8 is such a tensor, so that every QuantizeLinear to float8 is found (but for one whose type is
+    an attribute alone, opset 21).
+
+    Raises:
+        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth``.
+        OSError: when there is no such file.
+
+    Example:
+        >>> has_float8(b"")
+        False
+    """
+    if isinstance(model, bytes):
+        return _holds(model)
+    handle = os.open(model, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        return _holds(OpenFile(handle))
+    finally:
+        os.close(handle)
+
+
+def _holds(model: bytes | OpenFile) -> bool:
+    left = [("ModelProto", 0, len(model), 1)]
+    while left:
+        message, start, end, depth = left.pop()
+        check("graph_depth", depth, "The graph", GraphError)
+        if message == "TensorProto":
+            if _data_type(model[start : min(end, start + SMALL)]) in FLOAT8:
+                return True
+        elif _may_hold(model, start, end):
+            inner = MESSAGES.get(message, {})
+            found = parts(model, start, end)
+            left += [(inner[field], at, to, depth + 1) for field, at, to in found if field in inner]
+    return False
+
+
+def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:
+    """Say whether a message may have such a tensor in it: a large one may."""
+    return end - start > SMALL or any(mark in model[start:end] for mark in MARKS)
+
+
+def _data_type(tensor: bytes) -> int:
+    """Return the type that a tensor names before its data; 0 when it names none there."""
+    at = 0
+    while at < len(tensor):
+        tag, at = varint(tensor, at, 5)
+        field, kind = tag >> 3, tag & 7
+        if kind not in (VARINT, LENGTH):
+            return 0
+        value, at = varint(tensor, at, 10)
+        if field == DATA_TYPE and kind == VARINT:
+            return value
+        at += value if kind == LENGTH else 0
+    return 0
