@@ -40,29 +40,6 @@ def drift(bundle: str, folder: Path, engine: str) -> tuple[float, int]:
     return difference(np.array(got), wanted[:count]), count
 
 
-def is_generated(bundle: str) -> bool:
-    """Say whether a policy's action is a sequence of tokens, each of which decides what follows."""
-    spec = vlatool.load(bundle).spec
-    return spec.action.kind == "discrete" and spec.chunk > 1
-
-
-def of_tokens(bundle: str, folder: Path) -> tuple[float, int]:
-    """Return the difference of the first token's logits from those of the float32 bundle beside this one.
-
-    A token that flips changes all that follow, and with random weights a small change flips it: tokens tell nothing
-    of a quantized network.
-    """
-    rows = arrays(folder / "evaluation.npz")
-    rows.pop("action")
-    policies = [vlatool.load(each, seed=0) for each in (Path(bundle).parent / "float32", Path(bundle))]
-    name, found = policies[0].spec.action.name, ([], [])
-    for index in range(min(len(next(iter(rows.values()))), ROWS)):
-        for policy, logits in zip(policies, found, strict=True):
-            given = policy.infer({key: values[index] for key, values in rows.items()})
-            logits.append(np.array(given.outputs[name]).reshape(policy.spec.chunk, -1)[0])
-    return difference(np.array(found[1]), np.array(found[0])), len(found[0])
-
-
 def difference(got: np.ndarray, wanted: np.ndarray) -> float:
     """Share of answers that differ, or |difference| / |action|; actions may come without the axis of the chunk."""
     wanted = wanted.reshape(got.shape)
@@ -74,8 +51,7 @@ def difference(got: np.ndarray, wanted: np.ndarray) -> float:
 if __name__ == "__main__":
     bundle, folder, engine = sys.argv[1:]
     try:
-        generated = Path(bundle).name != "float32" and is_generated(bundle)
-        found, count = of_tokens(bundle, Path(folder)) if generated else drift(bundle, Path(folder), engine)
+        found, count = drift(bundle, Path(folder), engine)
     except VlatoolError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(error.exit_code) from None
