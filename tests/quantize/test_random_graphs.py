@@ -5,6 +5,7 @@ import onnx
 import pytest
 from _graph_trials import METHODS, float_graph, trial
 from _random_graphs import RandomGraph
+from onnx import helper
 
 from vlatool.finish import reference_policy
 from vlatool.launch import run_transform
@@ -62,6 +63,28 @@ def twice(g, value):
     return g.node("MatMul", [g.node("Relu", [first], g.shapes[value]), weight], g.shapes[value])
 
 
+def gemm_twice(g, value):
+    """One square weight in two products that transpose it, as in a loop over one Linear."""
+    weight, bias = g.weight(32, 32), g.constant(g.random.normal(size=32))
+    first = g.node("Gemm", [value, weight, bias], (1, 32), transB=1)
+    return g.node("Gemm", [g.node("Tanh", [first], (1, 32)), weight, bias], (1, 32), transB=1)
+
+
+def gemm_in_branches(g, value):
+    """One square weight that is transposed in both branches of an If."""
+    weight, branches = g.weight(32, 32), {}
+    for word, kind in (("then_branch", "Relu"), ("else_branch", "Tanh")):
+        nodes = [
+            helper.make_node("Gemm", [value, weight], [f"{word}0"], name=f"{word}0", transB=1),
+            helper.make_node(kind, [f"{word}0"], [f"{word}1"], name=f"{word}1"),
+        ]
+        out = helper.make_tensor_value_info(f"{word}1", onnx.TensorProto.FLOAT, (1, 32))
+        branches[word] = helper.make_graph(nodes, word, [], [out])
+    total = g.node("ReduceSum", [value, g.constant([0, 1], np.int64)], (), keepdims=0)
+    made = g.node("If", [g.node("Greater", [total, g.constant(0.0)], ())], (1, 32), **branches)
+    return g.node("Gemm", [made, weight], (1, 32), transB=1)
+
+
 def weight_given(g, value):
     weight = g.weight(32, 16)
     g.outputs.append(made := g.node("MatMul", [value, weight], (*g.shapes[value][:-1], 16)))
@@ -103,6 +126,15 @@ def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_pat
     found = trial(graph, float_graph(graph, tmp_path / "graph"), word)
     assert (found.verdict, found.words) == ("right", "")
     assert 0 < found.drift < 0.25
+
+
+@pytest.mark.parametrize("word", sorted(METHODS))
+@pytest.mark.parametrize("write", [gemm_twice, gemm_in_branches])
+def test_a_square_weight_is_transposed_once(write, word, tmp_path):
+    graph = Written(write, (1, 32))
+    found = trial(graph, float_graph(graph, tmp_path / "graph"), word)
+    assert (found.verdict, found.words) == ("right", "")
+    assert found.drift < 0.25
 
 
 @pytest.mark.parametrize("word", ["smooth", "float16", "static", "static-qdq", "static-openvino", "dynamic"])
