@@ -89,9 +89,14 @@ class RandomPolicy:
         (folder / "policy.yaml").write_text(yaml.safe_dump(self._description(), sort_keys=False))
         words = {"kind": "words", "pad": 0, "unknown": 1, "words": {word: 2 + at for at, word in enumerate(WORDS)}}
         (folder / "vocabulary.json").write_text(json.dumps(words))
-        seen = self.observations(RECORDED, self.seed)
-        np.savez(folder / "calibration.npz", **{name: np.array([each[name] for each in seen]) for name in seen[0]})
+        self.record(folder / "calibration.npz")
         return folder
+
+    def record(self, path: Path, *more: dict[str, Any]) -> Path:
+        """Write a recording for calibration, with further observations in it."""
+        seen = [*self.observations(RECORDED, self.seed), *more]
+        np.savez(path, **{name: np.array([each[name] for each in seen]) for name in seen[0]})
+        return path
 
     def observations(self, count: int, seed: int) -> list[dict[str, Any]]:
         """Draw observations without a batch axis."""

@@ -6,7 +6,8 @@
 
 None may end with what would be exit code 70, or end its process, and no bundle that loads may answer with a drift from
 torch above the method's limit. Prints a line for each of these and, at the end, a table: how many bundles of each
-method and engine were right, refused with a reason, drifted or crashed. Exit code 1 when something crashed or drifted,
+method and engine were right, refused with a reason, drifted (``uncovered``: because the recording does not cover what
+it is asked, which is tried again with a recording that does) or crashed. Exit code 1 when something crashed or drifted,
 or torch's export of a policy was refused.
 Policies run in worker processes; with ``-o``, what the file tells already is not tried again.
 """
@@ -192,13 +193,15 @@ def bad(outcome: Outcome) -> bool:
 def report(outcomes: Iterable[Outcome]) -> int:
     """Print the table and the reasons of refusals."""
     outcomes = list(outcomes)
-    print(f"{'method':16} {'engine':9} {'right':>6} {'refused':>8} {'drift':>6} {'crash':>6} {'worst':>9}")
+    verdicts = ("right", "refused", "uncovered", "drift", "crash")
+    print(f"{'method':16} {'engine':9}" + "".join(f"{word:>10}" for word in (*verdicts, "worst")))
     order = [EXPORT, *METHODS]
     for method, engine in sorted({(each.method, each.engine) for each in outcomes}, key=lambda at: order.index(at[0])):
         found = [each for each in outcomes if (each.method, each.engine) == (method, engine)]
         count = Counter(each.verdict for each in found)
-        print(f"{method:16} {engine or '(made)':9} {count['right']:6} {count['refused']:8} {count['drift']:6} "
-              f"{count['crash']:6} {max(each.drift for each in found):9.2g}")  # fmt: skip
+        worst = max((each.drift for each in found if each.verdict != "uncovered"), default=0.0)
+        told = "".join(f"{count[word]:10}" for word in verdicts)
+        print(f"{method:16} {engine or '(made)':9}{told}{worst:10.2g}")
     reasons = Counter(
         (each.method, each.engine, re.sub(r"'[^']*'|/\S+|[\d.]+", "*", each.words)[:150])
         for each in outcomes if each.verdict == "refused"
