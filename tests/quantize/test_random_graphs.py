@@ -9,6 +9,7 @@ from onnx import helper
 
 from vlatool.finish import reference_policy
 from vlatool.launch import run_transform
+from vlatool.quantize.float8 import Float8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
 from vlatool.runtime import load
@@ -260,3 +261,25 @@ def test_no_method_crashes_on_a_random_graph_and_what_it_gives_is_right(seed, tm
     found = {word: trial(graph, source, word) for word in METHODS}
     assert {word: each for word, each in found.items() if each.verdict in ("crash", "drift")} == {}
     assert [each.verdict for each in found.values()].count("right") >= 10
+
+
+def relu_between(g, value):
+    """A Relu, or a Clip at zero, right before what is quantized."""
+    shape = g.shapes[value]
+    for kind, bounds in (("Relu", []), ("Clip", [g.constant(0.0), g.constant(6.0)])):
+        value = g.node("MatMul", [value, g.weight(32, 32)], shape)
+        value = g.node(kind, [value, *bounds], shape)
+    return linear(g, value)
+
+
+def test_onnx_runtime_keeps_what_cuts_off_the_negative_before_float8(tmp_path):
+    """It takes the rounding to int8 for the same as a Relu, and float8 for int8."""
+    graph = Written(relu_between, (1, 4, 32))
+    source = float_graph(graph, tmp_path / "graph")
+    stage = Float8(calibration=source.path.parent / "recording.npz")
+    made = run_transform(stage, source, tmp_path / "float8", Context())
+    assert not made.manifest.findings
+    observation = {"input0": graph.recording(1, seed=1)["input0"][0]}
+    wanted, got = (load(bundle.path, threads=1).infer(observation).outputs for bundle in (source, made))
+    name = graph.outputs[0]
+    assert 0 < relative_error(got[name], wanted[name]) < 0.1

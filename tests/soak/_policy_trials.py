@@ -43,7 +43,7 @@ METHODS: dict[str, tuple[str, dict[str, Any], float]] = {
     "awq": ("quantize.weight_only", {"method": "awq"}, INT4),
 }
 """Word -> stage, options, and the largest drift."""
-CALIBRATED = ("static", "static-all", "static-qdq", "static-openvino")
+CALIBRATED = ("static", "static-all", "static-qdq", "static-openvino", "float8")
 """Methods whose activations have ranges from a recording: what leaves them is clipped."""
 EXPORT = "export"
 FRESH = 1000

@@ -41,6 +41,9 @@ SIGNED = ("session.qdqisint8allowed", "1")
 uint8 else, with which convolutions saturate where those of int8 are exact."""
 UNFUSED = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
+WITH_RELU = ("optimization.disable_specified_optimizers", "ReluQuantRewrite;ClipQuantRewrite")
+"""The option of ONNX Runtime that leaves Relu and Clip before a quantizer where they are: rounding to uint8 cuts off
+what is negative, but it (1.31) takes float8, which does not, for the same."""
 EXACT = "exact"
 EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
 SATURATING = "saturating: they are added in pairs of 16 bits"

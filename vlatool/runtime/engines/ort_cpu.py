@@ -135,11 +135,11 @@ class OrtCpuSession:
         no such type.
         """
         saturates = _arithmetic.ort_product(ort) < _arithmetic.WANTED
-        first = [_arithmetic.PRECISE, _arithmetic.SIGNED] if saturates else [None]
-        entries = [*first, _arithmetic.UNFUSED]
-        ways = [session_options(ort, threads) for _ in entries]
-        for options, entry in zip(ways, entries, strict=True):
-            if entry is not None:
+        first = [(_arithmetic.PRECISE,), (_arithmetic.SIGNED,)] if saturates else [()]
+        kinds = [*first, (_arithmetic.UNFUSED, _arithmetic.WITH_RELU)]
+        ways = [session_options(ort, threads) for _ in kinds]
+        for options, entries in zip(ways, kinds, strict=True):
+            for entry in entries:
                 options.add_session_config_entry(*entry)
         return ways
 
