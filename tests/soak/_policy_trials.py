@@ -23,19 +23,20 @@ from vlatool.runtime.policy import relative_error
 from vlatool.stage import Context, Transform, build_stage
 
 ENGINES = ("ort_cpu", "openvino")
-FLOAT, HALF, INT8, INT4 = 1e-3, 0.05, 0.25, 0.7
-"""Largest relative L2 drift of the actions from torch, of networks of a few random layers."""
+FLOAT, HALF, EIGHT_BITS, AT_RUN_TIME, INT8, INT4 = 1e-4, 0.005, 0.05, 0.1, 0.25, 0.7
+"""Largest relative L2 drift of the actions from torch, of networks of a few random layers: up to three times what the
+worst of 300 policies lost when no defect was left (docs/measured.md)."""
 METHODS: dict[str, tuple[str, dict[str, Any], float]] = {
     "static": ("quantize.static_int8", {}, INT8),
     "static-all": ("quantize.static_int8", {"attention": True, "elementwise": True}, 2 * INT8),
     "static-qdq": ("quantize.static_int8", {"layout": "qdq"}, INT8),
     "static-openvino": ("quantize.static_int8", {"layout": "openvino"}, INT8),
-    "dynamic": ("quantize.dynamic_int8", {}, INT8),
+    "dynamic": ("quantize.dynamic_int8", {}, AT_RUN_TIME),
     "smooth": ("quantize.smooth_quant", {"insert": True, "outliers": 1.0}, FLOAT),
     "float16": ("quantize.float16", {}, HALF),
     "float8": ("quantize.float8", {}, INT8),
-    "bfloat16": ("quantize.bfloat16", {}, HALF),
-    "int8-weights": ("quantize.weight_only", {"bits": 8}, HALF),
+    "bfloat16": ("quantize.bfloat16", {}, EIGHT_BITS),
+    "int8-weights": ("quantize.weight_only", {"bits": 8}, EIGHT_BITS),
     "int4": ("quantize.weight_only", {}, INT4),
     "int4-qdq": ("quantize.weight_only", {"layout": "qdq"}, INT4),
     "hqq": ("quantize.weight_only", {"method": "hqq"}, INT4),
