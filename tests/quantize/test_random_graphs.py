@@ -5,9 +5,11 @@ import onnx
 import pytest
 from _graph_trials import METHODS, float_graph, trial
 from _random_graphs import RandomGraph
+from onnx import helper
 
 from vlatool.finish import reference_policy
 from vlatool.launch import run_transform
+from vlatool.quantize.float8 import Float8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
 from vlatool.runtime import load
@@ -62,6 +64,28 @@ def twice(g, value):
     return g.node("MatMul", [g.node("Relu", [first], g.shapes[value]), weight], g.shapes[value])
 
 
+def gemm_twice(g, value):
+    """One square weight in two products that transpose it, as in a loop over one Linear."""
+    weight, bias = g.weight(32, 32), g.constant(g.random.normal(size=32))
+    first = g.node("Gemm", [value, weight, bias], (1, 32), transB=1)
+    return g.node("Gemm", [g.node("Tanh", [first], (1, 32)), weight, bias], (1, 32), transB=1)
+
+
+def gemm_in_branches(g, value):
+    """One square weight that is transposed in both branches of an If."""
+    weight, branches = g.weight(32, 32), {}
+    for word, kind in (("then_branch", "Relu"), ("else_branch", "Tanh")):
+        nodes = [
+            helper.make_node("Gemm", [value, weight], [f"{word}0"], name=f"{word}0", transB=1),
+            helper.make_node(kind, [f"{word}0"], [f"{word}1"], name=f"{word}1"),
+        ]
+        out = helper.make_tensor_value_info(f"{word}1", onnx.TensorProto.FLOAT, (1, 32))
+        branches[word] = helper.make_graph(nodes, word, [], [out])
+    total = g.node("ReduceSum", [value, g.constant([0, 1], np.int64)], (), keepdims=0)
+    made = g.node("If", [g.node("Greater", [total, g.constant(0.0)], ())], (1, 32), **branches)
+    return g.node("Gemm", [made, weight], (1, 32), transB=1)
+
+
 def weight_given(g, value):
     weight = g.weight(32, 16)
     g.outputs.append(made := g.node("MatMul", [value, weight], (*g.shapes[value][:-1], 16)))
@@ -103,6 +127,15 @@ def test_weights_are_quantized_however_they_are_read(write, shape, word, tmp_pat
     found = trial(graph, float_graph(graph, tmp_path / "graph"), word)
     assert (found.verdict, found.words) == ("right", "")
     assert 0 < found.drift < 0.25
+
+
+@pytest.mark.parametrize("word", sorted(METHODS))
+@pytest.mark.parametrize("write", [gemm_twice, gemm_in_branches])
+def test_a_square_weight_is_transposed_once(write, word, tmp_path):
+    graph = Written(write, (1, 32))
+    found = trial(graph, float_graph(graph, tmp_path / "graph"), word)
+    assert (found.verdict, found.words) == ("right", "")
+    assert found.drift < 0.25
 
 
 @pytest.mark.parametrize("word", ["smooth", "float16", "static", "static-qdq", "static-openvino", "dynamic"])
@@ -228,3 +261,25 @@ def test_no_method_crashes_on_a_random_graph_and_what_it_gives_is_right(seed, tm
     found = {word: trial(graph, source, word) for word in METHODS}
     assert {word: each for word, each in found.items() if each.verdict in ("crash", "drift")} == {}
     assert [each.verdict for each in found.values()].count("right") >= 10
+
+
+def relu_between(g, value):
+    """A Relu, or a Clip at zero, right before what is quantized."""
+    shape = g.shapes[value]
+    for kind, bounds in (("Relu", []), ("Clip", [g.constant(0.0), g.constant(6.0)])):
+        value = g.node("MatMul", [value, g.weight(32, 32)], shape)
+        value = g.node(kind, [value, *bounds], shape)
+    return linear(g, value)
+
+
+def test_onnx_runtime_keeps_what_cuts_off_the_negative_before_float8(tmp_path):
+    """It takes the rounding to int8 for the same as a Relu, and float8 for int8."""
+    graph = Written(relu_between, (1, 4, 32))
+    source = float_graph(graph, tmp_path / "graph")
+    stage = Float8(calibration=source.path.parent / "recording.npz")
+    made = run_transform(stage, source, tmp_path / "float8", Context())
+    assert not made.manifest.findings
+    observation = {"input0": graph.recording(1, seed=1)["input0"][0]}
+    wanted, got = (load(bundle.path, threads=1).infer(observation).outputs for bundle in (source, made))
+    name = graph.outputs[0]
+    assert 0 < relative_error(got[name], wanted[name]) < 0.1

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+RECORDED = 32
+"""Observations for calibration: with 8, those that come after left the ranges seen by half."""
 WORDS = ("go", "to", "the", "red", "blue", "ball", "box")
 TEXTS = ("go to red ball", "blue box", "ball to the box", "go")
 BODIES = {
@@ -87,9 +89,14 @@ class RandomPolicy:
         (folder / "policy.yaml").write_text(yaml.safe_dump(self._description(), sort_keys=False))
         words = {"kind": "words", "pad": 0, "unknown": 1, "words": {word: 2 + at for at, word in enumerate(WORDS)}}
         (folder / "vocabulary.json").write_text(json.dumps(words))
-        seen = self.observations(8, self.seed)
-        np.savez(folder / "calibration.npz", **{name: np.array([each[name] for each in seen]) for name in seen[0]})
+        self.record(folder / "calibration.npz")
         return folder
+
+    def record(self, path: Path, *more: dict[str, Any]) -> Path:
+        """Write a recording for calibration, with further observations in it."""
+        seen = [*self.observations(RECORDED, self.seed), *more]
+        np.savez(path, **{name: np.array([each[name] for each in seen]) for name in seen[0]})
+        return path
 
     def observations(self, count: int, seed: int) -> list[dict[str, Any]]:
         """Draw observations without a batch axis."""

@@ -1,150 +1,146 @@
 """Random small torch policies through export, every quantization method and both engines.
 
-    python tests/soak/policies_fuzz.py --policies 300
+    python tests/soak/policies_fuzz.py --policies 300 --jobs 2 -o outcomes.jsonl
     python tests/soak/policies_fuzz.py --policies 1 --first 17 --methods float16
+    python tests/soak/policies_fuzz.py --table outcomes.jsonl
 
-None may end with what would be exit code 70, and no bundle that loads may answer with a drift from torch above the
-method's limit. Prints a line for each of these and, at the end, a table: how many bundles of each method and engine
-were right, refused with a reason, drifted or crashed. Exit code 1 when something crashed or drifted.
+None may end with what would be exit code 70, or end its process, and no bundle that loads may answer with a drift from
+torch above the method's limit. Prints a line for each of these and, at the end, a table: how many bundles of each
+method and engine were right, refused with a reason, drifted (``uncovered``: because the recording does not cover what
+it is asked, which is tried again with a recording that does) or crashed. Exit code 1 when something crashed or drifted,
+or torch's export of a policy was refused.
+Policies run in worker processes; with ``-o``, what the file tells already is not tried again.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import json
+import os
 import re
+import signal
+import subprocess
 import sys
 import tempfile
-import traceback
-import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
-import numpy as np
+from _policy_trials import EXPORT, METHODS, Outcome, Place, places, trials
 from _random_policies import RandomPolicy
 
-from vlatool.bundle import Bundle
-from vlatool.errors import VlatoolError
-from vlatool.export._torch_policy import torch_policy
-from vlatool.export.onnx import ExportOnnx
-from vlatool.launch import run_transform
-from vlatool.pipeline import source_stage
-from vlatool.runtime import load
-from vlatool.runtime.policy import relative_error
-from vlatool.stage import Context, build_stage
-
-ENGINES = ("ort_cpu", "openvino")
-FLOAT, HALF, INT8, INT4 = 1e-3, 0.05, 0.25, 0.7
-"""Largest relative L2 drift of the actions from torch, of networks of a few random layers."""
-METHODS: dict[str, tuple[str, dict[str, Any], float]] = {
-    "static": ("quantize.static_int8", {}, INT8),
-    "static-all": ("quantize.static_int8", {"attention": True, "elementwise": True}, 2 * INT8),
-    "static-qdq": ("quantize.static_int8", {"layout": "qdq"}, INT8),
-    "static-openvino": ("quantize.static_int8", {"layout": "openvino"}, INT8),
-    "dynamic": ("quantize.dynamic_int8", {}, INT8),
-    "smooth": ("quantize.smooth_quant", {"insert": True, "outliers": 1.0}, FLOAT),
-    "float16": ("quantize.float16", {}, HALF),
-    "float8": ("quantize.float8", {}, INT8),
-    "bfloat16": ("quantize.bfloat16", {}, HALF),
-    "int8-weights": ("quantize.weight_only", {"bits": 8}, HALF),
-    "int4": ("quantize.weight_only", {}, INT4),
-    "int4-qdq": ("quantize.weight_only", {"layout": "qdq"}, INT4),
-    "hqq": ("quantize.weight_only", {"method": "hqq"}, INT4),
-    "gptq": ("quantize.weight_only", {"method": "gptq"}, INT4),
-    "awq": ("quantize.weight_only", {"method": "awq"}, INT4),
-}
-"""Word -> stage, options, and the largest drift."""
-FRESH = 1000
-"""Added to a policy's seed for observations that calibration has not seen."""
+Told = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one bundle.
+class Journal:
+    """The outcomes of a run, one line of JSON each, in a file where one is given.
 
     Args:
-        method: A key of ``METHODS``, or ``export``.
-        engine: Which one loaded it; empty when it was not made.
-        verdict: ``right``, ``refused``, ``drift`` or ``crash``.
-        drift: Relative L2 drift of the actions from torch, where it ran.
-        words: The reason.
+        path: The file; lines that are in it count.
+        methods: Those that the run is about.
     """
 
-    method: str
-    engine: str
-    verdict: str
-    drift: float = 0.0
-    words: str = ""
+    def __init__(self, path: Path | None, methods: Collection[str]) -> None:
+        self.path, self.lock = path, Lock()
+        found = [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
+        self.lines: list[Told] = [each for each in found if each["method"] in (EXPORT, *methods)]
+
+    def add(self, seed: int, outcome: Outcome) -> None:
+        """Note an outcome and print a bad one."""
+        policy = RandomPolicy(seed).words
+        with self.lock:
+            self.lines.append({"seed": seed, "policy": policy, **vars(outcome)})
+            if self.path:
+                with self.path.open("a") as stream:
+                    stream.write(json.dumps(self.lines[-1]) + "\n")
+            if bad(outcome):
+                print(f"{seed} {outcome.method} {outcome.engine} {outcome.verdict} {outcome.drift:.3g} ({policy})\n"
+                      f"{outcome.words}", flush=True)  # fmt: skip
+
+    def known(self, seed: int) -> set[Place]:
+        """Return what need not be tried of a policy any more; what was not made cannot be loaded."""
+        told = [each for each in self.lines if each["seed"] == seed]
+        unmade = [place for each in told if not each["engine"] for place in places(each["method"])]
+        return {*((each["method"], each["engine"]) for each in told), *unmade}
 
 
-def trials(policy: RandomPolicy, scratch: Path, methods: list[str]) -> Iterator[Outcome]:
-    """Take a policy through everything."""
-    made: list[Bundle] = []
+class Worker:
+    """A process that takes policies through everything; another one follows when it is ended by one of them."""
 
-    def export() -> Bundle:
-        source = run_transform(
-            source_stage(str(policy.write(scratch / "policy")))[0], None, scratch / "source", Context()
-        )
-        (scratch / "float").mkdir()
-        made.append(source)
-        return ExportOnnx().run(source, scratch / "float", Context())
+    def __init__(self, journal: Journal, methods: Collection[str]) -> None:
+        self.journal, self.methods = journal, list(methods)
+        self.process: subprocess.Popen[str] | None = None
 
-    exported, failed = _tried("export", "", export)
-    if exported is None:
-        yield failed
-        return
-    wanted = _answers(torch_policy(made[0], seed=0), policy)
-    yield from _loaded("export", exported, policy, wanted, FLOAT)
-    for method in methods:
-        stage, options, limit = METHODS[method]
+    def run(self, seed: int) -> None:
+        """Take one policy through what is not known of it yet."""
+        while True:
+            known = self.journal.known(seed)
+            if (EXPORT, "") in known or all(place in known for word in self.methods for place in places(word)):
+                return
+            if (ended := self._asked(seed, known)) is not None:
+                self.journal.add(seed, ended)
 
-        def quantize(stage: str = stage, options: dict[str, Any] = options, method: str = method) -> Bundle:
-            return run_transform(build_stage(stage, options), exported, scratch / method, Context())  # type: ignore[arg-type]
+    def _asked(self, seed: int, known: Collection[Place]) -> Outcome | None:
+        """Return what ended the process, None when all was answered."""
+        process = self.process = self.process or _started()
+        assert process.stdin
+        assert process.stdout
+        process.stdin.write(json.dumps({"seed": seed, "methods": self.methods, "skip": sorted(known)}) + "\n")
+        process.stdin.flush()
+        begun: Place = (EXPORT, "")
+        for line in process.stdout:
+            told = json.loads(line)
+            if "done" in told:
+                return None
+            if "begin" in told:
+                begun = (told["begin"][0], told["begin"][1])
+            else:
+                self.journal.add(seed, Outcome(**told))
+        process.stdin.close()
+        process.stdout.close()
+        code, self.process = process.wait(), None
+        reason = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return Outcome(*begun, "crash", words=f"ends its process with {reason}")
 
-        bundle, failed = _tried(method, "", quantize)
-        if bundle is None:
-            yield failed
-        else:
-            yield from _loaded(method, bundle, policy, wanted, limit)
-
-
-def _loaded(method: str, bundle: Bundle, policy: RandomPolicy, wanted: list[Any], limit: float) -> Iterator[Outcome]:
-    for engine in ENGINES:
-
-        def answered(engine: str = engine) -> float:
-            probe = engine == "openvino"  # it may end its process while it compiles
-            got = _answers(load(bundle.path, engine=engine, threads=1, seed=0, probe=probe), policy)
-            return relative_error(np.stack(got), np.stack(wanted))
-
-        drift, failed = _tried(method, engine, answered)
-        if drift is None:
-            yield failed
-        else:
-            yield Outcome(method, engine, "right" if drift <= limit else "drift", drift, f"above {limit:g}")
-
-
-def _answers(opened: Any, policy: RandomPolicy) -> list[Any]:
-    """Return the actions for fresh observations, one after the other."""
-    observations = policy.observations(4, policy.seed + FRESH)
-    noises = [policy.noise(policy.seed + FRESH + turn) for turn in range(len(observations))]
-    return [opened.infer(each, noise=noise).outputs["action"] for each, noise in zip(observations, noises, strict=True)]
+    def end(self) -> None:
+        """Let the process end."""
+        if self.process and self.process.stdin and self.process.stdout:
+            self.process.stdin.close()
+            self.process.wait()
+            self.process.stdout.close()
 
 
-def _tried(method: str, engine: str, work: Callable[[], Any]) -> tuple[Any, Outcome]:
-    """Return what some work gives, or what it ended with."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return work(), Outcome(method, engine, "right")
-    except VlatoolError as error:
-        died = "SIG" in str(error)
-        verdict = "crash" if error.exit_code == 70 or died else "refused"
-        return None, Outcome(method, engine, verdict, words=str(error))
-    except Exception:  # the seam: whatever is no error of vlatool's own would be exit code 70
-        return None, Outcome(method, engine, "crash", words=traceback.format_exc())
+def _started() -> subprocess.Popen[str]:
+    command = [sys.executable, str(Path(__file__).resolve()), "--serve"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+
+
+def serve() -> int:
+    """Answer the questions on standard input: the worker's side."""
+    from torch.onnx._internal.exporter._registration import ONNXRegistry
+
+    # what torch knows of its operators is the same for every export, and a sixth of the time of a policy
+    ONNXRegistry.from_torchlib = staticmethod(functools.cache(ONNXRegistry.from_torchlib))  # type: ignore[assignment]
+    replies = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what the engines print is no answer
+    for line in sys.stdin:
+        asked = json.loads(line)
+        skip = {(method, engine) for method, engine in asked["skip"]}
+        with tempfile.TemporaryDirectory(prefix="vlatool-fuzz-") as scratch:
+            tell = _told(replies)
+            for outcome in trials(RandomPolicy(asked["seed"]), Path(scratch), asked["methods"], skip, tell):
+                replies.write(json.dumps(vars(outcome)) + "\n")
+        replies.write('{"done": true}\n')
+    return 0
+
+
+def _told(replies: Any) -> Any:
+    return lambda place: replies.write(json.dumps({"begin": place}) + "\n")
 
 
 def main() -> int:
@@ -152,38 +148,67 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policies", type=int, default=300)
     parser.add_argument("--first", type=int, default=0, help="seed of the first policy")
+    parser.add_argument("--seeds", type=int, nargs="+", help="these alone")
     parser.add_argument("--methods", nargs="+", choices=sorted(METHODS), default=list(METHODS))
+    parser.add_argument("--jobs", type=int, default=1, help="worker processes")
     parser.add_argument("-o", "--output", type=Path, help="a line of JSON for each outcome, as they come")
+    parser.add_argument("--table", type=Path, help="print the table of such a file and run nothing")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    outcomes: list[Outcome] = []
-    for seed in range(given.first, given.first + given.policies):
-        policy = RandomPolicy(seed)
-        with tempfile.TemporaryDirectory(prefix="vlatool-fuzz-") as scratch:
-            for outcome in trials(policy, Path(scratch), given.methods):
-                outcomes.append(outcome)
-                if given.output:
-                    with given.output.open("a") as stream:
-                        stream.write(json.dumps({"seed": seed, "policy": policy.words, **vars(outcome)}) + "\n")
-                if outcome.verdict in ("crash", "drift"):
-                    print(f"{seed} {outcome.method} {outcome.engine} {outcome.verdict} {outcome.drift:.3g} "
-                          f"({policy.words})\n{outcome.words}", flush=True)  # fmt: skip
-    return report(outcomes)
+    if given.serve:
+        return serve()
+    journal = Journal(given.table or given.output, given.methods)
+    seeds = given.seeds or range(given.first, given.first + given.policies)
+    if not given.table:
+        run(journal, iter(seeds), given.methods, given.jobs)
+    return report([_outcome(each) for each in journal.lines if given.table or each["seed"] in seeds])
 
 
-def report(outcomes: list[Outcome]) -> int:
+def run(journal: Journal, seeds: Iterator[int], methods: Collection[str], jobs: int) -> None:
+    """Share policies among worker processes."""
+    lock = Lock()
+
+    def work(_: int) -> None:
+        worker = Worker(journal, methods)
+        while True:
+            with lock:
+                seed = next(seeds, None)
+            if seed is None:
+                return worker.end()
+            worker.run(seed)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(work, range(jobs)))
+
+
+def _outcome(told: Told) -> Outcome:
+    return Outcome(**{name: told[name] for name in ("method", "engine", "verdict", "drift", "words")})
+
+
+def bad(outcome: Outcome) -> bool:
+    """Say whether the fuzz has found something; torch can export each of these policies."""
+    return outcome.verdict in ("crash", "drift") or (outcome.verdict, outcome.method) == ("refused", EXPORT)
+
+
+def report(outcomes: Iterable[Outcome]) -> int:
     """Print the table and the reasons of refusals."""
-    print(f"{'method':16} {'engine':9} {'right':>6} {'refused':>8} {'drift':>6} {'crash':>6} {'worst':>9}")
-    for method, engine in dict.fromkeys((each.method, each.engine) for each in outcomes):
+    outcomes = list(outcomes)
+    verdicts = ("right", "refused", "uncovered", "drift", "crash")
+    print(f"{'method':16} {'engine':9}" + "".join(f"{word:>10}" for word in (*verdicts, "worst")))
+    order = [EXPORT, *METHODS]
+    for method, engine in sorted({(each.method, each.engine) for each in outcomes}, key=lambda at: order.index(at[0])):
         found = [each for each in outcomes if (each.method, each.engine) == (method, engine)]
         count = Counter(each.verdict for each in found)
-        print(f"{method:16} {engine or '(made)':9} {count['right']:6} {count['refused']:8} {count['drift']:6} "
-              f"{count['crash']:6} {max(each.drift for each in found):9.2g}")  # fmt: skip
+        worst = max((each.drift for each in found if each.verdict != "uncovered"), default=0.0)
+        told = "".join(f"{count[word]:10}" for word in verdicts)
+        print(f"{method:16} {engine or '(made)':9}{told}{worst:10.2g}")
     reasons = Counter(
-        re.sub(r"'[^']*'|/\S+|[\d.]+", "*", each.words)[:150] for each in outcomes if each.verdict == "refused"
-    )
-    for words, number in reasons.most_common():
-        print(f"refused {number:4}: {words}")
-    return int(any(each.verdict in ("crash", "drift") for each in outcomes))
+        (each.method, each.engine, re.sub(r"'[^']*'|/\S+|[\d.]+", "*", each.words)[:150])
+        for each in outcomes if each.verdict == "refused"
+    )  # fmt: skip
+    for (method, engine, words), number in reasons.most_common():
+        print(f"refused {number:4} {method} {engine or '(made)'}: {words}")
+    return int(any(bad(each) for each in outcomes))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
 from vlatool.quantize._layers import Layer
+from vlatool.quantize._nodes import read_names
 
 Array = NDArray[Any]
 
@@ -94,7 +95,7 @@ class Float8Writer:
             self._nodes.append(node)
         del self._graph.node[:]
         self._graph.node.extend(self._nodes)
-        used = {name for node in self._nodes for name in node.input} | {value.name for value in self._graph.output}
+        used = read_names(self._nodes) | {value.name for value in self._graph.output}
         for index in range(len(self._graph.initializer) - 1, -1, -1):
             if self._graph.initializer[index].name not in used:
                 del self._graph.initializer[index]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from vlatool.errors import require
+from vlatool.quantize._nodes import reads
 
 DOMAIN = "com.microsoft"
 
@@ -28,7 +29,7 @@ def use_integer_matmul(model: Any) -> int:
     producers = {name: node for node in graph.node for name in node.output}
     consumers: dict[str, list[Any]] = {}
     for node in graph.node:
-        for name in node.input:
+        for name in reads(node):
             consumers.setdefault(name, []).append(node)
     constants = {tensor.name: tensor for tensor in graph.initializer}
     outputs = {value.name for value in graph.output}
@@ -91,7 +92,7 @@ def _drop(graph: Any, added: set[str]) -> None:
     for node in reversed(nodes):
         if any(name in wanted for name in node.output):
             kept.append(node)
-            wanted.update(node.input)
+            wanted.update(reads(node))
     constants = [tensor for tensor in graph.initializer if tensor.name in wanted]
     del graph.node[:]
     graph.node.extend(reversed(kept))

@@ -8,6 +8,7 @@ from typing import Any
 
 from vlatool.errors import require
 from vlatool.quantize._layers import Layer
+from vlatool.quantize._nodes import reads
 from vlatool.quantize._value_types import FLOAT, static_shapes
 
 NORMS = ("LayerNormalization", "RMSNormalization")
@@ -99,7 +100,7 @@ class _Topology:
         self.producers = {name: index for index, node in enumerate(self.nodes) for name in node.output if name}
         self.readers: dict[str, list[int]] = {}
         for index, node in enumerate(self.nodes):
-            for name in node.input:
+            for name in reads(node):
                 self.readers.setdefault(name, []).append(index)
 
     def root(self, value: str) -> str:

@@ -17,7 +17,7 @@ from vlatool.quantize._graphs import (
     read,
     save,
 )
-from vlatool.quantize._layers import check_weights, find_layers
+from vlatool.quantize._layers import check_weights, find_layers, part_inner_gemms, split_gemm
 from vlatool.stage import Context, source_of
 
 OPS = ("MatMul", "Gemm")
@@ -55,6 +55,8 @@ class DynamicInt8(Quantization):
         quantization = quantization_library()
         model = load(original)
         check_weights(model, [layer for layer in find_layers(model, OPS) if layer.name in kept])
+        split_gemm(model)  # ONNX Runtime's own way turns a weight in place for each of its readers
+        part_inner_gemms(model)
         excluded = [node.name for node in model.graph.node if node.op_type in OPS and node.name not in kept]
         with quiet_quantizer() as scratch:
             quantization.quantize_dynamic(

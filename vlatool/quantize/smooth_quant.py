@@ -17,6 +17,7 @@ from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._graphs import foreign_errors, load, save
 from vlatool.quantize._layers import find_layers
+from vlatool.quantize._nodes import reads
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._smooth_groups import Edit, Group, find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
@@ -195,7 +196,7 @@ class _Writer:
     def _own(self, node: Any, position: int) -> str:
         """Return the name of a constant that this node alone reads, in this place alone; copy a shared one."""
         name = str(node.input[position])
-        if sum(list(each.input).count(name) for each in self._graph.node) == 1:
+        if sum(list(reads(each)).count(name) for each in self._graph.node) == 1:
             return name
         copy = f"{name}.{node.name}.{position}"
         tensor = self._onnx.TensorProto()

@@ -18,6 +18,7 @@ from vlatool.errors import GraphError, nearest, require
 from vlatool.host import MAX_CPU_ISA, onednn_max_cpu_isa
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engines import _arithmetic
+from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
 
 DEVICE = "CPU"
@@ -25,6 +26,8 @@ GRACE_MS = 1000
 """How long a run that is cancelled may take to end."""
 HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
 """What OpenVINO is told to compute in: left alone it silently takes bfloat16 where the processor has it."""
+PLAIN = {"SNIPPETS_MODE": "DISABLE"}
+"""One kernel for each operator, none generated for several."""
 NO_KERNEL = ("bad combination", "inner product")
 """What OpenVINO says of a processor without the instructions that a graph needs."""
 
@@ -214,19 +217,21 @@ def _without_float8(model: Path | bytes) -> str:
 
 
 def compiled(core: Any, model: Any, settings: dict[str, Any]) -> Any:
-    """Compile a model for the CPU; where that fails, once more without kernels generated for several operators.
+    """Compile a model for the CPU; where that fails or would crash, without kernels generated for several operators.
 
     OpenVINO (2026.4) takes Linear, Mish, Linear for a sequence that it can generate code for, and then has none for
-    Mish.
+    Mish. For what crashes see ``_sequences``.
 
     Raises:
         RuntimeError: what the first attempt raised, when the second fails too.
     """
+    if joins_a_sequence(model):
+        return core.compile_model(model, DEVICE, {**settings, **PLAIN})
     try:
         return core.compile_model(model, DEVICE, settings)
     except Exception as error:
         with contextlib.suppress(Exception):
-            return core.compile_model(model, DEVICE, {**settings, "SNIPPETS_MODE": "DISABLE"})
+            return core.compile_model(model, DEVICE, {**settings, **PLAIN})
         raise error
 
 

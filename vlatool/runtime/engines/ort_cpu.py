@@ -19,7 +19,7 @@ from vlatool.runtime.engines import _arithmetic
 from vlatool.runtime.stored_types import has_float8
 
 PROVIDER = "CPUExecutionProvider"
-RELU_REWRITE = "ReluQuantRewrite"
+CUT_OFF_REWRITES = ["ReluQuantRewrite", "ClipQuantRewrite"]
 SMALL = 256 * 1024
 """Bytes of all inputs and outputs up to which a run goes through buffers that are bound once."""
 NUMPY_OF: dict[str, np.dtype[Any]] = {
@@ -245,11 +245,12 @@ def session_options(ort: Any, threads: int | None) -> Any:
 def left_out(model: Path | bytes) -> list[str]:
     """Return the rewritings of ONNX Runtime that would make a graph compute something else than it says.
 
-    ReluQuantRewrite (seen in 1.31) drops a Relu before a QuantizeLinear whose zero point is the smallest number
-    of its type, and takes every float8 for such a type: negative values come through.
+    They drop a Relu or Clip before a QuantizeLinear whose zero point is the smallest number of its type, since rounding
+    to uint8 cuts off what is negative, and (seen in 1.31) take every float8 for such a type: negative values come
+    through.
     """
     with contextlib.suppress(GraphError, OSError):  # a file that is no graph is refused when it is opened
-        return [RELU_REWRITE] if has_float8(model) else []
+        return CUT_OFF_REWRITES if has_float8(model) else []
     return []
 
 
