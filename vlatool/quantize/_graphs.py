@@ -21,7 +21,7 @@ from vlatool.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, GraphError, RecipeError, VlatoolError, nearest, require
 from vlatool.export.onnx import FOLDED
-from vlatool.finish import carry_over, finish
+from vlatool.finish import GOLDEN_COUNT, carry_over, finish
 from vlatool.manifest import Graph, ProgramStep
 from vlatool.quantize._nodes import name_nodes, part_outputs
 from vlatool.quantize._phase import cut_phases
@@ -106,10 +106,14 @@ class Quantization(Transform):
             made[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
         context.tell("running the quantized graphs", None)
-        observations = observations_for(bundle, 2)
+        observations = self.golden(bundle)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
         told = made_by or self.made_by()
         return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return the observations that become golden."""
+        return observations_for(bundle, GOLDEN_COUNT)
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs that are quantized."""

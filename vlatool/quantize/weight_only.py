@@ -14,7 +14,7 @@ from pydantic import Field
 from vlatool.bundle import Bundle, hash_file, write_manifest
 from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import BundleError, DataError, require
-from vlatool.finish import SEED, carry_over, finish, history
+from vlatool.finish import GOLDEN_COUNT, SEED, carry_over, finish, history
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.quantize._blocks import Format
 from vlatool.quantize._compute import records_of
@@ -130,8 +130,12 @@ class WeightOnly(Quantization):
         }
         if self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW):
             context.tell("running the quantized graphs", None)
-            return finish(bundle, out, made_by=made_by, graphs=graphs, observations=observations_for(bundle, 2))
+            return finish(bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle))
         return _sealed(bundle, out, written, made_by, graphs)
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return recorded observations where there are any."""
+        return observations_for(bundle, GOLDEN_COUNT, self.calibration)
 
     @property
     def form(self) -> Format:
