@@ -3,7 +3,7 @@
 import numpy as np
 import onnx
 import pytest
-from _graph_trials import METHODS, float_graph, trial
+from _graph_trials import METHODS, float_graph, stage_of, trial
 from _random_graphs import RandomGraph
 from onnx import helper
 
@@ -283,3 +283,23 @@ def test_onnx_runtime_keeps_what_cuts_off_the_negative_before_float8(tmp_path):
     wanted, got = (load(bundle.path, threads=1).infer(observation).outputs for bundle in (source, made))
     name = graph.outputs[0]
     assert 0 < relative_error(got[name], wanted[name]) < 0.1
+
+
+@pytest.mark.parametrize("word", ["static", "float16", "gptq", "int4", "float8"])
+def test_the_golden_observations_are_recorded_ones(word, tmp_path):
+    """Of an ONNX file the others are drawn, and ids are zero in all of them."""
+    source = float_graph(Written(linear, (1, 32)), tmp_path / "graph")
+    recording = np.load(source.path.parent / "recording.npz")["input0"]
+    methods = {**METHODS, "float8": ("quantize.float8", {}, 0.1)}
+    stage = stage_of(methods[word][0], {**methods[word][1], "calibration": str(source.path.parent / "recording.npz")})
+    made = run_transform(stage, source, tmp_path / "made", Context())
+    golden = np.load(made.path / "golden/golden.npz")["in.input0"]
+    assert all(any(np.array_equal(each, row) for row in recording) for each in golden)
+
+
+def test_openvino_is_not_believed_because_all_ids_were_zero(tmp_path):
+    """It computes attention in int8 wrongly here (2026.4): with one token in all places that does not show."""
+    pytest.importorskip("openvino")
+    graph = RandomGraph(183)
+    found = trial(graph, float_graph(graph, tmp_path / "graph"), "static-openvino-all")
+    assert found.verdict in ("right", "refused"), found

@@ -106,10 +106,14 @@ class Quantization(Transform):
             made[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
         context.tell("running the quantized graphs", None)
-        observations = observations_for(bundle, TRIALS)
+        observations = self.golden(bundle)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
         told = made_by or self.made_by()
         return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return observations, the first of which become golden; all are looked at where the engine differs."""
+        return observations_for(bundle, TRIALS)
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs that are quantized."""

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for, recorded_observations
+from vlatool.finish import TRIALS
 from vlatool.quantize._beyond import find_beyond
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._graphs import Quantization, load, save
@@ -68,6 +69,10 @@ class Float16(Quantization):
 
         made_by = {**self.made_by(calibration=samples), "float16": told}
         return self.transform(bundle, out, context, convert, made_by=made_by)
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return recorded observations where there are any."""
+        return observations_for(bundle, TRIALS, self.calibration)
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what a person wants to know about the new bundle."""

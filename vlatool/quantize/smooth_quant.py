@@ -15,7 +15,7 @@ from vlatool.bundle import Bundle
 from vlatool.errors import GraphError, require
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._graphs import foreign_errors, load, save
+from vlatool.quantize._graphs import Quantization, foreign_errors, load, save
 from vlatool.quantize._layers import find_layers
 from vlatool.quantize._nodes import reads
 from vlatool.quantize._ranges import Statistics
@@ -94,6 +94,10 @@ class SmoothQuant(Calibrated):
         (out / REPORT).write_text(json.dumps({"groups": notes}, indent=1) + "\n", encoding="utf-8")
         _check_same(bundle, made)
         return made
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return those of the bundle that is smoothed, whose golden action must stay."""
+        return Quantization.golden(self, bundle)
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what a person wants to know about the new bundle."""

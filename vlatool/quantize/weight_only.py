@@ -130,8 +130,12 @@ class WeightOnly(Quantization):
         }
         if self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW):
             context.tell("running the quantized graphs", None)
-            return finish(bundle, out, made_by=made_by, graphs=graphs, observations=observations_for(bundle, TRIALS))
+            return finish(bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle))
         return _sealed(bundle, out, written, made_by, graphs)
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return recorded observations where there are any."""
+        return observations_for(bundle, TRIALS, self.calibration)
 
     @property
     def form(self) -> Format:
