@@ -1,6 +1,7 @@
 """Which candidate is chosen and what is said about it; every row is built by hand."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -410,6 +411,23 @@ def test_float32_is_no_answer_when_memory_was_asked_for() -> None:
 def elsewhere(*candidates: Row, baseline: Row = FLOAT) -> str:
     judged = [held(each, baseline) for each in (baseline, *candidates)]
     return next(item for item in choose(judged, elsewhere=BOARD.name) if item.row.role == "chosen").sentences[0]
+
+
+def test_float32_is_kept_where_none_keeps_to_the_limits_and_the_nearest_is_not_faster():
+    found = chosen(row("blind", 12.0))
+    assert (found.row.name, found.within) == ("float32", True)
+    assert found.sentences[0].startswith(
+        "float32 was kept: no candidate keeps to the limits, and the nearest, blind, is not shown to be faster"
+    )
+    assert "blind: its accuracy is unmeasured" in " ".join(found.sentences[1:])
+
+
+def test_a_ratio_for_a_board_is_the_one_of_the_table():
+    paired = Measurement("speedup", 3.02, "x", samples=20, low=1.58, high=4.74)
+    fast = row("fast", 4.0, drop(0.0))
+    others = tuple(each for each in fast.measurements if each.name != "speedup")
+    found = elsewhere(replace(fast, measurements=(*others, paired)))
+    assert found.startswith("fast is 3.02x as fast as float32 (1.58 to 4.74; measured on this host)")
 
 
 def test_the_first_sentence_has_what_was_measured_here_beside_what_is_predicted_for_the_board():

@@ -43,14 +43,24 @@ def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False, e
 
 
 def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged, str, tuple[str, ...]]:
-    """Return the candidate that misses the limits by least, and what is said of all of them."""
+    """Return the candidate that misses the limits by least, and what is said of all of them.
+
+    Where that is not even faster, and float32 keeps to the limits, float32 is returned.
+    """
     quantized = [item for item in judged if item.row.role != "baseline"]
-    best = min(quantized, key=lambda item: (item.miss, p50(item.row, origin)))
+    best, base = min(quantized, key=lambda item: (item.miss, p50(item.row, origin))), judged[0]
+    missed = tuple(f"{item.row.name}: {item.row.reason}." for item in quantized)
+    if base.within and origin == "measured" and not is_faster(best.row, base.row):
+        words = f"no candidate keeps to the limits, and the nearest, {best.row.name}, is"
+        speed = speed_words(best.row, base.row, elsewhere)
+        board = foretold(base.row, base.row, elsewhere)
+        first = f"{base.row.name} was kept: {words} {speed}.{board}"
+        return base, f"{words} not shown to be faster; {base.row.reason}", (first, *missed)
     sentences = (
         f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept."
         + (f" It is {speed_words(best.row, judged[0].row, elsewhere)}." if elsewhere and origin == "measured" else "")
         + foretold(best.row, judged[0].row, elsewhere),
-        *(f"{item.row.name}: {item.row.reason}." for item in quantized),
+        *missed,
     )
     return best, f"kept as the nearest, though outside the limits: {best.row.reason}", sentences
 
@@ -124,12 +134,12 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
     Args:
         row: A variant.
         base: What it is held against.
-        elsewhere: The board that it is for, when it is not this host: only the ratio is told.
+        elsewhere: The board that it is for, when it is not this host: only the ratio is told, as the table has it.
     """
-    times = ratio(row, base)
     speedup = row.get("speedup")
     known = speedup is not None and speedup.low is not None and speedup.high is not None
     span = f"; {speedup.low:.2f} to {speedup.high:.2f}" if speedup and known else ""
+    times = speedup.value if speedup and known and elsewhere else ratio(row, base)
     here = "measured on this host" if elsewhere else _times(row, base)
     if is_faster(row, base):
         return f"{times:.2f}x as fast as {base.name} ({span[2:] + '; ' if elsewhere and span else ''}{here})"

@@ -54,8 +54,8 @@ class Credibility:
 
 
 UNKNOWN = (
-    "whether the reference does its task is unmeasured: there is no environment and no expert's action; only the "
-    "distance from it was judged"
+    "whether the reference does its task is unmeasured: there is no environment and no expert's action; at "
+    "most the distance from it was judged"
 )
 
 

@@ -173,6 +173,14 @@ def test_gripper_flips_are_the_share_of_steps_with_the_other_sign():
     assert 0 < flips.low < 0.25 < flips.high
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (0.0, 0.08), (-1.0, 1.0)])
+def test_a_gripper_flips_at_the_middle_of_what_it_does(low: float, high: float):
+    closed, wide = low + 0.1 * (high - low), low + 0.9 * (high - low)
+    wanted = np.array([[[0.0, low], [0.0, high]], [[0.0, low], [0.0, high]]])
+    got = np.array([[[0.0, closed], [0.0, wide]], [[0.0, wide], [0.0, high]]])
+    assert by_name(compare(ARM, got, wanted, "baseline"))["gripper_flips_baseline"].value == 0.25
+
+
 def test_an_element_that_never_moves_does_not_divide_by_zero():
     wanted = np.zeros((3, 1, 2))
     found = by_name(compare(ARM, wanted + 1.0, wanted, "expert"))

@@ -168,7 +168,7 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
         Discrete: ``agreement_WHOSE`` (share, Wilson interval). Continuous: ``error_WHOSE.LABEL`` (mean absolute error
         in the element's unit), ``error_WHOSE`` (the mean of those, each divided by the standard deviation of the wanted
         element, or by what stands for it: ``scale_of``), and ``gripper_flips_WHOSE``: the share of steps in which a
-        gripper element has the other sign.
+        gripper element is on the other side of the middle of what was wanted of it.
     """
     if wanted is None:
         return []
@@ -200,11 +200,18 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     return found
 
 
+def _middles(wanted: Array) -> Array:
+    """Return what lies between open and closed for each gripper: the middle of what was wanted; 0 where that is one."""
+    low, high = wanted.min(axis=(0, 1)), wanted.max(axis=(0, 1))
+    return np.where(low < high, (low + high) / 2, 0.0)
+
+
 def _gripper_flips(labels: Sequence[str], got: Array, wanted: Array, whose: str) -> list[Measurement]:
     columns = [index for index, label in enumerate(labels) if "grip" in label.lower()]
     if not columns:
         return []
-    flips = int(np.sum((got[..., columns] > 0) != (wanted[..., columns] > 0)))
+    middle = _middles(wanted[..., columns])
+    flips = int(np.sum((got[..., columns] > middle) != (wanted[..., columns] > middle)))
     total = got[..., columns].size
     low, high = wilson(flips, total)
     return [Measurement(f"gripper_flips_{whose}", flips / total, "1", samples=total, low=low, high=high)]
