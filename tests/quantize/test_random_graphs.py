@@ -1,5 +1,8 @@
 """What people write in ONNX graphs, alone and drawn at random, through every method; at length: graphs_fuzz.py."""
 
+import subprocess
+import sys
+
 import numpy as np
 import onnx
 import pytest
@@ -7,6 +10,7 @@ from _graph_trials import METHODS, float_graph, stage_of, trial
 from _random_graphs import RandomGraph
 from onnx import helper
 
+from vlatool.bundle import Bundle
 from vlatool.finish import reference_policy
 from vlatool.launch import run_transform
 from vlatool.quantize.float8 import Float8
@@ -303,3 +307,12 @@ def test_openvino_is_not_believed_because_all_ids_were_zero(tmp_path):
     graph = RandomGraph(183)
     found = trial(graph, float_graph(graph, tmp_path / "graph"), "static-openvino-all")
     assert found.verdict in ("right", "refused"), found
+
+
+def test_float16_avoids_what_onnx_runtime_crashes_on(tmp_path):
+    """A transposed product (1.31); in a process of its own, for the test must go on."""
+    source = float_graph(RandomGraph(158), tmp_path / "graph")
+    command = [sys.executable, "-m", "vlatool", "quantize", "float16", str(source.path), "-o", str(tmp_path / "made")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert Bundle.open(tmp_path / "made").manifest.graphs["main"].precision["float16"] > 0.9

@@ -9,7 +9,7 @@ import pytest
 
 from vlatool.errors import GraphError
 from vlatool.quantize import _trial_compile
-from vlatool.quantize._trial_compile import compile_apart
+from vlatool.quantize._trial_compile import compile_apart, open_apart
 from vlatool.quantize.static_int8 import StaticInt8
 
 
@@ -25,9 +25,10 @@ def test_a_file_that_is_refused_is_left_to_the_engine(tmp_path: Path) -> None:
 
 
 def test_a_child_that_is_killed_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_trial_compile, "CODE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
-    with pytest.raises(GraphError, match="crashes \\(signal 11\\)"):
-        compile_apart(tmp_path / "g.onnx")
+    for name, apart in (("CODE", compile_apart), ("OPEN", open_apart)):
+        monkeypatch.setattr(_trial_compile, name, "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+        with pytest.raises(GraphError, match="crashes \\(signal 11\\)"):
+            apart(tmp_path / "g.onnx")
 
 
 def test_residual_sums_of_the_tiny_policy_give_a_bundle_or_an_error(quantized) -> None:

@@ -1,4 +1,4 @@
-"""Compile a graph in a process of its own first: OpenVINO crashes on some quantized graphs instead of refusing them."""
+"""Open a graph in a process of its own first: engines crash on some quantized graphs instead of refusing them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from pathlib import Path
 from vlatool.runtime.engines.openvino import OpenvinoSession
 OpenvinoSession(Path(sys.argv[1]), 1)
 """
+OPEN = """
+import sys
+from pathlib import Path
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+OrtCpuSession(Path(sys.argv[1]), 1)
+"""
 
 
 def compile_apart(path: Path) -> None:
@@ -27,4 +33,18 @@ def compile_apart(path: Path) -> None:
         raise GraphError(
             f"OpenVINO crashes (signal {-done.returncode}) when it compiles {path.name} with these layers in int8.",
             "quantize fewer: leave out --elementwise or --attention, or use --exclude",
+        )
+
+
+def open_apart(path: Path) -> None:
+    """Let a child open the graph in ONNX Runtime, which (1.31) crashes on some products of float16 between transposes.
+
+    Raises:
+        GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
+    """
+    done = subprocess.run(python_code(OPEN, [str(path)]), capture_output=True, check=False)
+    if done.returncode < 0:
+        raise GraphError(
+            f"ONNX Runtime crashes (signal {-done.returncode}) when it opens {path.name} with these layers in float16.",
+            "leave layers beside a Transpose in float32 with --exclude, or use another method",
         )

@@ -9,10 +9,12 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for, recorded_observations
+from vlatool.errors import GraphError
 from vlatool.finish import TRIALS
 from vlatool.quantize._beyond import find_beyond
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._graphs import Quantization, load, save
+from vlatool.quantize._trial_compile import open_apart
 from vlatool.stage import Context, SampleSet, source_of
 
 
@@ -65,7 +67,13 @@ class Float16(Quantization):
             kept.update(weights.beyond)
             told["kept"] += len(kept)
             told["subnormal_weights"] += weights.subnormal
+            turning = {node.name for node in model.graph.node if node.op_type == "Transpose"}
             save(to_float16(model, kept), target)
+            try:
+                open_apart(target)
+            except GraphError:  # with what is transposed in float32 it does not
+                save(to_float16(load(original), kept | turning), target)
+                open_apart(target)
 
         made_by = {**self.made_by(calibration=samples), "float16": told}
         return self.transform(bundle, out, context, convert, made_by=made_by)
