@@ -1,10 +1,11 @@
-"""Processor time of ONNX graphs with one image input in ONNX Runtime, in turns on one core, and their errors.
+"""Processor time of ONNX graphs in ONNX Runtime, in turns on one core, and their errors.
 
     python tests/soak/graphs_in_turns.py DATA.npz FLOAT32.onnx OTHER.onnx ... --rounds 24
 
 The first graph is the reference of ratios and errors. In each round each graph, in random order, runs four times on
-images of the recording; the median of the last three counts. Processor time and not wall time: a busy machine takes
-turns from all alike.
+observations of the recording (arrays by the names of the inputs, as they are fed but for the batch axis; in a file of
+`make peers` those that begin with `evaluation.`, with it); the median of the last three counts. Processor time and not
+wall time: a busy machine takes turns from all alike.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ import onnxruntime
 
 from vlatool.statistics import quantile_interval
 
+PEERS = "evaluation."
+
 
 def main() -> int:
     """Measure, and print one line for each graph."""
@@ -29,12 +32,11 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=24)
     given = parser.parse_args()
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    with np.load(given.data, allow_pickle=False) as stored:
-        frames = stored["image"]
     sessions = [opened(path) for path in given.graphs]
-    wanted = [run(sessions[0], frame) for frame in frames]
+    observed = observations(given.data, sessions[0])
+    wanted = [run(sessions[0], feeds) for feeds in observed]
     errors = [
-        np.mean([distance(run(session, frame), right) for frame, right in zip(frames, wanted, strict=True)])
+        np.mean([distance(run(session, feeds), right) for feeds, right in zip(observed, wanted, strict=True)])
         for session in sessions
     ]
     taken: list[list[float]] = [[] for _ in sessions]
@@ -44,7 +46,7 @@ def main() -> int:
             timed = []
             for turn in range(4):
                 begun = time.process_time()
-                run(sessions[place], frames[(number + turn) % len(frames)])
+                run(sessions[place], observed[(number + turn) % len(observed)])
                 timed.append((time.process_time() - begun) * 1e3)
             taken[place].append(median(timed[1:]))
     for path, error, times in zip(given.graphs, errors, taken, strict=True):
@@ -64,9 +66,20 @@ def opened(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
-def run(session: onnxruntime.InferenceSession, frame: np.ndarray) -> np.ndarray:
-    """Return the first output for one image."""
-    found: np.ndarray = session.run(None, {"image": frame[None]})[0]
+def observations(data: Path, session: onnxruntime.InferenceSession) -> list[dict[str, np.ndarray]]:
+    """Return the feeds of each recorded observation."""
+    names = [value.name for value in session.get_inputs()]
+    with np.load(data, allow_pickle=False) as stored:
+        if f"{PEERS}{names[0]}" in stored:
+            arrays = {name: stored[PEERS + name] for name in names}
+        else:
+            arrays = {name: stored[name][:, None] for name in names}
+    return [{name: array[number] for name, array in arrays.items()} for number in range(len(arrays[names[0]]))]
+
+
+def run(session: onnxruntime.InferenceSession, feeds: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the first output for one observation."""
+    found: np.ndarray = session.run(None, feeds)[0]
     return found
 
 
