@@ -121,6 +121,19 @@ def test_an_operator_that_the_engine_does_not_know(tmp_path: Path):
         build(tmp_path / "out", linear(tmp_path / "a.onnx", op="NoSuchOperator"))
 
 
+@pytest.mark.parametrize("domain", ["", "of.somebody"])
+def test_a_refusal_names_the_file_and_not_its_copy(tmp_path: Path, domain: str) -> None:
+    path = linear(tmp_path / "walker.onnx", op="NoSuchOperator")
+    model = onnx.load(path)
+    model.graph.node[0].domain = domain
+    onnx.save(model, path)
+    with pytest.raises(GraphError) as caught:
+        build(tmp_path / "out", path)
+    assert str(path) in caught.value.message
+    assert str(tmp_path / "out") not in str(caught.value)
+    assert caught.value.fix
+
+
 def test_a_rate_must_be_above_zero(tmp_path: Path):
     with pytest.raises(RecipeError, match="control_hz"):
         build_stage("sources.onnx", {"model": tmp_path / "a.onnx", "control_hz": 0})

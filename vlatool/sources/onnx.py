@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -10,7 +12,7 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import GraphError, InputError, SourceError, nearest, require
 from vlatool.export._draws import refuse_drawing_file
 from vlatool.finish import SEED, finish
 from vlatool.manifest import Graph, Manifest, single_graph
@@ -95,13 +97,14 @@ class OnnxFile(Transform):
             description=described.description,
             license=described.license,
         )
-        graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
         converted = {"opset": self.opset} if self.opset is not None else {}
         made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
-        observations = _observations(described, out, manifest)
-        if converted:
-            _compare(self.model, out, manifest, observations, further)
-        return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
+        with _told_of(self.model, out / "graphs/main.onnx"):
+            graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
+            observations = _observations(described, out, manifest)
+            if converted:
+                _compare(self.model, out, manifest, observations, further)
+            return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
 
     def _described(self, model: Any) -> Description:
         initializers = {tensor.name for tensor in model.graph.initializer}
@@ -159,6 +162,18 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
                 raise SourceError(
                     f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}."
                 )
+
+
+@contextlib.contextmanager
+def _told_of(model: Path, copy: Path) -> Iterator[None]:
+    """Let what is wrong with a copy be told of the user's own file; the copy is gone when they read it."""
+    try:
+        yield
+    except InputError as error:
+        error.message = error.message.replace(str(copy), str(model))
+        if isinstance(error, GraphError) and not error.fix:
+            error.fix = "mend the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
+        raise
 
 
 def _compare(
