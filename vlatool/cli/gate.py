@@ -13,9 +13,9 @@ import typer
 
 from vlatool.bundle import Bundle
 from vlatool.cli import _complete
-from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
+from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
 from vlatool.cli._default import group_with
-from vlatool.cli._document import document
+from vlatool.cli._document import document, put
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files import refuse_file, write_own
@@ -113,9 +113,9 @@ def init(
         document({"written": [str(path) for path in files]})
         return
     for path in files:
-        emit(f"written: {path}\n")
-    emit("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
-    emit(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")
+        put(f"written: {path}\n")
+    put("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
+    put(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")
 
 
 def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
@@ -158,7 +158,7 @@ def _write_junit(report: Report, path: Path) -> None:
 def _tell_github(report: Report) -> None:
     from vlatool.render import render
 
-    emit(render(report, "github"))
+    put(render(report, "github"))
     if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
         try:
             with Path(summary).open("a", encoding="utf-8") as stream:
