@@ -164,8 +164,9 @@ def main(arguments: list[str] | None = None) -> None:
     _standard_files()
     _end_on_signals()
     words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
-    with output(words, for_good=arguments is None) as document:
-        code = _run(words, document)
+    for_good = arguments is None
+    with output(words, for_good=for_good) as document:
+        code = _run(words, document, for_good=for_good)
     if unprinted := lost():
         _say(str(unprinted), unprinted.fix)
         code = code or unprinted.exit_code
@@ -173,7 +174,7 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
-def _run(words: list[str], document: Output | None) -> Any:
+def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
     """Run a command line; return what the process ends with."""
     try:
         with plain_warnings(), trust.nothing_named():
@@ -187,6 +188,8 @@ def _run(words: list[str], document: Output | None) -> Any:
     except BaseException as error:  # the seam: whatever happened becomes an exit code
         if not isinstance(error, Exception | KeyboardInterrupt):
             raise
+        if for_good and isinstance(error, KeyboardInterrupt | typer.Abort):  # once more would interrupt the last words
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         found = failure(error, words)
         if document and found.exit_code:
             document.failed(found)
