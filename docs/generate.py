@@ -268,7 +268,8 @@ def _described(kind: Any) -> tuple[str, dict[str, str]]:
 
 def errors_page() -> str:
     """Return the tree of errors and the exit codes."""
-    return f"# Errors and exit codes\n\n```\n{inspect.cleandoc(errors.__doc__ or '')}\n```\n\n130: interrupted.\n"
+    signals = "130: interrupted by Ctrl-C. 143 and 129: ended by SIGTERM or SIGHUP. What was begun is removed."
+    return f"# Errors and exit codes\n\n```\n{inspect.cleandoc(errors.__doc__ or '')}\n```\n\n{signals}\n"
 
 
 def profiles_page() -> str:

@@ -64,6 +64,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
         ("{latency: null, accuracy: null, answers: null, memory: null, size: null}", "every claim is null"),
         ("{schema: 2}", "schema: Input should be less than or equal to 1"),
         ("{latency: {margin: fast}}", "latency.margin: Input should be a valid number"),
+        ("{latency: {margin: yes}}", "latency.margin: Input should be a number, not a truth value (got True)"),
         ("{a: [", "is not valid YAML"),
         ("baseline: 2024-02-30", "is not valid YAML: day is out of range"),
     ],

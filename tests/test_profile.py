@@ -302,6 +302,20 @@ def test_what_is_no_profile_is_refused(tmp_path: Path, content: str, words: str)
     assert words in problems(tmp_path, content)
 
 
+@pytest.mark.parametrize("truth", [True, False])
+def test_a_truth_value_is_no_number(tmp_path: Path, valid: dict[str, Any], truth: bool) -> None:
+    valid["memory_gb"]["value"] = truth
+    valid["price_usd"]["year"] = truth
+    valid["memory_options_gb"] = [2, truth]
+    valid["modes"]["default"]["cores"]["cpu"] = truth
+    valid["modes"]["default"]["bandwidth_gb_s"] = truth
+    text = problems(tmp_path, valid)
+    for field in (
+        "memory_gb.value", "price_usd.year", "memory_options_gb", "modes.default.cores", "modes.default.bandwidth_gb_s"
+    ):  # fmt: skip
+        assert f"  {field}: must be a number, not a truth value; got " in text
+
+
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ProfileError, match="cannot be read: No such file"):
         load_profile(tmp_path / "absent.yaml")

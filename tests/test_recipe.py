@@ -73,6 +73,7 @@ def test_a_directory(tmp_path: Path):
         ({"schema": 1, "candidates": {"a": []}, "limit": {}}, "limit: Extra inputs"),
         ({"schema": 1, "candidates": {"a": []}, "limits": {"max_drop": 2}}, r"limits.max_drop: Input should be less"),
         ({"schema": 1, "candidates": {"a": []}, "effort": {"iterations": 3}}, "effort.iterations"),
+        ({"schema": 1, "candidates": {"a": []}, "limits": {"max_drop": True}}, "limits.max_drop: Input should be a nu"),
         ({"schema": 1, "candidates": {"a": "quantize.static_int8"}}, "candidates.a"),
     ],
 )

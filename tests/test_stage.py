@@ -61,6 +61,11 @@ def test_every_wrong_option_is_listed():
     assert "activations = 'int4'" in caught.value.message
 
 
+def test_a_truth_value_is_no_number():
+    with pytest.raises(RecipeError, match="samples = True: input should be a number, not a truth value"):
+        build_stage("quantize.static_int8", {"samples": True})
+
+
 def test_a_missing_option_is_named():
     with pytest.raises(RecipeError, match=r"policy = .*field required"):
         build_stage("sources.torch_module", {})

@@ -170,6 +170,15 @@ def test_the_draft_of_a_dead_process_is_swept(tmp_path: Path, name: str):
     assert os.listdir(tmp_path) == [name]
 
 
+def test_a_draft_that_was_only_begun_is_swept(tmp_path: Path):
+    begun = tmp_path / ".out.tmp-999999999-0badcafe"
+    (begun / "content").mkdir(parents=True)
+    (begun / "vlatool-draft.json").touch()
+    with writing(tmp_path / "out") as draft:
+        (draft / "new").touch()
+    assert os.listdir(tmp_path) == ["out"]
+
+
 @pytest.mark.parametrize("name", [".out.tmp-123-abc", ".out.tmp-999999999-0badcafe", ".out.old-0badcafe"])
 def test_a_directory_that_is_only_called_like_a_draft_is_left_alone(tmp_path: Path, name: str):
     before = content(fill(tmp_path / name))
@@ -342,6 +351,17 @@ def test_a_damaged_directory_of_the_cache_is_replaced_and_what_is_not_ours_is_ke
 def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path, number, message):
     with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: {message}"), writing(tmp_path / "out"):
         raise OSError(number, os.strerror(number))
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_disk_that_is_full_from_the_first_byte_leaves_nothing(tmp_path: Path, monkeypatch):
+    def full(path: Path, *_args: object, **_options: object) -> None:
+        path.touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OutputError, match="the disk is full"), writing(tmp_path / "out"):
+        pytest.fail("the block must not run")
     assert os.listdir(tmp_path) == []
 
 

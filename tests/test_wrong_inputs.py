@@ -437,7 +437,7 @@ SOURCES = [
     Row("calibration data that is not there", "names the calibration data", 3,
         lambda at: ["export", at.policy("schema: 1", "calibration: none.npz"), *at.to]),
     Row("no factory", "names no factory", 3, lambda at: ["export", at.policy("source: policy.py:make\n", ""), *at.to]),
-    Row("a factory without a function", "names no factory", 3,
+    Row("a factory without a function", "names a file and no function", 3,
         lambda at: ["export", at.policy("policy.py:make\n", "policy.py\n"), *at.to]),
     Row("no factory file", "There is no file", 3, lambda at: ["export", at.policy(drop="policy.py"), *at.to]),
     Row("no factory function", "no function 'make'; did you mean 'male'", 3,

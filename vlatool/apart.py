@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -85,6 +86,8 @@ def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, st
 
 @atexit.register
 def _stop() -> None:
+    with contextlib.suppress(ValueError):  # Ctrl-C once more: the process ends already
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     for kind, server in _servers.items():
         if kind[0] == str(os.getpid()):
             server.stop()

@@ -5,16 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from vlatool.errors import RecipeError, require
 from vlatool.latencies import PERCENTILES
+from vlatool.numeric import Numeric
 from vlatool.regression import ALPHA, LOOKS
 from vlatool.signed_rank import fewest
 from vlatool.yaml_files import read_mapping
 
 
-class _Claim(BaseModel):
+class _Claim(Numeric):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -80,7 +81,7 @@ class DeadlineClaim(_Claim):
         return self
 
 
-class Gate(BaseModel):
+class Gate(Numeric):
     """Everything that a candidate must keep to; a claim that is null is not examined."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

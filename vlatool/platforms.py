@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from vlatool.errors import ProfileError, nearest
+from vlatool.numeric import Numeric
 from vlatool.profile import SUFFIXES, Kind
 from vlatool.yaml_files import read_yaml
 
 
-class Platform(BaseModel):
+class Platform(Numeric):
     """A kind of robot.
 
     Args:

@@ -11,11 +11,12 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from vlatool._profile_problems import problem, wrong_names, wrong_sources
 from vlatool.errors import OutputError, ProfileError, nearest
 from vlatool.files import unstamped, write_own
+from vlatool.numeric import Numeric
 from vlatool.yaml_files import read_mapping
 
 SEARCH_PATH = "VLATOOL_PROFILES"
@@ -51,7 +52,7 @@ Computed = Annotated[str, AfterValidator(_known_computed)]
 Version = Annotated[str, AfterValidator(_version)]
 
 
-class _Strict(BaseModel):
+class _Strict(Numeric):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 

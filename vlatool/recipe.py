@@ -5,16 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from vlatool.errors import RecipeError, require
+from vlatool.numeric import Numeric
 from vlatool.yaml_files import read_mapping
 
 StageList = tuple[dict[str, dict[str, Any]], ...]
 """Stages in order, each a mapping of one name to its options."""
 
 
-class Limits(BaseModel):
+class Limits(Numeric):
     """What a candidate must keep to."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -48,7 +49,7 @@ class Limits(BaseModel):
         return min(given) if given else None
 
 
-class Effort(BaseModel):
+class Effort(Numeric):
     """How much is measured."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -58,7 +59,7 @@ class Effort(BaseModel):
     threads: int = Field(1, ge=1, description="intra-op threads while timing")
 
 
-class Recipe(BaseModel):
+class Recipe(Numeric):
     """Export, candidates and limits of one ``optimize`` run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ConfigDict, ValidationError
 
 from vlatool import __version__, registry
 from vlatool.bundle import Bundle, hash_file
 from vlatool.errors import RecipeError, nearest
 from vlatool.instruction_sets import computed_in
+from vlatool.numeric import Numeric
 from vlatool.report import Report
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def _sample_hash(observation: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-class Stage(BaseModel):
+class Stage(Numeric):
     """Base of every stage: options as fields, extra keys refused, frozen."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

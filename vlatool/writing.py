@@ -55,11 +55,17 @@ class _Draft:
         """Make an empty draft beside its final name."""
         place = final.with_name(f".{final.name}.tmp-{os.getpid()}-{uuid.uuid4().hex[:8]}")
         place.mkdir()
-        draft = place / CONTENT
-        draft.mkdir()
-        inode = draft.stat().st_ino
-        marker = {"vlatool": "a draft", "place": place.stat().st_ino, "content": inode}
-        (place / MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
+        try:
+            draft = place / CONTENT
+            draft.mkdir()
+            inode = draft.stat().st_ino
+            marker = {"vlatool": "a draft", "place": place.stat().st_ino, "content": inode}
+            (place / MARKER).write_text(json.dumps(marker) + "\n", encoding="utf-8")
+        except BaseException:
+            with contextlib.suppress(OSError):
+                (place / MARKER).unlink(missing_ok=True)
+            _remove_begun(place)
+            raise
         return cls(place, inode)
 
     @classmethod
@@ -143,8 +149,17 @@ def sweep(final: Path) -> None:
         if draft is not None:
             draft.dispose(final)
         else:
-            with contextlib.suppress(OSError):  # empty: its writer was killed before it wrote anything
-                place.rmdir()
+            _remove_begun(place)
+
+
+def _remove_begun(place: Path) -> None:
+    """Remove a draft in which nothing was written yet: at most an empty directory and an empty marker."""
+    with contextlib.suppress(OSError):
+        if (place / CONTENT).is_dir():
+            (place / CONTENT).rmdir()
+        if (place / MARKER).is_file() and (place / MARKER).lstat().st_size == 0:
+            (place / MARKER).unlink()
+        place.rmdir()
 
 
 def _is_alive(place: Path) -> bool:

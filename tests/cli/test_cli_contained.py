@@ -233,12 +233,23 @@ def test_closed_and_full_streams_do_not_change_the_exit_code(float_bundle, redir
     assert subprocess.run(["sh", "-c", shell], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("redirect", [">/dev/full", ">/dev/full 2>&-"])
-def test_a_result_that_cannot_be_printed_does_not_change_the_verdict(int8_bundle, redirect: str) -> None:
+@pytest.mark.parametrize("redirect", [">/dev/full", ">/dev/full 2>&-", "--json >/dev/full"])
+def test_a_result_that_cannot_be_printed_is_an_error(int8_bundle, redirect: str) -> None:
     shell = f'"{sys.executable}" -m vlatool evaluate recorded "{int8_bundle.path}" --samples 2 {redirect}'
     done = subprocess.run(["sh", "-c", shell], check=False, stderr=subprocess.PIPE, text=True)
-    assert done.returncode == 0
-    assert ("the result cannot be printed: No space left" in done.stderr) == ("2>" not in redirect)
+    assert done.returncode == 3
+    assert ("error: the result cannot be printed: No space left" in done.stderr) == ("2>" not in redirect)
+
+
+def test_lines_that_cannot_be_printed_name_standard_output(float_bundle) -> None:
+    shell = f'"{sys.executable}" -m vlatool inspect "{float_bundle.path}" >/dev/full'
+    done = subprocess.run(["sh", "-c", shell], check=False, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (3, "error: standard output: No space left on device.\n")
+
+
+def test_another_error_keeps_its_code_when_it_cannot_be_printed() -> None:
+    shell = f'"{sys.executable}" -m vlatool nothing --json >/dev/full'
+    assert subprocess.run(["sh", "-c", shell], check=False, stderr=subprocess.PIPE).returncode == 2
 
 
 def test_an_error_keeps_its_code_with_stderr_closed(tmp_path: Path, folder) -> None:

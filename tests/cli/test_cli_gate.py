@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from pathlib import Path
 from xml.etree import ElementTree
@@ -149,6 +151,16 @@ def test_init_writes_nothing_where_it_cannot_write_all(vlatool, tmp_path) -> Non
     assert (code, out) == (3, "")
     assert ".github" in err
     assert not (tmp_path / "gate.yaml").exists()
+
+
+def test_init_on_a_full_disk_names_the_file_and_leaves_no_empty_folder(vlatool, tmp_path, monkeypatch) -> None:
+    def full(*_args: object, **_options: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    code, _, err = vlatool("gate", "init", tmp_path / "new")
+    assert (code, err.splitlines()[0]) == (3, f"error: Cannot write {tmp_path / 'new/gate.yaml'}: the disk is full.")
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -328,7 +328,7 @@ def test_a_bug_is_a_document(vlatool, monkeypatch) -> None:
     assert "a key that nobody has" in told["error"]["message"]
 
 
-@pytest.mark.parametrize("redirect", [">/dev/full", ">&-", "| head -c 0"])
+@pytest.mark.parametrize("redirect", [">&-", "| head -c 0"])
 def test_a_document_that_nobody_takes_changes_no_exit_code(redirect: str) -> None:
     shell = f'"{sys.executable}" -m vlatool samples list --json {redirect}'
     done = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, check=False)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from vlatool import registry
 from vlatool.errors import OutputError, UsageError
 from vlatool.render import FILES, _format, _samples, _scatter, _svg, _tables, render, write_reports
 from vlatool.report import Measurement, Report, Row, read_report
+from vlatool.writing import writing
 
 
 @pytest.mark.parametrize(
@@ -43,10 +46,18 @@ def test_write_reports(tmp_path: Path) -> None:
     assert read_report(tmp_path / "new").title == optimize().title
 
 
-def test_write_reports_says_where_it_failed(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_reports(optimize(), tmp_path / "file")
+def test_a_disk_that_fills_up_names_the_output_and_not_its_draft(tmp_path: Path, monkeypatch) -> None:
+    def full(*_args: object, **_options: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def filled(draft: Path) -> None:
+        monkeypatch.setattr(Path, "write_text", full)
+        write_reports(optimize(), draft)
+
+    with pytest.raises(OutputError) as caught, writing(tmp_path / "out") as place:
+        filled(place)
+    assert caught.value.message == f"Cannot write {tmp_path / 'out'}: the disk is full."
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,24 @@ def test_a_factory_is_a_place_and_a_function(factory, parts):
     assert split_factory(factory) == parts
 
 
-@pytest.mark.parametrize("factory", ["", "policy.py", "policy.py:", ":make", "policy.py:make()", "policy.py:a.b"])
+@pytest.mark.parametrize("factory", ["", "policy.py:", ":make", "policy.py:make()", "policy.py:a.b"])
 def test_what_is_no_factory(factory):
     with pytest.raises(SourceError, match="names no factory") as caught:
         split_factory(factory)
     assert "policy.py:make" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("named", "says", "fix"),
+    [
+        ("model.onnx", "is an ONNX file", "name the file itself as SOURCE"),
+        ("original.py", "names a file and no function", "original.py:NAME"),
+    ],
+)
+def test_what_a_person_meant_is_told(named: str, says: str, fix: str):
+    with pytest.raises(SourceError, match=says) as caught:
+        split_factory(named)
+    assert fix in caught.value.fix
 
 
 def test_only_the_file_form_has_a_file(tmp_path: Path):

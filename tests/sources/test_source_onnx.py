@@ -121,6 +121,19 @@ def test_an_operator_that_the_engine_does_not_know(tmp_path: Path):
         build(tmp_path / "out", linear(tmp_path / "a.onnx", op="NoSuchOperator"))
 
 
+@pytest.mark.parametrize("domain", ["", "of.somebody"])
+def test_a_refusal_names_the_file_and_not_its_copy(tmp_path: Path, domain: str) -> None:
+    path = linear(tmp_path / "walker.onnx", op="NoSuchOperator")
+    model = onnx.load(path)
+    model.graph.node[0].domain = domain
+    onnx.save(model, path)
+    with pytest.raises(GraphError) as caught:
+        build(tmp_path / "out", path)
+    assert str(path) in caught.value.message
+    assert str(tmp_path / "out") not in str(caught.value)
+    assert caught.value.fix
+
+
 def test_a_rate_must_be_above_zero(tmp_path: Path):
     with pytest.raises(RecipeError, match="control_hz"):
         build_stage("sources.onnx", {"model": tmp_path / "a.onnx", "control_hz": 0})
@@ -236,3 +249,60 @@ def test_a_directory_with_an_onnx_file_is_told_to_name_the_file(tmp_path: Path, 
     assert str(path) in caught.value.fix
     assert "--factory" not in str(caught.value)
     assert not is_bundle(str(tmp_path))
+
+
+def drawing(path: Path, inside: bool = False) -> Path:
+    """An ONNX file that adds normal noise to what it reads, in a branch where ``inside``."""
+    noise = helper.make_node("RandomNormalLike", ["x"], ["n"])
+    nodes = [noise]
+    if inside:
+        value = helper.make_tensor_value_info("n", TensorProto.FLOAT, (1, 3))
+        branches = [helper.make_graph([noise], name, [], [value]) for name in ("then", "else")]
+        always = numpy_helper.from_array(np.array(True), "always")
+        nodes = [
+            helper.make_node("Constant", [], ["always"], value=always),
+            helper.make_node("If", ["always"], ["n"], then_branch=branches[0], else_branch=branches[1]),
+        ]
+    x, y = (helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, 3)) for name in ("x", "y"))
+    graph = helper.make_graph([*nodes, helper.make_node("Add", ["x", "n"], ["y"])], "main", [x], [y])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10), path)
+    return path
+
+
+@pytest.mark.parametrize(("inside", "times"), [(False, "once"), (True, "2 times")])
+def test_a_file_that_draws_random_numbers_is_refused(tmp_path: Path, inside: bool, times: str) -> None:
+    path = drawing(tmp_path / "a.onnx", inside)
+    with pytest.raises(GraphError, match=rf"a.onnx draws random numbers, {times} .*\(RandomNormalLike\)") as caught:
+        build(tmp_path / "out", path)
+    assert "noise: {noise: {shape: [" in caught.value.fix
+    assert "distribution: normal" in caught.value.fix
+
+
+def noisy(folder: Path, graph: str = "main") -> Path:
+    """The same with the noise as an input, and a description whose program draws it."""
+    model = onnx.load(drawing(folder / "a.onnx"))
+    del model.graph.node[0]
+    model.graph.input.append(helper.make_tensor_value_info("n", TensorProto.FLOAT, (1, 3)))
+    onnx.save(model, folder / "a.onnx")
+    (folder / "policy.yaml").write_text(
+        "name: noisy\nspec:\n  inputs: [{name: x, shape: [1, 3]}]\n  outputs: [{name: y, shape: [1, 3]}]\n"
+        f"  control_hz: 10\nprogram:\n  - graph: {graph}\n    feeds: {{x: x, n: noise}}\n    gives: {{y: y}}\n"
+        "    noise: {noise: {shape: [1, 3], distribution: normal}}\n"
+    )
+    return folder / "a.onnx"
+
+
+@pytest.mark.parametrize("options", [{}, {"opset": 18}])
+def test_a_file_that_takes_noise_as_an_input_gets_it_from_its_program(tmp_path: Path, options: dict[str, int]) -> None:
+    bundle = build(tmp_path / "out", noisy(tmp_path), policy=tmp_path, **options)
+    observation = {"x": np.array([1.0, 2.0, 3.0], np.float32)}
+    first, again = (load(bundle.path, threads=1, seed=7).infer(observation).chunk for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, observation["x"])
+    given = load(bundle.path, threads=1).infer(observation, noise={"noise": np.ones((1, 3), np.float32)})
+    np.testing.assert_allclose(given.chunk, [[2, 3, 4]])
+
+
+def test_a_program_of_other_graphs_than_the_file(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="runs the graph 'denoise'; a policy that is one ONNX file has the graph 'm"):
+        build(tmp_path / "out", noisy(tmp_path, "denoise"), policy=tmp_path)

@@ -299,7 +299,7 @@ def test_the_command_exits_by_the_verdict_and_prints_json(capsys, policy_dir, ag
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [
-        (["--against", "original.py"], 3, "names no factory"),
+        (["--against", "original.py"], 3, "add the function: original.py:NAME"),
         (["--against", "nowhere.py:act"], 3, "There is no file"),
         (["--against", "original.py:none"], 3, "has no function 'none'"),
         (["--against", "original.py:act", "--data", "none.npz"], 3, "There is no data file"),

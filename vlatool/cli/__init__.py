@@ -14,7 +14,7 @@ import typer
 
 from vlatool import __version__, trust
 from vlatool.cli._console import plain_warnings
-from vlatool.cli._document import Output, output
+from vlatool.cli._document import Output, lost, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
 from vlatool.cli._stages import StageGroup
 from vlatool.cli.cache import app as cache
@@ -154,7 +154,8 @@ def _end_on_signals() -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit.
 
-    0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted.
+    0 ok, 1 gate failed, 2 usage, 3 bad input, 4 missing extra, 5 inconclusive, 70 our bug, 130 interrupted,
+    143 ended by SIGTERM. A result that a full disk took makes a 0 a 3.
     With ``--json``, standard output holds one JSON document, of an error too.
 
     Args:
@@ -163,13 +164,17 @@ def main(arguments: list[str] | None = None) -> None:
     _standard_files()
     _end_on_signals()
     words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
-    with output(words, for_good=arguments is None) as document:
-        code = _run(words, document)
+    for_good = arguments is None
+    with output(words, for_good=for_good) as document:
+        code = _run(words, document, for_good=for_good)
+    if unprinted := lost():
+        _say(str(unprinted), unprinted.fix)
+        code = code or unprinted.exit_code
     _flushed()
     sys.exit(code)
 
 
-def _run(words: list[str], document: Output | None) -> Any:
+def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
     """Run a command line; return what the process ends with."""
     try:
         with plain_warnings(), trust.nothing_named():
@@ -183,6 +188,8 @@ def _run(words: list[str], document: Output | None) -> Any:
     except BaseException as error:  # the seam: whatever happened becomes an exit code
         if not isinstance(error, Exception | KeyboardInterrupt):
             raise
+        if for_good and isinstance(error, KeyboardInterrupt | typer.Abort):  # once more would interrupt the last words
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         found = failure(error, words)
         if document and found.exit_code:
             document.failed(found)

@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from vlatool.cli._document import document, report_document
+from vlatool.cli._document import document, put, report_document
 from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.host import cache_directory
 from vlatool.outputs import REPORT, refuse_inputs, refuse_replacing
@@ -174,28 +174,13 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
     if as_json:  # first, so that a full disk does not lose it
         document(report_document(report, raw=raw, file=out / REPORT_FILE if out else None))
     else:
-        emit(terminal_text(report))
+        put(terminal_text(report))
     if out is not None:
         with writing(out, force=force) as draft:
             write_reports(report, draft)
     if out is not None and not as_json:
-        emit(f"report: {out / 'report.html'}\n")
+        put(f"report: {out / 'report.html'}\n")
     leave(report)
-
-
-def emit(text: str) -> None:
-    """Print on stdout; a reader that has gone (``| head``) or a full disk does not change the exit code.
-
-    That is the verdict's.
-    """
-    try:
-        typer.echo(text, nl=False)
-        sys.stdout.flush()
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            with contextlib.suppress(OSError, ValueError):
-                typer.echo(f"warning: the result cannot be printed: {error.strerror}", err=True)
 
 
 def terminal_text(report: Report, *, brief: bool = False) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 
 import typer
 
-from vlatool.cli._failure import Failure
+from vlatool.cli._failure import INPUT, Failure
 from vlatool.report import Report, without_nan
 
 FLAG = "--json"
@@ -60,6 +60,8 @@ class Output:
 
 _now: list[Output] = []
 """The output of the command line that runs, when it asks for JSON."""
+_lost: list[str] = []
+"""Why results could not be printed."""
 
 
 def document(value: Any, text: str = "") -> None:
@@ -127,7 +129,7 @@ def output(words: Sequence[str], *, for_good: bool) -> Iterator[Output | None]:
         os.dup2(kept, 1)
         os.close(kept)
         sys.stdout = stdout
-        _write(_now.pop().text())
+        put(_now.pop().text())
         if for_good:
             os.dup2(2, 1)
 
@@ -148,14 +150,23 @@ def _flush(stream: Any) -> None:
         ctypes.CDLL(None).fflush(None)
 
 
-def _write(text: str) -> None:
-    """Print the document; a reader that has gone or a full disk does not change the exit code."""
+def put(text: str) -> None:
+    """Print on standard output. A reader that has gone (``| head``) is no error; of a full disk ``lost`` tells."""
     try:
-        sys.stdout.write(text)
+        typer.echo(text, nl=False)
         sys.stdout.flush()
     except OSError as error:
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
-            with contextlib.suppress(OSError, ValueError):
-                typer.echo(f"warning: the result cannot be printed: {error.strerror}", err=True)
+            _lost.append(error.strerror or str(error))
+
+
+def lost() -> Failure | None:
+    """Return why a result did not reach standard output since this was asked, None when all of it did."""
+    if not _lost:
+        return None
+    reason = _lost[0]
+    _lost.clear()
+    fix = "make room where standard output is written to, and run it again"
+    return Failure("OSError", f"the result cannot be printed: {reason}.", fix, INPUT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -57,7 +58,8 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
     if isinstance(error, BrokenPipeError):
         return Failure("OSError", "nobody reads the output any more.", "", OK)
     if isinstance(error, OSError):
-        return Failure("OSError", f"{error.filename or 'a file'}: {error.strerror or error}.", "", INPUT)
+        where = error.filename or ("standard output" if _printing(error) else "a file")
+        return Failure("OSError", f"{where}: {error.strerror or error}.", "", INPUT)
     if isinstance(error, MemoryError):
         return Failure("MemoryError", "out of memory.", "use a machine with more memory, or a smaller policy", INPUT)
     if isinstance(error, SystemExit):
@@ -65,6 +67,11 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
         return Failure("Terminated", f"ended by signal {code - 128}." if code > 128 else "ended.", "", code)
     fix = "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback"
     return Failure("InternalError", f"{type(error).__name__}: {message_of(error)}", fix, OUR_BUG)
+
+
+def _printing(error: BaseException) -> bool:
+    """Say whether an error is one of printing: it was raised in ``typer.echo``."""
+    return [frame.f_code.co_name for frame, _ in traceback.walk_tb(error.__traceback__)][-1:] == ["echo"]
 
 
 def _usage(error: Any) -> Failure:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -13,13 +15,13 @@ import typer
 
 from vlatool.bundle import Bundle
 from vlatool.cli import _complete
-from vlatool.cli._console import command_line, default_workers, emit, progress, refuse_existing, show
+from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
 from vlatool.cli._default import group_with
-from vlatool.cli._document import document
+from vlatool.cli._document import document, put
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files import refuse_file, write_own
-from vlatool.outputs import refuse_inputs
+from vlatool.outputs import output_errors, refuse_inputs
 
 if TYPE_CHECKING:
     from vlatool.gate import Gate
@@ -105,17 +107,34 @@ def init(
     files = {directory / name: text for name, text in gate_files(baseline.as_posix(), candidate.as_posix()).items()}
     for path in files:
         refuse_file(path, force=force)
-    for path in files:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    for path, text in files.items():
-        write_own(path, text, force=force)
+    with _folders(files):
+        for path, text in files.items():
+            with output_errors(path):
+                write_own(path, text, force=force)
     if as_json:
         document({"written": [str(path) for path in files]})
         return
     for path in files:
-        emit(f"written: {path}\n")
-    emit("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
-    emit(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")
+        put(f"written: {path}\n")
+    put("GitLab reads its job when .gitlab-ci.yml says: include: {local: .gitlab/policy-gate.yml}\n")
+    put(f"next: vlatool gate {shlex.quote(str(candidate))}   # in {directory.absolute()}\n")
+
+
+@contextlib.contextmanager
+def _folders(files: Iterable[Path]) -> Iterator[None]:
+    """Make the folders of files; of these, remove what stays empty when they cannot be written."""
+    wanted = sorted({folder for path in files for folder in path.absolute().parents}, key=lambda each: len(each.parts))
+    absent = [folder for folder in wanted if not folder.exists()]
+    try:
+        for folder in absent:
+            with output_errors(folder):
+                folder.mkdir(exist_ok=True)
+        yield
+    except BaseException:
+        for folder in reversed(absent):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
@@ -158,7 +177,7 @@ def _write_junit(report: Report, path: Path) -> None:
 def _tell_github(report: Report) -> None:
     from vlatool.render import render
 
-    emit(render(report, "github"))
+    put(render(report, "github"))
     if summary := os.environ.get("GITHUB_STEP_SUMMARY"):
         try:
             with Path(summary).open("a", encoding="utf-8") as stream:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli import _complete
-from vlatool.cli._console import default_workers, emit, file_or_none, leave, progress, refuse_existing, terminal_text
-from vlatool.cli._document import document, report_document
+from vlatool.cli._console import default_workers, file_or_none, leave, progress, refuse_existing, terminal_text
+from vlatool.cli._document import document, put, report_document
 from vlatool.cli._plan import plan_document
 from vlatool.errors import UsageError
 from vlatool.outputs import BUNDLE
@@ -106,8 +106,8 @@ def optimize(
     if as_json:
         document(report_document(report, raw=raw, file=output / "reports" / REPORT))
     else:
-        emit(terminal_text(report, brief=True))
-        emit(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
+        put(terminal_text(report, brief=True))
+        put(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
     leave(report)
 
 

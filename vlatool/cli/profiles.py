@@ -91,7 +91,7 @@ def validate_profiles(
     ],
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
-    """Check profiles against the schema; exit 3 when one is wrong, naming every line of it."""
+    """Check profiles against the schema; exit 3 when one is wrong, naming every field that is."""
     from vlatool.errors import ProfileError
     from vlatool.profile import SUFFIXES, load_profile
 

@@ -9,8 +9,8 @@ import typer
 
 from vlatool.bundle import Bundle
 from vlatool.cli import _complete
-from vlatool.cli._console import emit, progress, refuse_existing
-from vlatool.cli._document import document
+from vlatool.cli._console import progress, refuse_existing
+from vlatool.cli._document import document, put
 from vlatool.errors import GateFailed, UsageError
 from vlatool.outputs import BUNDLE
 
@@ -56,14 +56,14 @@ def rebuild(
     opened = Bundle.open(bundle)
     versions = version_changes(build_record(opened))
     if versions and not as_json:
-        emit(f"versions differ from the recorded ones: {_told(versions)}\n")
+        put(f"versions differ from the recorded ones: {_told(versions)}\n")
     with progress() as context:
         files = tuple(file or ())
         made = run(opened, context, source=source, files=files, cache=cache_directory(), out=output, force=force)
     if as_json:
         document(_told_as_json(made, versions, output))
     else:
-        emit(_text(made, versions, output))
+        put(_text(made, versions, output))
     if check and not made.identical:
         _fail(made, versions)
 

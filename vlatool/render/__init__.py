@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Protocol
 
 from vlatool import registry
-from vlatool.errors import OutputError
 from vlatool.files import whole_file
 from vlatool.report import Report
 
@@ -49,16 +48,11 @@ def write_reports(report: Report, directory: Path) -> list[Path]:
         The paths that were written.
 
     Raises:
-        OutputError: when the directory cannot be made or written to.
+        OSError: when the directory cannot be made or written to; ``writing`` makes a sentence of it.
     """
     texts = {directory / name: render(report, format) for format, name in FILES.items()}
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        for path, text in texts.items():
-            with whole_file(path) as draft:
-                draft.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"The reports cannot be written to {directory}: {error}.", "name another directory"
-        ) from error
+    directory.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        with whole_file(path) as draft:
+            draft.write_text(text, encoding="utf-8")
     return list(texts)

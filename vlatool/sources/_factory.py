@@ -29,8 +29,18 @@ def split_factory(factory: str) -> tuple[str, str]:
     """
     where, _, function = factory.rpartition(":")
     if not where or not function.isidentifier():
-        raise SourceError(f"'{factory}' names no factory.", "write path/to/policy.py:make or package.module:make")
+        raise _no_function(factory)
     return where, function
+
+
+def _no_function(named: str) -> SourceError:
+    if named.endswith(".onnx"):
+        fix = "name the file itself as SOURCE, and leave source out of the policy.yaml beside it: vlatool export "
+        fix += named if "/" in named else f"DIRECTORY/{named}"
+        return SourceError(f"'{named}' is an ONNX file and no Python function.", fix)
+    if named.endswith(".py"):
+        return SourceError(f"'{named}' names a file and no function in it.", f"add the function: {named}:NAME")
+    return SourceError(f"'{named}' names no factory.", "write path/to/policy.py:make or package.module:make")
 
 
 def factory_file(factory: str, folder: Path) -> Path | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -10,13 +12,15 @@ from pydantic import Field
 
 from vlatool.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import SourceError, nearest, require
-from vlatool.finish import finish
+from vlatool.errors import GraphError, InputError, SourceError, nearest, require
+from vlatool.export._draws import refuse_drawing_file
+from vlatool.finish import SEED, finish
 from vlatool.manifest import Graph, Manifest, single_graph
 from vlatool.quantize._precision import precision_shares
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
+from vlatool.runtime.program import Program
 from vlatool.sources._description import Description, read_description
 from vlatool.sources._onnx_axes import fix_axes, opset_of, told, with_opset
 from vlatool.sources._onnx_batch import add_batch_axes
@@ -65,7 +69,7 @@ class OnnxFile(Transform):
         """Load the file, store it, and run it once."""
         self.check(None, None)
         model = _load(self.model)
-        given = read_description(self.policy) if self.policy else None
+        given = _description(self.policy) if self.policy else None
         fixed = told(fix_axes(model, given.spec if given else None))
         further = [] if given else add_batch_axes(model)
         if further:
@@ -75,6 +79,7 @@ class OnnxFile(Transform):
             context.tell(fixed, None)
         described = given or self._described(model)
         _check_names(model, described.spec)
+        refuse_drawing_file(model, self.model)
         if self.opset is not None:
             model = with_opset(model, self.opset)
         copy_assets(described, out)
@@ -86,19 +91,20 @@ class OnnxFile(Transform):
             name=described.name,
             version=described.version,
             spec=described.spec,
-            program=single_graph(described.spec),
+            program=described.program or single_graph(described.spec),
             environment=described.environment,
             parts=described.parts,
             description=described.description,
             license=described.license,
         )
-        graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
         converted = {"opset": self.opset} if self.opset is not None else {}
         made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
-        observations = _observations(described, out, manifest)
-        if converted:
-            _compare(self.model, out, described.spec, observations, further)
-        return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
+        with _told_of(self.model, out / "graphs/main.onnx"):
+            graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
+            observations = _observations(described, out, manifest)
+            if converted:
+                _compare(self.model, out, manifest, observations, further)
+            return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
 
     def _described(self, model: Any) -> Description:
         initializers = {tensor.name for tensor in model.graph.initializer}
@@ -107,6 +113,19 @@ class OnnxFile(Transform):
         rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int)) if outputs else 1
         spec = PolicySpec(inputs, outputs, self.control_hz, chunk=rows, execute=1 if rows > 1 else 0)
         return Description(self.model.parent, self.model.stem, "0.0.0", spec)
+
+
+def _description(path: Path) -> Description:
+    """Read a description whose program runs the one graph that an ONNX file is."""
+    described = read_description(path)
+    further = next((step.graph for step in described.program if step.graph != "main"), None)
+    if further is not None:
+        raise SourceError(
+            f"The program in {path} runs the graph '{further}'; a policy that is one ONNX file has the graph 'main' "
+            "alone.",
+            "write graph: main in each step, or leave the program out",
+        )
+    return described
 
 
 def _load(path: Path) -> Any:
@@ -145,21 +164,37 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
                 )
 
 
+@contextlib.contextmanager
+def _told_of(model: Path, copy: Path) -> Iterator[None]:
+    """Let what is wrong with a copy be told of the user's own file; the copy is gone when they read it."""
+    try:
+        yield
+    except InputError as error:
+        error.message = error.message.replace(str(copy), str(model))
+        if isinstance(error, GraphError) and not error.fix:
+            error.fix = "mend the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
+        raise
+
+
 def _compare(
-    before: Path, out: Path, spec: PolicySpec, observations: list[dict[str, Any]], unbatched: list[str]
+    before: Path, out: Path, manifest: Manifest, observations: list[dict[str, Any]], unbatched: list[str]
 ) -> None:
     """Hold the converted graph against the file that it came from, which has no batch axis in some tensors.
 
     Raises:
         SourceError: when ONNX Runtime computes something else.
     """
-    sessions = [OrtCpuSession(path, threads=1) for path in (before, out / "graphs/main.onnx")]
-    encode = ObservationEncoder(spec, out / "assets")
+    programs = [
+        Program(manifest.program, {"main": OrtCpuSession(path, threads=1)}, SEED)
+        for path in (before, out / "graphs/main.onnx")
+    ]
+    encode = ObservationEncoder(manifest.spec, out / "assets")
     for observation in observations:
         feeds = encode(observation)
         as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
         wanted, got = (
-            session.run(each)[spec.action.name] for session, each in zip(sessions, (as_before, feeds), strict=True)
+            program.run(each)[manifest.spec.action.name]
+            for program, each in zip(programs, (as_before, dict(feeds)), strict=True)
         )
         error = relative_error(got, wanted)
         if not error <= TOLERANCE:

@@ -1,0 +1,25 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+ENDING = """
+import os, signal
+from vlatool import apart
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+server = apart._Server(dict(os.environ))
+apart._servers[(str(os.getpid()),)] = server
+wait = server.process.wait
+
+def interrupted(patience=None):
+    os.kill(os.getpid(), signal.SIGINT)
+    return wait(patience)
+
+server.process.wait = interrupted
+"""
+
+
+def test_ctrl_c_while_the_children_end_is_no_traceback() -> None:
+    done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
