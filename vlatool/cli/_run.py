@@ -105,7 +105,9 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         document({**summary, "precision": precision, "findings": findings})
         _refuse(made)
         return
-    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
+    graphs = sum(record.bytes for file, record in made.manifest.files.items() if file.startswith("graphs/"))
+    sizes = f"graphs {graphs / 1e6:.2f} MB, in all {made.size_bytes / 1e6:.1f} MB"
+    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {sizes}")
     for line in stage.lines(made):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
