@@ -165,7 +165,7 @@ def _stages(policy: Policy, samples: list[Sample], tolerance: float) -> list[dic
 def _stage(what: str, name: str, samples: list[Sample], errors: list[float], tolerance: float) -> dict[str, Any]:
     differing = [sample.number for sample, error in zip(samples, errors, strict=True) if not error <= tolerance]
     return {"stage": what, "input": name, "relative error": _worst(errors), "differs": len(differing),
-            "first": differing[0] if differing else -1}  # fmt: skip
+            "first": differing[0] if differing else None}  # fmt: skip
 
 
 def _error(got: Array, wanted: Array) -> float:
