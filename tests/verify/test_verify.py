@@ -13,9 +13,11 @@ import pytest
 from vlatool.bundle import Bundle, restate
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
+from vlatool.render.terminal import TerminalRenderer
 from vlatool.report import Report
 from vlatool.stage import Context
 from vlatool.verify import Options, check, verify
+from vlatool.verify._compare import Sample, _elements
 
 ORIGINAL = """\
 import json
@@ -180,6 +182,18 @@ def test_one_observation_is_named_in_the_singular(bundles, against):
     report = found(bundles["source"], against(), samples=1)
     assert report.title.endswith("on 1 recorded observation")
     assert {each["first"] for each in report.rows[0].details["stage by stage"]} == {None}
+
+
+def test_the_terminal_begins_with_numbers_and_has_no_table_without_any(bundles, against):
+    shown = TerminalRenderer().render(found(bundles["source"], against(), samples=1))
+    assert "variant" not in shown
+    assert "error max, dx" in shown
+
+
+def test_small_errors_keep_their_digits(float_bundle):
+    sample = Sample(0, {}, {}, {}, np.zeros(0), np.zeros((4, 2)), np.full((4, 2), 1.23456e-9))
+    dx, _ = _elements(float_bundle.manifest.spec, [sample])
+    assert (dx["max error"], dx["relative"]) == (1.235e-9, 1.0)
 
 
 def test_a_quantized_bundle_is_named_as_such(int8_bundle, against):

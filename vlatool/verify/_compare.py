@@ -139,8 +139,9 @@ def _elements(spec: PolicySpec, samples: list[Sample]) -> list[dict[str, Any]]:
     for index, (label, unit) in enumerate(zip(labels, spec.action.units(), strict=True)):
         worst = int(errors[:, index].argmax())
         largest = float(errors[worst, index])
-        found.append({"element": label, "unit": unit, "max error": round(largest, 9),
-                      "relative": round(largest / (float(sizes[index]) or 1.0), 9),
+        relative = largest / (float(sizes[index]) or 1.0)
+        found.append({"element": label, "unit": unit, "max error": float(f"{largest:.4g}"),
+                      "relative": float(f"{relative:.4g}"),
                       "observation": samples[worst].number})  # fmt: skip
     return found
 
