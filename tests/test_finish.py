@@ -117,7 +117,7 @@ def test_rounding_of_an_action_that_is_near_zero_in_physical_units_is_no_other_a
         load(made.path, threads=1)
 
 
-@pytest.mark.parametrize("dtype", ["float16", "int4"])
+@pytest.mark.parametrize("dtype", ["float16", "int4", "int4 weights"])
 def test_graphs_whose_kernels_round_otherwise_on_each_processor_may_differ_more(
     float_bundle, wrong_engine, tmp_path, dtype
 ):

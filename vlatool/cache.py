@@ -36,6 +36,7 @@ PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")
 NEW_S = 60.0
 """Seconds in which what was just made counts as in use: its maker has not locked it yet."""
 IN_USE = "is in use"
+RECENT = f"was made or used in the last {NEW_S:.0f} s"
 
 Inode = tuple[int, int]
 
@@ -100,6 +101,11 @@ class Removed:
     stays: dict[str, str]
 
 
+def is_cache(place: Path) -> bool:
+    """Say whether a directory is empty, or holds one of the folders of a cache."""
+    return not any(place.iterdir()) or any((place / name).exists() for name in (STAGES, STREAMS, WORKLOADS, FILES, TAG))
+
+
 def contents(cache: Path) -> Contents:
     """Return what a cache holds; nothing for one that is not there yet.
 
@@ -162,7 +168,7 @@ def prune(
         reason = _remove(cache, entry, dry_run)
         if reason:
             stays[entry.name] = reason
-        if not reason.startswith(IN_USE):
+        if not reason.startswith((IN_USE, RECENT)):
             removed.append(entry)
             files = dict(entry.files.values())
             uses.subtract(files.keys())
@@ -228,7 +234,7 @@ def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
     """Remove the files of an entry, file by file; return why something of it stays."""
     path = cache / entry.name
     if _now() - entry.used < NEW_S:
-        return f"{IN_USE}: it was made or used in the last {NEW_S:.0f} s"
+        return RECENT
     lock = path / STREAM_FILES[0] if entry.what == "unfinished work" else path
     with alone(lock) as mine:
         if not mine:

@@ -44,7 +44,7 @@ COARSE_TOLERANCE = 0.03
 """The same for graphs whose kernels round otherwise by design from processor to processor: float16 is computed as such
 where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8 where
 there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72)."""
-COARSE = ("float16", "int4")
+COARSE = ("float16", "int4", "int4 weights")
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")

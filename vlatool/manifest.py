@@ -35,7 +35,8 @@ class Graph:
 
     Args:
         file: Path inside the bundle.
-        precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1).
+        precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
+            the weights alone are int4.
         opset: Opset of the default ONNX domain.
         compute: Dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
     """

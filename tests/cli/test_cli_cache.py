@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -25,14 +26,29 @@ def cache(tmp_path: Path, float_bundle) -> Path:
 
 def test_size_and_list_tell_what_is_kept(vlatool, cache) -> None:
     (cache / "notes.txt").write_text("mine")
+    (cache / "two\nlines").write_text("mine")
     code, out, _ = vlatool("cache", "size", "--cache", cache)
     assert code == 0
     assert "quantize.dynamic_int8            1 kept" in out
-    assert "not vlatool's, never removed: notes.txt" in out
+    assert "not vlatool's, never removed: notes.txt, two\\nlines\n" in out
     code, out, _ = vlatool("cache", "list", "--cache", cache)
     assert code == 0
     assert "10 d" in out
     assert "stages/quantize.dynamic_int8-" in out
+
+
+def test_prune_says_what_was_freed_and_what_is_kept(vlatool, cache) -> None:
+    assert vlatool("cache", "prune", "--max-size", "1TB", "--cache", cache)[1].startswith(f"{cache}: freed 0 B, ")
+    told = vlatool("cache", "prune", "--all", "--dry-run", "--cache", cache)[1].splitlines()[-1]
+    assert re.fullmatch(rf"{cache}: would free [\d.]+ kB, 0 B kept", told)
+
+
+@pytest.mark.parametrize("command", [("prune", "--all"), ("size",), ("list",)])
+def test_what_is_no_cache_is_told(vlatool, tmp_path, command) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    code, out, err = vlatool("cache", *command, "--cache", tmp_path)
+    assert (code, out) == (3, "")
+    assert f"{tmp_path} is no cache" in err
 
 
 def test_json_of_size_list_and_prune(vlatool, cache) -> None:

@@ -19,12 +19,13 @@ def wrong(vlatool, wrong_engine, float_bundle, tmp_path):
     return (*vlatool("quantize", "dynamic-int8", float_bundle.path, "-o", out, "--json"), out)
 
 
-def test_the_stage_fails_but_leaves_the_bundle_to_be_looked_at(wrong):
+def test_the_stage_fails_but_leaves_the_bundle_to_be_looked_at(wrong, float_bundle):
     code, out, err, path = wrong
     assert code == 1
     assert json.loads(out)["findings"][0]["name"] == "engine-difference"
     assert f"error: {path} was written, but it is wrong: the engine ort_cpu computes another action" in err
     assert "to overrule: engine-difference" in err
+    assert f"vlatool explain {path} --baseline {float_bundle.path}; load" in err
     assert Bundle.open(path).manifest.findings[0]["value"] == pytest.approx(0.5, abs=1e-3)
 
 

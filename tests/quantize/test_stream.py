@@ -91,6 +91,12 @@ def test_processes_give_the_same_bytes(shard, reference, tmp_path):
     assert told[-1] == 1.0
 
 
+def test_progress_says_quantized_of_what_is_quantized_alone(shard, tmp_path):
+    told: list[str] = []
+    write(records(shard), tmp_path / "work" / "told", tell=lambda what, _share: told.append(what))
+    assert told == [*["quantized layer/MatMul"] * 6, "copied table"]
+
+
 class Stop(Exception):
     """Ends a run from within."""
 

@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from vlatool.bundle import Bundle, seal
+from vlatool.cli.inspect import describe
 from vlatool.data import synthetic_observations
 from vlatool.errors import BundleError, DataError, GraphError, OutputError, RecipeError, SourceError
 from vlatool.launch import run_transform
@@ -108,7 +109,7 @@ def test_from_shards_to_int4(llama, llama_int4, llama_float):
     assert "Transpose" in kinds(llama_int4)  # of heads; none of weights
     assert 0 < relative_error(actions(llama_int4), actions(llama_float)) < 0.35
     assert llama_int4.manifest.parent == llama.hash
-    assert llama_int4.manifest.graphs["main"].precision["int4"] > 0.9
+    assert llama_int4.manifest.graphs["main"].precision["int4 weights"] > 0.9
     assert llama_int4.manifest.golden
     assert [step["stage"] for step in llama_int4.manifest.build] == ["sources.torch_module", "quantize.weight_only"]
     told = losses(llama_int4)
@@ -186,6 +187,13 @@ def test_both_layouts_mean_the_same(float_bundle, quantized, drift, options):
     assert drift(standard, blocks) < 1e-5
     assert 0 < drift(blocks) < (0.02 if options.get("bits") == 8 else 0.15)
     assert losses(blocks)["layers"] == losses(standard)["layers"]
+    shares = [each.manifest.graphs["main"].precision for each in (blocks, standard)]
+    assert shares[0] == shares[1]
+    assert shares[0][f"int{options.get('bits', 4)} weights"] > 0.5
+    beside = f" MB + {standard.manifest.files[WEIGHTS].bytes / 1e6:.2f} MB in {WEIGHTS}, opset 21, "
+    assert any(beside in line for line in describe(standard))
+    with pytest.raises(BundleError, match=r"\(weights\) already"):
+        WeightOnly().check(standard, None)
     model = onnx.load(standard.path / "graphs/main.onnx")
     onnx.checker.check_model(model)
     assert next(entry.version for entry in model.opset_import if entry.domain == "") == 21

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import re
 
 import pytest
@@ -8,6 +9,7 @@ from rich.cells import cell_len
 
 from vlatool.render import render
 from vlatool.render.terminal import TerminalRenderer
+from vlatool.report import Measurement, Report, Row
 
 ANSI = re.compile(r"\x1b\[[\d;]*m")
 
@@ -113,3 +115,15 @@ def test_what_is_unmeasured_is_one_block_and_one_line_for_each_reason() -> None:
         "GPU memory, GPU clock: no GPU",
     ]
     assert text.index("memory by part") < text.index("time by phase") < text.index("cold start by part")
+
+
+@pytest.mark.parametrize(
+    "tail", [[], [Measurement("latency_p99", math.nan, "ms")], [Measurement("latency_p99", 3.0, "ms")]]
+)
+def test_the_spread_has_a_column_for_the_tail_where_there_is_one(tail):
+    rows = tuple(Row(name, measurements=tuple(tail), raw={"latency_ms": [1.0, 2.0] * 8}) for name in "ab")
+    text = TerminalRenderer().render(Report("benchmark", "t", rows=rows))
+    known = bool(tail) and tail[0].known
+    (heads,) = (line for line in text.splitlines() if line.startswith("spread of latency"))
+    assert heads.split("  ")[-1].strip() == ("latency p99" if known else "calls")
+    assert ("n = 16" in text) != known

@@ -188,6 +188,17 @@ def test_a_bundle_from_before_has_one_tolerance_for_both(bundle):
     assert load(bundle.path).golden_tolerances == (0.2, 0.2)
 
 
+def test_another_engine_than_the_bundle_was_made_for_is_told(bundle):
+    pytest.importorskip("openvino")
+    scaled(bundle, "out.y", 2.0)
+    with pytest.raises(GraphError, match="another golden action") as caught:
+        load(bundle.path, engine="openvino")
+    assert "was made for ort_cpu: load it with engine='ort_cpu'" in caught.value.fix
+    with pytest.raises(GraphError, match="another golden action") as caught:
+        load(bundle.path)
+    assert "was made for" not in caught.value.fix
+
+
 def test_an_action_of_another_size_is_another_action(bundle):
     assert relative_error(np.zeros((1, 4)), np.zeros((1, 2))) == np.inf
 

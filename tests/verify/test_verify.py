@@ -13,9 +13,11 @@ import pytest
 from vlatool.bundle import Bundle, restate
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
+from vlatool.render.terminal import TerminalRenderer
 from vlatool.report import Report
 from vlatool.stage import Context
 from vlatool.verify import Options, check, verify
+from vlatool.verify._compare import Sample, _elements
 
 ORIGINAL = """\
 import json
@@ -174,6 +176,48 @@ def test_what_would_make_both_equal_is_named_where_the_original_gives_actions_al
     report = found(bundles["source"], against(change))
     assert report.verdict == "fail"
     assert says in " ".join(report.summary)
+
+
+def test_one_observation_is_named_in_the_singular(bundles, against):
+    report = found(bundles["source"], against(), samples=1)
+    assert report.title.endswith("on 1 recorded observation")
+    assert {each["first"] for each in report.rows[0].details["stage by stage"]} == {None}
+
+
+def test_the_terminal_begins_with_numbers_and_has_no_table_without_any(bundles, against):
+    shown = TerminalRenderer().render(found(bundles["source"], against(), samples=1))
+    assert "variant" not in shown
+    assert "error max, dx" in shown
+
+
+def test_small_errors_keep_their_digits(float_bundle):
+    sample = Sample(0, {}, {}, {}, np.zeros(0), np.zeros((4, 2)), np.full((4, 2), 1.23456e-9))
+    dx, _ = _elements(float_bundle.manifest.spec, [sample])
+    assert (dx["max error"], dx["relative"]) == (1.235e-9, 1.0)
+
+
+def test_a_quantized_bundle_is_named_as_such(int8_bundle, against):
+    report = found(int8_bundle, against(), tolerance=1e-5)
+    assert "This bundle is in int8 and float32" not in " ".join(report.summary)
+    assert "This bundle is in int8, which alone makes its actions differ" in " ".join(report.summary)
+
+
+def test_the_network_is_told_where_the_original_tells_some_of_the_inputs(bundles, against):
+    network = ("NETWORK = make().eval()", "NETWORK = make().eval()\nfor each in NETWORK.parameters():\n"
+               "    each.data *= 1.2")  # fmt: skip
+    some = """
+
+def preprocess(observation):
+    return {name: value for name, value in prepared(observation).items() if name != "image"}
+
+
+def raw(observation):
+    return network(observation)
+"""
+    said = " ".join(found(bundles["source"], against(network, more=some)).summary)
+    assert "'proprio' and 'instruction' are the same, the network's output is not" in said
+    assert "and at 'image', which preprocess() does not return" in said
+    assert "cannot be told" not in said
 
 
 def test_what_cannot_be_told_is_not_told(bundles, against):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -98,14 +99,17 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         made = run_transform(stage, bundle, out, context, force=force)
+    baseline = source if is_bundle(source) else ""
     summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
     precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
     findings = made.manifest.findings
     if as_json:
         document({**summary, "precision": precision, "findings": findings})
-        _refuse(made)
+        _refuse(made, baseline)
         return
-    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {made.size_bytes / 1e6:.1f} MB")
+    graphs = sum(record.bytes for file, record in made.manifest.files.items() if file.startswith("graphs/"))
+    sizes = f"graphs {graphs / 1e6:.2f} MB, in all {made.size_bytes / 1e6:.1f} MB"
+    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {sizes}")
     for line in stage.lines(made):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
@@ -113,7 +117,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
             typer.echo(f"  {name}: no matrix product or convolution")
             continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
-    _refuse(made)
+    _refuse(made, baseline)
 
 
 def _onnx_source(export: Transform, source: Transform) -> Transform:
@@ -122,14 +126,20 @@ def _onnx_source(export: Transform, source: Transform) -> Transform:
     return source.model_copy(update={"opset": getattr(export, "opset", None)}) if asked else source
 
 
-def _refuse(made: Bundle) -> None:
+def _refuse(made: Bundle, baseline: str = "") -> None:
     """Leave with an error when a stage found the bundle to be wrong; it is there all the same, to be looked at.
+
+    Args:
+        made: The new bundle.
+        baseline: The bundle that it was made from, where a path leads to it.
 
     Raises:
         GateFailed: naming the first finding.
     """
     for finding in made.manifest.findings:
-        fix = f"vlatool explain {made.path}; load, optimize and gate refuse the bundle (to overrule: {finding['name']})"
+        beside = f" --baseline {shlex.quote(baseline)}" if baseline else ""
+        overrule = f"load, optimize and gate refuse the bundle (to overrule: {finding['name']})"
+        fix = f"vlatool explain {made.path}{beside}; {overrule}"
         raise GateFailed(f"{made.path} was written, but it is wrong: {finding['message']}", fix)
 
 

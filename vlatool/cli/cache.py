@@ -13,6 +13,7 @@ import typer
 
 from vlatool.cli._document import document
 from vlatool.errors import DataError, UsageError, nearest
+from vlatool.printable import printable
 
 if TYPE_CHECKING:
     from vlatool.cache import Contents, Entry, Removed
@@ -84,16 +85,19 @@ def prune(
         typer.echo(f"{'would remove' if dry_run else 'removed'} {entry.name}")
     for name, reason in removed.stays.items():
         typer.echo(f"warning: {name} stays: it {reason}", err=True)
-    word = "would be free" if dry_run else "are free"
-    typer.echo(f"{place}: {_human(removed.freed)} {word}, {_human(left)} left")
+    word = "would free" if dry_run else "freed"
+    typer.echo(f"{place}: {word} {_human(removed.freed)}, {_human(left)} kept")
 
 
 def _place(cache: Path | None) -> Path:
+    from vlatool.cache import is_cache
     from vlatool.host import cache_directory
 
     place = cache or cache_directory()
     if (cache is not None or place.exists()) and not place.is_dir():
         raise DataError(f"There is no directory {place}.", "name the directory of a cache")
+    if cache is not None and not is_cache(place):
+        raise DataError(f"{place} is no cache: vlatool keeps nothing in it.", "name the directory of a cache")
     return place
 
 
@@ -146,7 +150,11 @@ def _told_removed(place: Path, removed: Removed, left: int, dry_run: bool) -> di
 def _tell_unknown(held: Contents) -> None:
     if held.unknown:
         more = f" and {len(held.unknown) - 6} more" if len(held.unknown) > 6 else ""
-        typer.echo(f"not vlatool's, never removed: {', '.join(held.unknown[:6])}{more}")
+        typer.echo(f"not vlatool's, never removed: {', '.join(map(_on_one_line, held.unknown[:6]))}{more}")
+
+
+def _on_one_line(name: str) -> str:
+    return printable(name).replace("\n", "\\n").replace("\t", "\\t")
 
 
 def _human(size: float) -> str:

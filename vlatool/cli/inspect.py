@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,11 +12,14 @@ import typer
 from vlatool.bundle import Bundle, manifest_bytes
 from vlatool.cli import _complete
 from vlatool.cli._document import document
-from vlatool.errors import GraphError
+from vlatool.errors import BundleError, GraphError
 from vlatool.manifest import Manifest
 from vlatool.printable import printable
+from vlatool.runtime.external_data import OpenFile, external_files
+from vlatool.runtime.graph_files import recorded
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
+from vlatool.sealed_files import open_inside
 from vlatool.spec import TensorSpec
 
 
@@ -74,11 +78,24 @@ def describe(bundle: Bundle) -> list[str]:
     lines += [f"  output     {_tensor(tensor)}" for tensor in spec.outputs]
     for name, graph in manifest.graphs.items():
         shares = ", ".join(f"{share:.1%} {kind}" for kind, share in graph.precision.items())
-        size = manifest.files[graph.file].bytes / 1e6
-        lines.append(f"  graph      {name}: {size:.2f} MB, opset {graph.opset}, MACs: {shares}")
+        size = _megabytes(bundle, graph.file) + "".join(
+            f" + {_megabytes(bundle, file)} in {file}" for file in _beside(bundle, graph.file)
+        )
+        lines.append(f"  graph      {name}: {size}, opset {graph.opset}, MACs: {shares}")
     lines += _lineage(manifest)
     lines += [f"  WRONG      {each['name']}: {each['message']}" for each in manifest.findings]
     return lines
+
+
+def _beside(bundle: Bundle, file: str) -> list[str]:
+    """Return the files of a bundle in which a graph keeps weights; graphs may share one. None of a broken graph."""
+    with contextlib.suppress(BundleError, GraphError), open_inside(bundle.path, file) as handle:
+        return recorded(bundle, file, external_files(OpenFile(handle)))
+    return []
+
+
+def _megabytes(bundle: Bundle, file: str) -> str:
+    return f"{bundle.manifest.files[file].bytes / 1e6:.2f} MB"
 
 
 def _tensor(tensor: TensorSpec) -> str:

@@ -41,6 +41,20 @@ def precision_of(node: Any, tensors: Tensors) -> str:
     return tensors.dtype(node.input[0])
 
 
+def weights_alone(node: Any, tensors: Tensors) -> str:
+    """Return the precision of a layer's weights where they alone are stored so (``int4``); empty for any other layer.
+
+    What such a layer is computed in is up to the engine: one dequantizes the weights, another rounds the activations.
+    """
+    if node.op_type == "MatMulNBits":
+        return precision_of(node, tensors)
+    first, second, *_ = *(_source(name, tensors) for name in node.input[:2]), None, None
+    if node.op_type in INTEGER_OPS or second is None or second.op_type != "DequantizeLinear":
+        return ""
+    stored = tensors.is_constant(second.input[0]) and (first is None or first.op_type != "DequantizeLinear")
+    return tensors.dtype(second.input[0]).removeprefix("u") if stored else ""
+
+
 def _source(name: str, tensors: Tensors) -> Any:
     """Return the node that gave a value before it was moved."""
     node = tensors.producer(name)

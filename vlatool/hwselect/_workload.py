@@ -9,7 +9,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -123,12 +123,15 @@ def workload(bundle: Bundle) -> Workload:
     return Workload(graphs, dict(runs) or dict.fromkeys(graphs, 1))
 
 
-def graph_workload(path: Path, parts: Mapping[str, Sequence[str]] | None = None) -> GraphWorkload:
+def graph_workload(
+    path: Path, parts: Mapping[str, Sequence[str]] | None = None, told: Callable[[Any, Tensors], str] = precision_of
+) -> GraphWorkload:
     """Count the work of one run of an ONNX file; a free first axis counts as 1.
 
     Args:
         path: The file.
         parts: Part of the policy -> globs of module names, to count each by itself.
+        told: What the multiply-accumulates of a layer are counted as.
 
     Raises:
         GraphError: when the file cannot be read.
@@ -140,7 +143,7 @@ def graph_workload(path: Path, parts: Mapping[str, Sequence[str]] | None = None)
     except Exception as error:  # the seam: every exception type of onnx and protobuf becomes ours
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
-    return _count(tensors, parts or {})
+    return _count(tensors, parts or {}, told)
 
 
 def part_named(name: str, parts: Mapping[str, Sequence[str]]) -> str:
@@ -153,7 +156,7 @@ def _matches(names: Iterable[str], globs: Iterable[str]) -> bool:
     return any(fnmatch.fnmatchcase(name, glob) for name in names for glob in globs)
 
 
-def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]]) -> GraphWorkload:
+def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]], told: Callable[[Any, Tensors], str]) -> GraphWorkload:
     macs: Counter[str] = Counter()
     tally = Tally()
     activation_bytes = 0
@@ -168,7 +171,7 @@ def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]]) -> GraphWorkloa
             tally.layers += 1
             unknown.append(node.name or node.output[0])
             continue
-        macs[precision_of(node, tensors)] += count
+        macs[told(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
         part = part_named(node.name, parts)
         written_numbers = math.prod(tensors.shape(node.output[0]) or ())

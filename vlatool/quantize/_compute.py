@@ -90,7 +90,7 @@ def records_of(task: Task, form: Format, choose: str, tolerance: float) -> list[
     for first in range(0, max(source.count, 1), step):
         count = min(step, source.count - first)
         job = Job(task, form, choose, tolerance, first, count)
-        found.append(Record(task.label, padded(count * width), job, count, source.array is None))
+        found.append(Record(task.label, padded(count * width), job, count, source.array is None, "copied"))
     return found
 
 

@@ -61,7 +61,8 @@ class Quantization(Transform):
                 raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.")
         for name in self.chosen_graphs(source):
             graph = source.manifest.graphs[name]
-            lower = [kind for kind in graph.precision if kind not in FLOATS] or [graph.compute]
+            quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
+            lower = quantized or [graph.compute]
             if lower != ["float32"] and lower != [""]:
                 raise BundleError(
                     f"The graph '{name}' of {source.path} is {' and '.join(lower)} already; {self.name()} starts from "

@@ -63,6 +63,7 @@ class Record:
         fill: Computes it.
         weights: Parameters that it covers, for the progress.
         portable: Whether another process can compute it.
+        verb: What is done to it, for the progress.
     """
 
     name: str
@@ -70,6 +71,7 @@ class Record:
     fill: Fill
     weights: int = 0
     portable: bool = True
+    verb: str = "quantized"
 
 
 def padded(size: int) -> int:

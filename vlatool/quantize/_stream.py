@@ -126,7 +126,7 @@ def write_records(records: list[Record], plan: str, place: Path, processes: int,
                 offset += record.size
                 unflushed += record.size
                 done += record.weights
-                tell(f"quantized {record.name}", done / total)
+                tell(f"{record.verb} {record.name}", done / total)
                 if unflushed >= COMMIT_BYTES:
                     journal.flush()
                     unflushed = 0

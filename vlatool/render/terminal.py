@@ -137,6 +137,9 @@ class TerminalRenderer:
             return [*self._percentiles(report, self._origin(report)), *self._numbers(report),
                     *([Text(), *reasons] if reasons else []), *self._spread(report)]  # fmt: skip
         shown = columns(report)
+        if not shown and len(report.rows) == 1:
+            reasons = self._reasons(report)
+            return [*([Text(), *reasons] if reasons else []), *self._spread(report)]
         same = [self._same_count(report, column) for column in shown]
         body = [["", *same]] if any(same) else []
         styles: dict[int, str] = {0: "dim"} if body else {}
@@ -214,14 +217,16 @@ class TerminalRenderer:
 
     def _spread(self, report: Report) -> list[Text]:
         body = []
+        known = any((tail := row.get("latency_p99")) and tail.known for row in report.rows)
+        tails = known and not percentile_names(report)
         for row in report.rows:
             samples = finite(row.raw.get("latency_ms") or [])
             if len(samples) > 1:
-                tail = None if percentile_names(report) else row.get("latency_p99")
+                tail = row.get("latency_p99") if tails else None
                 beside = f"{quantity(tail)} ({aside(tail)})" if tail and aside(tail) else quantity(tail) if tail else ""
                 body.append([plain(row.name), sparkline(samples, 20), beside or count(len(samples))])
         where = ", this host" if board(report) else ""
-        heads = [f"spread of latency{where}", "min … p99", "calls" if percentile_names(report) else "latency p99"]
+        heads = [f"spread of latency{where}", "min … p99", "latency p99" if tails else "calls"]
         return [Text(), *self._table(heads, body, [False, False, True])] if body else []
 
     def _further(self, report: Report) -> list[Text]:

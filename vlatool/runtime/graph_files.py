@@ -45,7 +45,7 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
         del content
     with contextlib.ExitStack() as stack:
         place = stack.enter_context(bundle.held(folder, [graph.file]))
-        beside = _recorded(bundle, graph.file, _beside(place, name))
+        beside = recorded(bundle, graph.file, _beside(place, name))
         if beside:
             stack.enter_context(bundle.held(folder, beside))
         return engine(path, threads, graph.compute, place / name)
@@ -61,7 +61,7 @@ def _beside(place: Path, name: str) -> set[str]:
         return external_files(OpenFile(handle))
 
 
-def _recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
+def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
     """Return the files of a bundle that a graph's locations mean.
 
     Raises:

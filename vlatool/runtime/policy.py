@@ -257,8 +257,17 @@ class Policy:
                 raise GraphError(
                     f"This {machine(self.engine)} computes another golden action{where} than recorded: relative error "
                     f"{error:.3g}, allowed {allowed:g}.{cause and ' ' + cause}",
-                    remedy or "the engine or processor may lack what this precision needs; run: vlatool doctor",
+                    remedy
+                    or self._made_for()
+                    or "the engine or processor may lack what this precision needs; run: vlatool doctor",
                 )
+
+    def _made_for(self) -> str:
+        """Say which engine the bundle was made for, when another one runs it."""
+        wanted = self.bundle.manifest.engine or DEFAULT_ENGINE
+        if wanted == self.engine:
+            return ""
+        return f"the bundle was made for {wanted}: load it with engine={wanted!r}, or make one for {self.engine}"
 
     def chunk_error(self, got: Array, wanted: Array) -> float:
         """Return the relative L2 difference of two chunks in physical units; infinite for other sizes.

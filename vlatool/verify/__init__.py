@@ -73,7 +73,8 @@ def check(options: Options) -> None:
 def _report(bundle: Bundle, options: Options, found: Mapping[str, Any]) -> Report:
     """Return what was found as a report; its verdict is ``fail`` when the actions differ."""
     name, count, differing = bundle.manifest.name, int(found["samples"]), int(found["differing"])
-    title = f"{name} against {options.against} on {count} {found['observations']}"
+    observations = str(found["observations"]).removesuffix("s" if count == 1 else "")
+    title = f"{name} against {options.against} on {count} {observations}"
     worst = float(found["error"])
     if differing:
         first = found["first"]

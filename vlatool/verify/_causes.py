@@ -18,24 +18,66 @@ Array = NDArray[Any]
 Change = Callable[["Sample"], Mapping[str, Array]]
 TRIED = 6
 """Observations on which a guess must make both equal."""
-LEAST_FIT = 8
+LEAST_FIT = 16
 """Values of an element from which a straight line through them says something."""
+LEFT_OVER = 0.1
+"""Share of a difference that a straight line may leave and still explain it: through mere rounding it leaves most."""
+NARROW = {"float16": (2.0**-11, 2.0**-25), "bfloat16": (2.0**-8, 2.0**-133)}
+"""Dtype -> the relative and the least absolute rounding."""
 
 
 def causes(
     policy: Policy, samples: Sequence[Sample], stages: Sequence[Mapping[str, Any]], tolerance: float
 ) -> tuple[list[str], bool]:
     """Return what differs, a sentence for each cause, and whether the stage is certain."""
-    told = list(_of_stages(policy, samples, stages, tolerance))
+    known = list(_of_quantization(policy))
+    told = list(_of_rounding(policy, samples)) or list(_of_stages(policy, samples, stages, tolerance))
     if told:
-        return told, True
+        return [*known, *told], True
     found = [*_of_action(policy, samples, tolerance), *_of_inputs(policy, samples, tolerance)]
     if found:
-        return found, True
-    text = list(_of_texts(policy, samples, tolerance))
+        return [*known, *found], True
+    text = [*known, *_of_texts(policy, samples, tolerance)]
     where = "no single change of an input or of the action makes both equal, so it is the network (weights, layers, "
     where += "eval mode, the order of the inputs), or more than one stage"
     return [*text, f"It cannot be told for certain which stage differs: {where}."], False
+
+
+def _of_quantization(policy: Policy) -> Iterator[str]:
+    """Say when the policy is not the float32 one, which differs from its original by design."""
+    graphs = policy.bundle.manifest.graphs.values()
+    kinds = dict.fromkeys(kind for graph in graphs for kind in (*graph.precision, graph.compute))
+    lower = [kind for kind in kinds if kind not in ("", "float32", "float64")]
+    if lower:
+        yield (
+            f"This bundle is in {' and '.join(lower)}, which alone makes its actions differ: compare the float32 "
+            "bundle that it was made from, or pass a --tolerance that allows what it costs."
+        )
+
+
+def _of_rounding(policy: Policy, samples: Sequence[Sample]) -> Iterator[str]:
+    """Say when the original's action is this policy's, rounded to a narrower dtype."""
+    if policy.spec.action.kind == "discrete":
+        return
+    mine = np.concatenate([sample.chunk for sample in samples])
+    theirs = np.concatenate([sample.wanted for sample in samples])
+    for dtype, (relative, least) in NARROW.items():
+        within = np.abs(mine - theirs) <= 1.1 * np.maximum(relative * np.abs(mine), least)
+        if within.all() and np.array_equal(_narrowed(theirs, dtype), theirs):
+            yield (
+                f"The original's action is in {dtype}, and the difference is that rounding: let it return float32, or "
+                "pass a --tolerance that allows it."
+            )
+            return
+
+
+def _narrowed(values: Array, dtype: str) -> Array:
+    """Return the values as that dtype holds them; bfloat16 is float32 without its lower 16 bits."""
+    if dtype == "float16":
+        with np.errstate(over="ignore"):
+            return values.astype(np.float16).astype(values.dtype)
+    bits = values.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
+    return bits.view(np.float32).astype(values.dtype)
 
 
 def _of_stages(
@@ -53,9 +95,28 @@ def _of_stages(
         return
     if network is not None and not network["differs"]:
         yield "The network gives the same, so the denormalisation differs: look at the action's statistics and units."
-    elif network is not None and len(before) == len(policy.spec.inputs):
-        words = f"The inputs are the same, the network's output is not, first on observation {network['first']}: look "
-        yield words + "at weights, layers, eval mode, and the order in which forward() takes the inputs."
+    elif network is not None:
+        compared = [stage["input"] for stage in before]
+        others = [tensor.name for tensor in policy.spec.inputs if tensor.name not in compared]
+        guessed = list(_of_inputs(policy, samples, tolerance)) if others else []
+        yield from guessed
+        if guessed or not before:
+            return
+        those = "The inputs are" if not others else f"Of the inputs, {_listed(compared)} {_are(compared)}"
+        words = f"{those} the same, the network's output is not, first on observation {network['first']}"
+        if any(_of_quantization(policy)):
+            yield f"{words}, as is to be expected."
+            return
+        words += ": look at weights, layers, eval mode, and the order in which forward() takes the inputs"
+        yield words + (f", and at {_listed(others)}, which preprocess() does not return." if others else ".")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(", ".join(f"'{name}'" for name in part) for part in (names[:-1], names[-1:]) if part)
+
+
+def _are(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
 
 
 def _by(samples: Sequence[Sample], stage: Mapping[str, Any]) -> str:
@@ -97,10 +158,12 @@ def _of_lines(policy: Policy, samples: Sequence[Sample], tolerance: float) -> It
                 continue
             return
         slope, offset = np.polyfit(mine[:, index], theirs[:, index], 1)
-        left = np.abs(slope * mine[:, index] + offset - theirs[:, index]).max()
-        if not left <= 10 * tolerance * (float(theirs[:, index].std()) or spread):
+        left = slope * mine[:, index] + offset - theirs[:, index]
+        if not np.abs(left).max() <= 10 * tolerance * float(theirs[:, index].std()):
             return
         if abs(slope - 1) > tolerance or abs(offset) > tolerance * spread:
+            if not left.std() <= LEFT_OVER * np.sqrt(np.mean((theirs - mine)[:, index] ** 2)):
+                return
             told.append(f"the original's {label} is {slope:.4g} times this policy's plus {offset:.4g}")
     if told:
         yield f"The denormalisation differs (statistics, units or order of the elements): {'; '.join(told[:6])}."

@@ -139,8 +139,9 @@ def _elements(spec: PolicySpec, samples: list[Sample]) -> list[dict[str, Any]]:
     for index, (label, unit) in enumerate(zip(labels, spec.action.units(), strict=True)):
         worst = int(errors[:, index].argmax())
         largest = float(errors[worst, index])
-        found.append({"element": label, "unit": unit, "max error": round(largest, 9),
-                      "relative": round(largest / (float(sizes[index]) or 1.0), 9),
+        relative = largest / (float(sizes[index]) or 1.0)
+        found.append({"element": label, "unit": unit, "max error": float(f"{largest:.4g}"),
+                      "relative": float(f"{relative:.4g}"),
                       "observation": samples[worst].number})  # fmt: skip
     return found
 
@@ -165,7 +166,7 @@ def _stages(policy: Policy, samples: list[Sample], tolerance: float) -> list[dic
 def _stage(what: str, name: str, samples: list[Sample], errors: list[float], tolerance: float) -> dict[str, Any]:
     differing = [sample.number for sample, error in zip(samples, errors, strict=True) if not error <= tolerance]
     return {"stage": what, "input": name, "relative error": _worst(errors), "differs": len(differing),
-            "first": differing[0] if differing else -1}  # fmt: skip
+            "first": differing[0] if differing else None}  # fmt: skip
 
 
 def _error(got: Array, wanted: Array) -> float:

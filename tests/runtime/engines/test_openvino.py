@@ -186,6 +186,19 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path, monkeypatch) -> None
     assert not caught.value.fix, "what confines OpenVINO has nothing to do with it"
 
 
+BLOCKED = """g (float[1,8] x) => (float[1,4] y) <int8[8,4] w = {1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,
+1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1},
+float[1,4] s = {1.0,1.0,1.0,1.0}> { d = DequantizeLinear<axis = 0, block_size = 32>(w, s)  y = MatMul(x, d) }"""
+
+
+def test_a_layer_that_is_narrower_than_a_block_is_told_with_its_reason(tmp_path: Path) -> None:
+    path = tmp_path / "blocked.onnx"
+    onnx.save(onnx.parser.parse_model(f'<ir_version: 10, opset_import: ["" : 21]> {BLOCKED}'), str(path))
+    with pytest.raises(GraphError, match=r"\(8\) cannot be divided by block_size \(32\)") as caught:
+        OpenvinoSession(path, threads=1)
+    assert "ort_cpu" in caught.value.fix
+
+
 @pytest.mark.parametrize("as_bytes", [False, True])
 def test_a_float8_graph_that_is_refused_goes_to_another_engine(tmp_path: Path, as_bytes: bool) -> None:
     model = onnx.load(graph(tmp_path / "own.onnx", "g (float[1,3] x) => (float[1,3] y) { y = Own(x, w) }"))

@@ -30,6 +30,8 @@ PLAIN = {"SNIPPETS_MODE": "DISABLE"}
 """One kernel for each operator, none generated for several."""
 NO_KERNEL = ("bad combination", "inner product")
 """What OpenVINO says of a processor without the instructions that a graph needs."""
+PARTIAL_BLOCK = "cannot be divided by block_size"
+"""What OpenVINO says of a layer whose inputs are no whole number of blocks."""
 
 
 class OpenvinoSession:
@@ -197,7 +199,12 @@ class OpenvinoSession:
 
 
 def _remedy(error: Exception) -> str:
-    """Return what to do where OpenVINO has no kernel for this processor, or for what a variable confines it to."""
+    """Return what to do where OpenVINO takes no such graph, or has no kernel for this processor.
+
+    The kernel may also be missing in what a variable confines it to.
+    """
+    if PARTIAL_BLOCK in str(error):
+        return "OpenVINO takes whole blocks alone: use the engine ort_cpu, or leave the narrower layers out (--exclude)"
     if not any(sign in str(error) for sign in NO_KERNEL):
         return ""
     lacks = "instructions that OpenVINO needs for it: quantize with --layout ort"
@@ -275,5 +282,6 @@ def _dtype(port: Any) -> str:
 
 
 def _last_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    """Return the last line that says why: OpenVINO ends some errors with a summary of which operators failed."""
+    lines = [line.strip() for line in str(error).split("\nSummary:")[0].splitlines() if line.strip()]
     return (lines[-1] if lines else type(error).__name__)[:300]
