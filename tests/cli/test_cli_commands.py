@@ -190,6 +190,7 @@ def test_export_makes_a_bundle_from_a_policy(vlatool, policy_template, float_bun
     assert code == 0
     assert "100.0% float32 of the MACs" in out
     graph = "graphs/main.onnx"
+    assert f" 1.2.0, graphs {float_bundle.manifest.files[graph].bytes / 1e6:.2f} MB, in all " in out
     assert (tmp_path / "out" / graph).read_bytes() == (float_bundle.path / graph).read_bytes()
 
 
