@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from vlatool.judge import Judged, p50
@@ -45,17 +46,15 @@ def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False, e
 def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged, str, tuple[str, ...]]:
     """Return the candidate that misses the limits by least, and what is said of all of them.
 
-    Where that is not even faster, and float32 keeps to the limits, float32 is returned.
+    Where none could be judged, and float32 keeps to the limits, float32 is returned.
     """
     quantized = [item for item in judged if item.row.role != "baseline"]
     best, base = min(quantized, key=lambda item: (item.miss, p50(item.row, origin))), judged[0]
     missed = tuple(f"{item.row.name}: {item.row.reason}." for item in quantized)
-    if base.within and origin == "measured" and not is_faster(best.row, base.row):
-        words = f"no candidate keeps to the limits, and the nearest, {best.row.name}, is"
-        speed = speed_words(best.row, base.row, elsewhere)
-        board = foretold(base.row, base.row, elsewhere)
-        first = f"{base.row.name} was kept: {words} {speed}.{board}"
-        return base, f"{words} not shown to be faster; {base.row.reason}", (first, *missed)
+    if base.within and math.isinf(best.miss):
+        words = "no candidate could be judged"
+        first = f"{base.row.name} was kept: {words}.{foretold(base.row, base.row, elsewhere)}"
+        return base, f"{words}; {base.row.reason}", (first, *missed)
     sentences = (
         f"No candidate keeps to the limits; the nearest, {best.row.name}, was kept."
         + (f" It is {speed_words(best.row, judged[0].row, elsewhere)}." if elsewhere and origin == "measured" else "")

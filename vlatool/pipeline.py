@@ -189,7 +189,8 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
     confined to compute as the board does, all of it runs in a process that has the variable from its start.
 
     Returns:
-        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept), ``inconclusive``
+        The report; verdict ``fail`` when no candidate keeps to the limits (the nearest one is kept, or
+        float32 where none could be judged), ``inconclusive``
         when float32 does no better than actions that do not look at the observation.
     """
     with writing(out, force=force) as draft:
@@ -268,7 +269,8 @@ def judged_rows(
 def verdict_of(judged: list[Judged], trust: Credibility) -> str:
     """Return ``pass``, ``fail``, or ``inconclusive`` where nothing can be held against the reference."""
     chosen = next(item for item in judged if item.row.role == "chosen")
-    return "inconclusive" if trust.fails else "pass" if chosen.within else "fail"
+    kept = chosen.within and any(item.within for item in judged[1:])
+    return "inconclusive" if trust.fails else "pass" if kept else "fail"
 
 
 def _needs(bundle: Bundle) -> tuple[str, ...]:
