@@ -25,7 +25,7 @@ def bundle_of(folder: Path, text: str, said: list[str] | None = None) -> Bundle:
     [
         ("g (float[3,5] x, float[5] z) => (float[3,5] y) { y = Add(x, z) }", [(1, 3, 5), (1, 5), (1, 3, 5)], 3),
         ("g (float[5] x, float[1,5] z) => (float[1,5] y) { y = Add(x, z) }", [(1, 5), (1, 5), (1, 5)], 1),
-        ("g (float[4] x, float[4] z) => (float[4] y) { x_observed = Neg(x)  y = Add(x_observed, z) }",
+        ("g (float[4] x, float[4] z) => (float[4] y) { x_observed_0 = Neg(x)  y = Add(x_observed_0, z) }",
          [(1, 4), (1, 4), (1, 4)], 1),
         ("g (float[2,5] x, float[N,5] z) => (float[M,5] y) { y = Concat<axis=0>(x, z) }",
          [(1, 2, 5), (1, 5), (1, 3, 5)], 3),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import GraphError
+from vlatool.hwselect._shapes import nodes_inside
 
 DRAWING = {
     "RandomNormal": "normal", "RandomNormalLike": "normal", "RandomUniform": "uniform", "RandomUniformLike": "uniform",
@@ -75,9 +76,7 @@ def _nodes(nodes: Sequence[Any]) -> Iterator[Any]:
     """Yield nodes and those of the graphs inside of them."""
     for node in nodes:
         yield node
-        for attribute in node.attribute:
-            for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
-                yield from _nodes(inner.node)
+        yield from nodes_inside(node)
 
 
 def _static(value: Any) -> tuple[int, ...]:

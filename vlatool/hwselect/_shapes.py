@@ -123,7 +123,7 @@ class Tensors:
     def hidden(self, operators: set[str]) -> Iterator[str]:
         """Yield the names of nodes that run such operators inside (branches and loops), which nothing here counts."""
         for node in self.nodes:
-            if any(inner.op_type in operators for inner in _inside(node)):
+            if any(inner.op_type in operators for inner in nodes_inside(node)):
                 yield node.name or node.output[0]
 
 
@@ -185,9 +185,10 @@ def bits(dtype: str) -> int:
     return int("".join(character for character in dtype if character.isdigit()) or 8)
 
 
-def _inside(node: Any) -> Iterator[Any]:
+def nodes_inside(node: Any) -> Iterator[Any]:
+    """Yield the nodes of the graphs inside of a node (If, Loop, Scan), and of those inside of them."""
     for item in node.attribute:
         for graph in (item.g, *item.graphs):
             for inner in graph.node:
                 yield inner
-                yield from _inside(inner)
+                yield from nodes_inside(inner)

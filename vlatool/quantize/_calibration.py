@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle import Bundle
-from vlatool.data import calibration_recording, doubts, observations_for
+from vlatool.data import calibration_recording, doubts
 from vlatool.errors import DataError
-from vlatool.finish import TRIALS
 from vlatool.quantize._calibrate import Wanted, calibrate
 from vlatool.quantize._graphs import Quantization
 from vlatool.quantize._ranges import Statistics
@@ -40,10 +39,6 @@ class Calibrated(Quantization):
         super().check(source, profile)
         if source is not None and calibration_recording(source, self.calibration) is None:
             raise self._missing(source)
-
-    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return recorded observations: drawn ones, of which ids are zero, do not show all that engines do wrong."""
-        return observations_for(bundle, TRIALS, self.calibration)
 
     def observed(self, bundle: Bundle, seen: SampleSet) -> tuple[list[int], Iterator[Mapping[str, Any]]]:
         """Return the numbers of the calibration samples and an iterator over them; warn of what makes them unreliable.

@@ -113,8 +113,12 @@ class Quantization(Transform):
         return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)
 
     def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return observations, the first of which become golden; all are looked at where the engine differs."""
-        return observations_for(bundle, TRIALS)
+        """Return observations, the first of which become golden; all are looked at where the engine differs.
+
+        They are those that the stage was given, where it takes any: drawn ones, of which ids are zero, do not show all
+        that engines do wrong.
+        """
+        return observations_for(bundle, TRIALS, getattr(self, "calibration", None))
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs that are quantized."""

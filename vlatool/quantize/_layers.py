@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from vlatool.errors import GraphError, require
+from vlatool.hwselect._shapes import nodes_inside
 from vlatool.quantize._nodes import reads, varying
 from vlatool.quantize._value_types import FLOAT, float_names
 
@@ -245,20 +246,12 @@ def split_gemm(model: Any) -> int:
 def part_inner_gemms(model: Any) -> None:
     """Give every Gemm inside an If, Loop or Scan that transposes a weight of the graph a copy of its own, in place."""
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
-    for number, node in enumerate(_inner_nodes(model.graph.node)):
+    for number, node in enumerate(inner for outer in model.graph.node for inner in nodes_inside(outer)):
         turned = node.op_type == "Gemm" and any(item.name == "transB" and item.i for item in node.attribute)
         if turned and node.input[1] in constants:
             copy = model.graph.initializer.add()
             copy.CopyFrom(constants[node.input[1]])
             copy.name = node.input[1] = f"{copy.name}.{number}"
-
-
-def _inner_nodes(nodes: Iterable[Any]) -> Iterator[Any]:
-    for node in nodes:
-        for item in node.attribute:
-            for graph in (item.g, *item.graphs):
-                yield from graph.node
-                yield from _inner_nodes(graph.node)
 
 
 def _readers(model: Any) -> dict[str, list[Any]]:

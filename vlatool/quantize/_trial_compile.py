@@ -28,10 +28,9 @@ def compile_apart(path: Path) -> None:
     Raises:
         GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
     """
-    done = subprocess.run(python_code(CODE, [str(path)]), capture_output=True, check=False)
-    if done.returncode < 0:
+    if signal := _killed_by(CODE, path):
         raise GraphError(
-            f"OpenVINO crashes (signal {-done.returncode}) when it compiles {path.name} with these layers in int8.",
+            f"OpenVINO crashes (signal {signal}) when it compiles {path.name} with these layers in int8.",
             "quantize fewer: leave out --elementwise or --attention, or use --exclude",
         )
 
@@ -42,9 +41,14 @@ def open_apart(path: Path) -> None:
     Raises:
         GraphError: when the child was killed by a signal; a refusal is left to the engine's own message.
     """
-    done = subprocess.run(python_code(OPEN, [str(path)]), capture_output=True, check=False)
-    if done.returncode < 0:
+    if signal := _killed_by(OPEN, path):
         raise GraphError(
-            f"ONNX Runtime crashes (signal {-done.returncode}) when it opens {path.name} with these layers in float16.",
+            f"ONNX Runtime crashes (signal {signal}) when it opens {path.name} with these layers in float16.",
             "leave layers beside a Transpose in float32 with --exclude, or use another method",
         )
+
+
+def _killed_by(code: str, path: Path) -> int:
+    """Return the signal that ends a child which runs the code on a graph; 0 when none does."""
+    done = subprocess.run(python_code(code, [str(path)]), capture_output=True, check=False)
+    return max(0, -done.returncode)

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from vlatool.bundle import Bundle
+from vlatool.data import observations_for
 from vlatool.errors import GraphError, require
+from vlatool.finish import TRIALS
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._graphs import Quantization, foreign_errors, load, save
+from vlatool.quantize._graphs import foreign_errors, load, save
 from vlatool.quantize._layers import find_layers
 from vlatool.quantize._nodes import reads
 from vlatool.quantize._ranges import Statistics
@@ -97,7 +99,7 @@ class SmoothQuant(Calibrated):
 
     def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
         """Return those of the bundle that is smoothed, whose golden action must stay."""
-        return Quantization.golden(self, bundle)
+        return observations_for(bundle, TRIALS)
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what a person wants to know about the new bundle."""

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from vlatool.bundle import Bundle, hash_file, write_manifest
-from vlatool.data import observations_for, recorded_observations
+from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
-from vlatool.finish import SEED, TRIALS, carry_over, finish, history
+from vlatool.finish import SEED, carry_over, finish, history
 from vlatool.manifest import FileRecord, Graph, Manifest
 from vlatool.quantize._blocks import Format
 from vlatool.quantize._compute import records_of
@@ -132,10 +132,6 @@ class WeightOnly(Quantization):
             context.tell("running the quantized graphs", None)
             return finish(bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle))
         return _sealed(bundle, out, written, made_by, graphs)
-
-    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return recorded observations where there are any."""
-        return observations_for(bundle, TRIALS, self.calibration)
 
     @property
     def form(self) -> Format:

@@ -6,7 +6,7 @@ Of a file, what need not be looked at is not even read: the data of large tensor
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from vlatool.errors import GraphError
 from vlatool.limits import check, limit
@@ -58,6 +58,9 @@ class OpenFile:
         return self._part[start - self._at : end - self._at]
 
 
+MayHold = Callable[[bytes | OpenFile, int, int], bool]
+
+
 def external_files(model: bytes | OpenFile) -> set[str]:
     """Return the locations of all external data that a serialized ``ModelProto`` names, as they stand there.
 
@@ -72,9 +75,23 @@ def external_files(model: bytes | OpenFile) -> set[str]:
         >>> external_files(b"")
         set()
     """
-    found: set[str] = set()
+    entries = (place for message, *place in messages(model, _may_name) if message == STRING_ENTRY)
+    return {name for start, end in entries for name in _location(model, start, end)}
+
+
+def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, int, int]]:
+    """Yield what every message in a serialized ``ModelProto`` is, where it starts and where it ends (``MESSAGES``).
+
+    Args:
+        model: The bytes.
+        may_hold: Of the bytes and the place of a message, whether to go into it.
+
+    Raises:
+        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth`` or have more parts
+            than ``graph_fields``.
+    """
     seen, most = 0, limit("graph_fields")
-    levels = [("ModelProto", parts(model, 0, len(model)))] if _may_name(model, 0, len(model)) else []
+    levels = [("ModelProto", parts(model, 0, len(model)))] if may_hold(model, 0, len(model)) else []
     while levels and seen <= most:
         message, fields = levels[-1]
         field, start, end = next(fields, (0, 0, 0))
@@ -82,13 +99,12 @@ def external_files(model: bytes | OpenFile) -> set[str]:
         inner = MESSAGES[message].get(field)
         if not field:
             levels.pop()
-        elif inner == STRING_ENTRY:
-            found |= _location(model, start, end)
-        elif inner and _may_name(model, start, end):
-            levels.append((inner, parts(model, start, end)))
-            check("graph_depth", len(levels), "The graph", GraphError)
+        elif inner:
+            yield inner, start, end
+            if inner in MESSAGES and may_hold(model, start, end):
+                levels.append((inner, parts(model, start, end)))
+                check("graph_depth", len(levels), "The graph", GraphError)
     check("graph_fields", seen, "The graph", GraphError)
-    return found
 
 
 def _may_name(model: bytes | OpenFile, start: int, end: int) -> bool:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from vlatool.errors import GraphError
-from vlatool.limits import check
-from vlatool.runtime.external_data import LENGTH, MESSAGES, SMALL, VARINT, OpenFile, parts, varint
+from vlatool.runtime.external_data import LENGTH, SMALL, VARINT, OpenFile, messages, varint
 
 FLOAT8 = (17, 18, 19, 20)
 """``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
@@ -24,7 +22,8 @@ def has_float8(model: Path | bytes) -> bool:
     an attribute alone, opset 21).
 
     Raises:
-        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth``.
+        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth`` or have more parts
+            than ``graph_fields``.
         OSError: when there is no such file.
 
     Example:
@@ -41,18 +40,8 @@ def has_float8(model: Path | bytes) -> bool:
 
 
 def _holds(model: bytes | OpenFile) -> bool:
-    left = [("ModelProto", 0, len(model), 1)]
-    while left:
-        message, start, end, depth = left.pop()
-        check("graph_depth", depth, "The graph", GraphError)
-        if message == "TensorProto":
-            if _data_type(model[start : min(end, start + SMALL)]) in FLOAT8:
-                return True
-        elif _may_hold(model, start, end):
-            inner = MESSAGES.get(message, {})
-            found = parts(model, start, end)
-            left += [(inner[field], at, to, depth + 1) for field, at, to in found if field in inner]
-    return False
+    tensors = (place for message, *place in messages(model, _may_hold) if message == "TensorProto")
+    return any(_data_type(model[start : min(end, start + SMALL)]) in FLOAT8 for start, end in tensors)
 
 
 def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vlatool.errors import require
+from vlatool.quantize._nodes import free_name
 
 
 def add_batch_axes(model: Any) -> list[str]:
@@ -26,15 +27,15 @@ def add_batch_axes(model: Any) -> list[str]:
     outputs = [value for value in graph.output if _lacks_batch(value)]
     helper = require("onnx.helper", "build")
     taken = stored | {name for node in graph.node for name in (*node.input, *node.output)}
-    axes = _free("batch_axis", taken)
+    axes = free_name("batch_axis", 0, taken)
     graph.initializer.append(helper.make_tensor(axes, 7, [1], [0]))
     before, after = [], []
     for value in inputs:
-        inner = _free(f"{value.name}_observed", taken)
+        inner = free_name(f"{value.name}_observed", 0, taken)
         _rename_reads(graph, value.name, inner)
         before.append(helper.make_node("Squeeze", [value.name, axes], [inner], f"{value.name}/Squeeze"))
     for value in outputs:
-        inner = _free(f"{value.name}_given", taken)
+        inner = free_name(f"{value.name}_given", 0, taken)
         _rename_reads(graph, value.name, inner)
         for node in graph.node:
             node.output[:] = [inner if name == value.name else name for name in node.output]
@@ -68,11 +69,3 @@ def _rename_reads(graph: Any, old: str, new: str) -> None:
         for attribute in node.attribute:
             for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
                 _rename_reads(inner, old, new)
-
-
-def _free(wanted: str, taken: set[str]) -> str:
-    name = wanted
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
