@@ -18,10 +18,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from vlatool import errors, gate, manifest, registry, report, spec
+from vlatool import errors, registry, report
+from vlatool.bundle import manifest, spec
 from vlatool.cli._schemas import COMMANDS, definitions
-from vlatool.profile import load_profile, names
-from vlatool.stage import Stage, stage_kinds
+from vlatool.gate import config
+from vlatool.hardware.profile import load_profile, names
+from vlatool.stage.base import Stage, stage_kinds
 
 REFERENCE = Path(__file__).parent / "reference"
 NOTE = "<!-- written by docs/generate.py from the code; do not edit -->\n"
@@ -68,13 +70,19 @@ def gate_page() -> str:
     """Return a section for each claim of a gate file."""
     top = "What `vlatool gate` examines ([guide](../guides/gate.md)): `schema: 1`, `baseline: PATH`, and these claims;"
     off = [
-        f"`{name}`" for name, field in gate.Gate.model_fields.items() if field.default is None and name != "baseline"
+        f"`{name}`" for name, field in config.Gate.model_fields.items() if field.default is None and name != "baseline"
     ]
     parts = [f"# gate.yaml\n\n{top}\none that is null is not examined. Null when nothing is said: {', '.join(off)}.\n"]
-    for claim in (gate.LatencyClaim, gate.AccuracyClaim, gate.AnswersClaim, gate.GrowthClaim, gate.DeadlineClaim):
-        names = [name for name, field in gate.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
+    for claim in (
+        config.LatencyClaim,
+        config.AccuracyClaim,
+        config.AnswersClaim,
+        config.GrowthClaim,
+        config.DeadlineClaim,
+    ):
+        names = [name for name, field in config.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
         parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")
-    told = gate.Gate.model_fields["accept"].description
+    told = config.Gate.model_fields["accept"].description
     parts.append(
         f"## accept\n\n`accept: [engine-difference]`: {told}; see `vlatool inspect`. None when nothing is said.\n"
     )

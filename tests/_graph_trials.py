@@ -12,13 +12,13 @@ import numpy as np
 import onnx
 from _random_graphs import RandomGraph
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
-from vlatool.launch import run_transform
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.onnx import OnnxFile
-from vlatool.stage import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.run import run_transform
 
 INT4, INT8 = 0.6, 0.15
 """Largest relative L2 drift from float32 of graphs of a few random layers."""

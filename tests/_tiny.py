@@ -196,7 +196,7 @@ def observations(count: int, seed: int) -> dict[str, Any]:
 
 def with_expert(recorded: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Give recorded samples the actions of the expert in a policy's folder, whose hand shakes a little."""
-    from vlatool.sources._factory import call_factory
+    from vlatool.module.factory import call_factory
 
     seen = [{name: recorded[name][index] for name in ("image", "proprio", "instruction")}
             for index in range(len(recorded["image"]))]  # fmt: skip

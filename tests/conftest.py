@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from _tiny import observations, write_policy
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 COLUMNS = (
@@ -89,7 +89,7 @@ def policy_dir(policy_template: Path, tmp_path: Path) -> Path:
 def source_bundle(policy_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The source bundle of the tiny policy; read only."""
     from vlatool.sources.torch_module import TorchModule
-    from vlatool.stage import Context
+    from vlatool.stage.base import Context
 
     out = tmp_path_factory.mktemp("source") / "bundle"
     out.mkdir()
@@ -100,7 +100,7 @@ def source_bundle(policy_template: Path, tmp_path_factory: pytest.TempPathFactor
 def float_bundle(source_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The tiny policy as exported, float32; read only."""
     from vlatool.export.onnx import ExportOnnx
-    from vlatool.stage import Context
+    from vlatool.stage.base import Context
 
     out = tmp_path_factory.mktemp("float") / "bundle"
     out.mkdir()
@@ -111,7 +111,7 @@ def float_bundle(source_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory
 def int8_bundle(float_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """The tiny policy in static int8; read only."""
     from vlatool.quantize.static_int8 import StaticInt8
-    from vlatool.stage import Context
+    from vlatool.stage.base import Context
 
     out = tmp_path_factory.mktemp("int8") / "bundle"
     out.mkdir()

@@ -22,15 +22,15 @@ import pytest
 import yaml
 from _edits import put, take
 
-from vlatool.bundle import DIGEST, MANIFEST, Bundle, digest_of, seal
+from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle, digest_of, seal
 from vlatool.cli import main
 from vlatool.errors import VlatoolError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.launch import run_transform
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage import Context
+from vlatool.stage.base import Context
+from vlatool.stage.run import run_transform
 
 Line = list[Any]
 BOARD = ["--profile", "raspberry-pi-5"]

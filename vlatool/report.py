@@ -136,7 +136,7 @@ class Report:
         limits: Limit name -> the value that was asked for, with its unit in the name.
         command: The command line that made the report.
         created: UTC time, ISO 8601.
-        environment: The machine, its state and the versions (see ``vlatool.host``).
+        environment: The machine, its state and the versions (see ``vlatool.machine.host``).
         warnings: What a reader should know before trusting the numbers, with the remedy.
         schema: Version of this format.
         validity: Whether the measurement can be trusted: ``valid``, ``suspect``, ``invalid``; empty when not judged.

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from vlatool.benchmark._contest import BLOCKS, Contestant, latency_measurements, speedup, unique_names
-from vlatool.benchmark._memory import peak_rss_mb, resident_mb
-from vlatool.benchmark._probe import cold_start, main
 from vlatool.benchmark.latency import Latency, processors
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, ProfileError, UsageError
-from vlatool.hwselect._workload import workload
-from vlatool.stage import Context
+from vlatool.graph.workload import workload
+from vlatool.measurement.cold_start import cold_start, main
+from vlatool.measurement.interleaved import BLOCKS, Contestant, latency_measurements, speedup, unique_names
+from vlatool.measurement.memory import peak_rss_mb, resident_mb
+from vlatool.stage.base import Context
 
 PROBED = {"import_ms", "engine_ms", "load_ms", "first_ms", "peak_rss_mb", "rss_mb"}
 
@@ -180,7 +180,7 @@ def test_the_probe_runs_in_a_fresh_process(int8_bundle):
 
 
 def test_the_probe_prints_one_line_of_json(int8_bundle):
-    command = [sys.executable, "-m", "vlatool.benchmark._probe", str(int8_bundle.path), "ort_cpu", "1"]
+    command = [sys.executable, "-m", "vlatool.measurement.cold_start", str(int8_bundle.path), "ort_cpu", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert set(json.loads(done.stdout)) == PROBED | {"begun_ns", "acted_ns"}
 
@@ -195,7 +195,7 @@ def test_the_probe_in_this_process(float_bundle):
 
 
 def test_a_bundle_without_golden_values_is_probed_on_another_observation(float_bundle, copied):
-    from vlatool.bundle import seal
+    from vlatool.bundle.bundle import seal
 
     bare = copied(float_bundle)
     seal(bare.path, replace(bare.manifest, golden=""))
@@ -250,23 +250,23 @@ def test_a_sustained_run_lasts_and_compares(float_bundle):
 
 
 def test_an_invalid_measurement_decides_nothing(float_bundle, monkeypatch):
-    from vlatool.benchmark import _agent
+    from vlatool.measurement import agent
 
-    honest = _agent.measure
+    honest = agent.measure
 
     def strays(job, tell):
         found = honest(job, tell)
         found["policies"][0]["answers"]["strays"] = 7
         return found
 
-    monkeypatch.setattr(_agent, "measure", strays)
+    monkeypatch.setattr(agent, "measure", strays)
     report = benchmarked(float_bundle)
     assert (report.verdict, report.validity) == ("inconclusive", "invalid")
     assert "The measurement is invalid" in report.summary[0]
 
 
 def test_a_board_is_emulated_with_its_processors_and_memory(float_bundle):
-    from vlatool.profile import load_profile
+    from vlatool.hardware.profile import load_profile
 
     board = load_profile("raspberry-pi-5")
     stage = Latency(emulate=True, iterations=20, duration=0, cold=False, threads=1)
@@ -287,8 +287,8 @@ def test_a_board_is_emulated_with_its_processors_and_memory(float_bundle):
 
 
 def test_a_job_runs_elsewhere_where_the_context_says_so(float_bundle):
-    from vlatool.benchmark._agent import measure
-    from vlatool.benchmark._job import Job
+    from vlatool.measurement.agent import measure
+    from vlatool.measurement.job import Job
 
     asked = []
 
@@ -326,8 +326,8 @@ def test_processors_are_read_as_lists_of_ranges(text, wanted):
 
 
 def test_what_the_engine_logs_is_kept(float_bundle):
-    from vlatool.benchmark._agent import measure
-    from vlatool.benchmark._job import Job
+    from vlatool.measurement.agent import measure
+    from vlatool.measurement.job import Job
 
     def elsewhere(job, bundles, tell):
         return {**measure(Job.from_dict(job), tell), "log": "".join(f"warning {number}\n" for number in range(50))}

@@ -5,11 +5,12 @@ import onnx.parser
 import pytest
 
 from vlatool.benchmark.overhead import Overhead
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import UsageError
-from vlatool.manifest import Graph, Manifest, ProgramStep
-from vlatool.spec import PolicySpec, TensorSpec
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 
 def test_the_overhead_is_the_median_over_pairs_of_rounds(float_bundle):

@@ -11,7 +11,7 @@ import psutil
 import pytest
 from _processes import below
 
-from vlatool.benchmark._agent import WORKER
+from vlatool.measurement.agent import WORKER
 from vlatool.report import Report
 
 QUICK = ["--iterations", 20, "--duration", 0, "--no-cold", "--no-phase"]

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from vlatool.cli.cache import _human
-from vlatool.in_use import release
-from vlatool.launch import cached_transform
+from vlatool.files.locks import release
 from vlatool.quantize.dynamic_int8 import DynamicInt8
-from vlatool.stage import Context
+from vlatool.stage.base import Context
+from vlatool.stage.run import cached_transform
 
 
 @pytest.fixture

@@ -14,18 +14,18 @@ from typing import Any
 import pytest
 
 from vlatool import __version__, cli, registry
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main
 from vlatool.cli._console import command_line, leave, progress
 from vlatool.cli._stages import DEFAULTS
 from vlatool.cli.optimize import share
 from vlatool.errors import GateFailed, GraphError, Inconclusive, UsageError
-from vlatool.finish import save_npz
-from vlatool.npz_files import open_npz
-from vlatool.profile import names
+from vlatool.files.npz import open_npz
+from vlatool.hardware.profile import names
 from vlatool.report import Measurement, Report, Row, read_report
 from vlatool.runtime import load
-from vlatool.stage import Context
+from vlatool.stage.base import Context
+from vlatool.stage.finish import save_npz
 
 FAST = ["--iterations", "20", "--duration", "0", "--no-cold"]
 

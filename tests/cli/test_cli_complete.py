@@ -13,8 +13,8 @@ from typer._completion_classes import BashComplete
 
 from vlatool import registry
 from vlatool.cli import app
-from vlatool.platforms import platform_names
-from vlatool.profile import names
+from vlatool.hardware.platforms import platform_names
+from vlatool.hardware.profile import names
 
 
 @pytest.fixture

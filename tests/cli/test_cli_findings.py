@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 
 RECIPE = "candidates: {mine: [quantize.dynamic_int8: {}]}\nlimits: {max_drop: 1.0, hz: 1000000}\n"
 

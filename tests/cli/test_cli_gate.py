@@ -9,10 +9,9 @@ from xml.etree import ElementTree
 
 import pytest
 
-from vlatool import run_gate
-from vlatool.benchmark._agreement import run_agreement
-from vlatool.benchmark._pairs import Pairs
-from vlatool.claims import _timed
+from vlatool.gate import run, timed
+from vlatool.measurement.agreement import run_agreement
+from vlatool.measurement.pairs import Pairs
 
 QUICK = "{latency: {looks: [10]}, memory: null}"
 
@@ -23,11 +22,11 @@ def slowdown(monkeypatch: pytest.MonkeyPatch):
 
     def make(share: float) -> None:
         monkeypatch.setattr(
-            _timed,
+            timed,
             "measure_pairs",
             lambda job, timeout: Pairs((2.0,) * 50, (2.0 * (1 + share) + 1e-4 * (job.seed % 10),) * 50),
         )
-        monkeypatch.setattr(run_gate, "measure_agreement", lambda job, timeout: run_agreement(job))
+        monkeypatch.setattr(run, "measure_agreement", lambda job, timeout: run_agreement(job))
 
     return make
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlatool.profile import load_profile, names
+from vlatool.hardware.profile import load_profile, names
 from vlatool.report import Report, read_report
 
 SMALL = ["--boards", "raspberry-pi-5", "--boards", "jetson-orin-nano", "--boards", "raspberry-pi-5-hailo8"]

@@ -321,7 +321,7 @@ def test_a_bug_is_a_document(vlatool, monkeypatch) -> None:
     def fault() -> None:
         raise KeyError("a key that nobody has")
 
-    monkeypatch.setattr("vlatool.doctor.diagnose", fault)
+    monkeypatch.setattr("vlatool.doctor.doctor.diagnose", fault)
     status, told, _ = vlatool("doctor", "--json")
     validate(told, "failed")
     assert (status, told["error"]["type"], told["error"]["exit_code"]) == (70, "InternalError", 70)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 
 SMOOTH = "candidates: {smooth: [quantize.smooth_quant: {}]}\neffort: {episodes: 0, iterations: 20}\n"
 RECIPE = """\

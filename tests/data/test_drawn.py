@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import Drawer, read_drawn, read_recording, save_drawn
 from vlatool.data._drawn import EXTREME, words_of
 from vlatool.errors import DataError
-from vlatool.manifest import Manifest
-from vlatool.spec import PolicySpec, TensorSpec
 
 VOCABULARY = {"go", "to", "the", "red", "blue", "ball", "box"}
 

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import npz, observations_for, read_recording, recorded_observations, synthetic_observations
 from vlatool.errors import DataError
-from vlatool.manifest import Manifest
-from vlatool.spec import PolicySpec, TensorSpec
 
 COUNT = 6
 SPEC = PolicySpec(

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pytest
 
+from vlatool.accuracy.outcome import Outcome
+from vlatool.accuracy.paired import compare_success, success_row
 from vlatool.data import observations_for
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
 from vlatool.evaluate import _controls, _episodes
-from vlatool.evaluate._episodes import Job, Outcome, run_jobs
-from vlatool.evaluate._paired import compare_success, success_row
+from vlatool.evaluate._episodes import Job, run_jobs
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.report import Row
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 WORLD = """\
 import numpy as np
@@ -218,7 +219,7 @@ def test_what_is_named_wrongly_is_said(int8_bundle, policy_template, options, er
 def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
     from dataclasses import replace
 
-    from vlatool.bundle import Bundle
+    from vlatool.bundle.bundle import Bundle
 
     bare = Bundle(int8_bundle.path, replace(int8_bundle.manifest, environment={}))
     for stage in (ClosedLoop(), ClosedLoop(environment="a.py:make"), ClosedLoop(tasks=("reach",))):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError
 from vlatool.evaluate._environment import World
 from vlatool.evaluate._episodes import Job, run_jobs
-from vlatool.spec import PolicySpec, TensorSpec
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 GOOD = """\
 import numpy as np

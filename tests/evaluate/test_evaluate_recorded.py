@@ -10,14 +10,14 @@ from functools import partialmethod
 import numpy as np
 import pytest
 
-from vlatool.bundle import Bundle, restate, seal
+from vlatool.bundle.bundle import Bundle, restate, seal
+from vlatool.bundle.spec import TensorSpec
 from vlatool.data import evaluation_recording, recorded_observations
 from vlatool.errors import DataError, GraphError
 from vlatool.evaluate import recorded
 from vlatool.evaluate.recorded import Recorded, compare, run_recorded
 from vlatool.runtime import Policy, load
-from vlatool.spec import TensorSpec
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 ARM = TensorSpec("action", (1, 2, 2), labels=("dx", "gripper"), unit=("m", "1"))
 TURN = TensorSpec("action", (1, 3), kind="discrete", labels=("left", "right", "forward"))

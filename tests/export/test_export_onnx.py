@@ -5,18 +5,18 @@ import numpy as np
 import onnx
 import pytest
 
-from vlatool.benchmark._job import Job
-from vlatool.benchmark._worker import measure, opened
-from vlatool.bundle import Bundle, hash_file
+from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
-from vlatool.export._torch_policy import load_modules, torch_policy
 from vlatool.export.onnx import ExportOnnx
+from vlatool.measurement.job import Job
+from vlatool.measurement.worker import measure, opened
+from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage import Context, build_stage
+from vlatool.stage.base import Context, build_stage
 
 PLAIN_YAML = """\
 name: plain

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.export.onnx import ExportOnnx
 from vlatool.quantize.float8 import Float8
 from vlatool.quantize.static_int8 import StaticInt8
@@ -17,7 +17,7 @@ from vlatool.quantize.weight_only import WeightOnly
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 GRU = """\
 import torch

@@ -15,7 +15,7 @@ from _guide import GUIDES, GuideError, commands, files, follow
 from _verdict import BARE, FAULT, REFUSED, WORKS, WRONG, Verdict, judge, markdown
 from table import rows_of
 
-from vlatool.sources._description import read_description
+from vlatool.module.description import read_description
 
 PLAIN = Cell("quantize float16", ("quantize", "float16"))
 MEASURED = Cell("infer float16", ("bundle", "policy", ""), ANSWERS, drift=0.02)

@@ -5,7 +5,7 @@ import subprocess
 import gate_samples
 import pytest
 
-from vlatool.gate import read_gate
+from vlatool.gate.config import read_gate
 
 
 @pytest.fixture

@@ -52,7 +52,7 @@ def make(workload: Workload, name: str) -> None:
 def open_bundle(workload: Workload, path: Path) -> tuple[Infer, list[Feeds]]:
     """Open a bundle as a controller does; return one inference, the runtime's work included, and raw observations."""
     import vlatool.runtime
-    from vlatool.bundle import Bundle
+    from vlatool.bundle.bundle import Bundle
     from vlatool.data import read_recording
 
     policy = vlatool.runtime.load(path, threads=1)

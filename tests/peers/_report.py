@@ -12,7 +12,7 @@ import numpy as np
 from _interleave import CLOCKS, Contestant
 from _workload import Array
 
-from vlatool.statistics import quantile_interval
+from vlatool.stats.intervals import quantile_interval
 
 TOLERANCE = 0.02
 """Share of the latency within which two contestants count as equally fast."""

@@ -76,7 +76,7 @@ class Workload:
                 self._encode(draft)
 
     def _encode(self, file: Path) -> None:
-        from vlatool.bundle import Bundle
+        from vlatool.bundle.bundle import Bundle
         from vlatool.data import read_recording
         from vlatool.runtime.observation import ObservationEncoder
 

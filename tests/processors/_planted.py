@@ -16,9 +16,9 @@ import onnx
 from _variants import VariantError
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.finish import GOLDEN_COUNT, carry_over, finish
+from vlatool.stage.finish import GOLDEN_COUNT, carry_over, finish
 
 STEPS = 16.0
 """What the action is multiplied by before it becomes whole numbers."""

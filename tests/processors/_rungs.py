@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlatool.host import MAX_CPU_ISA
+from vlatool.machine.host import MAX_CPU_ISA
 
 CPUINFO = Path("/proc/cpuinfo")
 AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl")

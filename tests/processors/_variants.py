@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.finish import ROUNDING
+from vlatool.stage.finish import ROUNDING
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = ("sample_models/vln-babyai", "sample_models/vla-metaworld")
@@ -143,7 +143,7 @@ def observations(bundle: Path, count: int) -> tuple[dict[str, Any], int]:
     Raises:
         VariantError: when the bundle carries none.
     """
-    from vlatool.bundle import Bundle
+    from vlatool.bundle.bundle import Bundle
     from vlatool.data import EVALUATION, read_recording
 
     opened = Bundle.open(bundle)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from vlatool import registry
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.runtime import Policy, load
 from vlatool.runtime.policy import DEFAULT_ENGINE

@@ -25,8 +25,8 @@ from _rungs import CPUINFO, model
 from _variants import FLOAT, FOR_ARM, SAMPLES, Made, VariantError, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 
-from vlatool.finish import ROUNDING
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.stage.finish import ROUNDING
 
 CORES = ("cortex-a76", "cortex-a72")
 """Raspberry Pi 5, and Raspberry Pi 4, which has no dot product."""

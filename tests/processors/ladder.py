@@ -25,11 +25,11 @@ from _variants import FOR_X86, SAMPLES, Made, Variant, VariantError, make
 from _verdicts import Row, difference, exit_code, summed_up, table
 from answers import actions
 
-from vlatool.bundle import Bundle
-from vlatool.finish import reference_policy
-from vlatool.host import MAX_CPU_ISA, architecture
-from vlatool.runtime.engines._arithmetic import SATURATING, is_int8
-from vlatool.runtime.engines._reference import ReferenceSession
+from vlatool.bundle.bundle import Bundle
+from vlatool.machine.host import MAX_CPU_ISA, architecture
+from vlatool.runtime.arithmetic import SATURATING, is_int8
+from vlatool.runtime.engines import reference as as_written
+from vlatool.stage.finish import reference_policy
 
 X86 = "x86_64"
 """What can be emulated: QEMU runs the host's own Python on another processor."""
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Make, ask on every rung, compare, and print."""
     given = parsed(arguments)
     os.environ.pop(MAX_CPU_ISA, None)
-    if ReferenceSession.arithmetic() == SATURATING:
+    if as_written().arithmetic() == SATURATING:
         print("make ladder: int8 products saturate here, so there is nothing to hold bundles against", file=sys.stderr)
         return 1
     text = CPUINFO.read_text()

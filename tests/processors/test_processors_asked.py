@@ -8,10 +8,10 @@ import pytest
 from _asked import CRASHED, ask, how_it_ended, parsed, run
 from _planted import plant
 
-from vlatool.bundle import restate
-from vlatool.finish import ENGINE_DIFFERENCE, GOLDEN, save_npz
-from vlatool.npz_files import open_npz
+from vlatool.bundle.bundle import restate
+from vlatool.files.npz import open_npz
 from vlatool.runtime import load
+from vlatool.stage.finish import ENGINE_DIFFERENCE, GOLDEN, save_npz
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from _rungs import RUNGS
 from _variants import FLOAT, FOR_ARM, FOR_X86, Made, Variant, make, observations
 from arm64 import PLANTED, compared
 
-from vlatool.runtime.engines._arithmetic import EXACT, EXACT_BY_OPTION, SATURATING
+from vlatool.runtime.arithmetic import EXACT, EXACT_BY_OPTION, SATURATING
 
 ACTIONS = np.arange(1.0, 7.0).reshape(2, 3)
 

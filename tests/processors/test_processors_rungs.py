@@ -3,8 +3,8 @@
 import pytest
 from _rungs import RUNGS, flags, model
 
-from vlatool.host import MAX_CPU_ISA
-from vlatool.instruction_sets import RUNGS as SETS
+from vlatool.machine.host import MAX_CPU_ISA
+from vlatool.machine.instruction_sets import RUNGS as SETS
 
 LINES = """\
 processor\t: {number}

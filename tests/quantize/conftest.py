@@ -8,11 +8,11 @@ import numpy as np
 import onnx
 import pytest
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
-from vlatool.stage import Context, Transform
+from vlatool.stage.base import Context, Transform
 
 
 @pytest.fixture

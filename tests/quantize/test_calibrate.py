@@ -16,15 +16,16 @@ import onnxruntime
 import pytest
 from onnx import numpy_helper
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import FileRecord, Graph, Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import recorded_observations
 from vlatool.errors import DataError, GraphError
-from vlatool.manifest import FileRecord, Graph, Manifest, ProgramStep
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._ranges import Statistics
 from vlatool.runtime.observation import ObservationEncoder
-from vlatool.spec import PolicySpec, TensorSpec
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 WIDTH = 64
 LOOP = """(float[1,W] x, float[1,W] h, float[1] t) => (float[1,W] g)
@@ -168,7 +169,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 import test_calibrate as tests
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 def peak():
     return int(next(line for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line).split()[1])
 bundle = Bundle.open({bundle!r})

@@ -3,7 +3,7 @@ from pathlib import Path
 import onnx
 import pytest
 
-from vlatool.bundle import Bundle, hash_file
+from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import BundleError, GraphError, RecipeError
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 
@@ -92,8 +92,8 @@ def test_only_selected_graphs_are_quantized(float_bundle, quantized, tmp_path: P
     """A second graph that no step runs stays as it is."""
     from dataclasses import replace
 
-    from vlatool.bundle import seal
-    from vlatool.manifest import Graph
+    from vlatool.bundle.bundle import seal
+    from vlatool.bundle.manifest import Graph
 
     both = copied(float_bundle)
     (both.path / "graphs/other.onnx").write_bytes((both.path / "graphs/main.onnx").read_bytes())

@@ -18,18 +18,18 @@ import onnx.parser
 import pytest
 from onnx import numpy_helper
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.spec import TensorSpec
 from vlatool.cli import main
-from vlatool.data._doubts import _of_channels
+from vlatool.data._calibration_checks import _of_channels
 from vlatool.errors import VlatoolError
-from vlatool.launch import run_transform
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.sources.onnx import OnnxFile
-from vlatool.spec import TensorSpec
-from vlatool.stage import Context, Transform
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.run import run_transform
 
 Array = Any
 Change = Callable[[Array], Array] | None

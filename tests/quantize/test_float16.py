@@ -7,14 +7,14 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.errors import DataError, RecipeError
-from vlatool.quantize._beyond import find_beyond
+from vlatool.graph.files import load, save
 from vlatool.quantize._float16_graph import around, look_at_weights, phase_nodes, to_float16
-from vlatool.quantize._graphs import load, save
+from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize.float16 import Float16
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 HALF, FLOAT = TensorProto.FLOAT16, TensorProto.FLOAT
 

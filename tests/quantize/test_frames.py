@@ -8,10 +8,10 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+from vlatool.graph.layers import Style, find_layers
+from vlatool.graph.qdq import insert_qdq
 from vlatool.quantize._early import quantize_early
 from vlatool.quantize._frames import fold_frames
-from vlatool.quantize._layers import Style, find_layers
-from vlatool.quantize._qdq import insert_qdq
 
 RANDOM = np.random.default_rng(0)
 FRAME = RANDOM.integers(0, 256, (1, 8, 8, 3)).astype(np.uint8)

@@ -10,15 +10,15 @@ from _graph_trials import METHODS, float_graph, stage_of, trial
 from _random_graphs import RandomGraph
 from onnx import helper
 
-from vlatool.bundle import Bundle
-from vlatool.finish import reference_policy
-from vlatool.launch import run_transform
+from vlatool.bundle.bundle import Bundle
 from vlatool.quantize.float8 import Float8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
-from vlatool.stage import Context
+from vlatool.stage.base import Context
+from vlatool.stage.finish import reference_policy
+from vlatool.stage.run import run_transform
 
 WEIGHTS = ("int4", "int4-qdq", "hqq", "gptq", "gptq-qdq", "awq", "awq-qdq")
 SEEDS = (34, 50)

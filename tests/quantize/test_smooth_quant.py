@@ -7,16 +7,16 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from onnxruntime import InferenceSession
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph
 from vlatool.errors import BundleError, DataError, GraphError, RecipeError
-from vlatool.manifest import Graph
-from vlatool.quantize._graphs import load, save
-from vlatool.quantize._layers import find_layers
+from vlatool.graph.files import load, save
+from vlatool.graph.layers import find_layers
 from vlatool.quantize._smooth_groups import find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.quantize.smooth_quant import SmoothQuant, _Writer
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.stage import build_stage
+from vlatool.stage.base import build_stage
 
 WIDTH = 6
 RANDOM = 7

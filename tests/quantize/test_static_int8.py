@@ -5,13 +5,13 @@ import numpy as np
 import onnx
 import pytest
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import DataError, MissingExtra, RecipeError
-from vlatool.quantize import _pixels
+from vlatool.quantize import _conv1x1
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
-from vlatool.stage import build_stage
+from vlatool.stage.base import build_stage
 
 
 @pytest.fixture
@@ -152,15 +152,15 @@ def test_a_glob_that_matches_no_node_is_a_typing_error(quantized):
 
 
 def test_openvino_is_in_the_key_and_the_record_only_where_it_runs(quantized, float_bundle, monkeypatch):
-    from vlatool import stage
+    from vlatool.stage import base
 
     own, other = StaticInt8(samples=8, layout="openvino"), StaticInt8(samples=8, layout="qdq")
     assert "openvino" in quantized(own).manifest.made_by["versions"]
     assert "openvino" not in quantized(other).manifest.made_by["versions"]
     assert "openvino" in quantized(Bfloat16()).manifest.made_by["versions"]
     before = [each.key("x") for each in (own, other, Bfloat16())]
-    real = stage.installed_version
-    monkeypatch.setattr(stage, "installed_version", lambda name: "9" if name == "openvino" else real(name))
+    real = base.installed_version
+    monkeypatch.setattr(base, "installed_version", lambda name: "9" if name == "openvino" else real(name))
     assert [a == b for a, b in zip(before, (each.key("x") for each in (own, other, Bfloat16())), strict=True)] == [
         False,
         True,
@@ -184,7 +184,7 @@ def test_openvino_computes_what_the_int8_graph_says(quantized):
 
 
 def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operators, monkeypatch):
-    monkeypatch.setattr(_pixels, "FEWEST", 4)
+    monkeypatch.setattr(_conv1x1, "FEWEST", 4)
     options = {"layout": "openvino", "samples": 8}
     plain = quantized(StaticInt8(**options, activations="uint8"))
     written = quantized(StaticInt8(**options, convolutions=True))

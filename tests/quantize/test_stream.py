@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from vlatool.bundle import hash_file
+from vlatool.bundle.bundle import hash_file
 from vlatool.errors import GraphError, OutputError, SourceError
 from vlatool.quantize import _stream
 from vlatool.quantize._blocks import Format
@@ -24,8 +24,8 @@ from vlatool.quantize._records import Record
 from vlatool.quantize._rewrite import Task, block_task, copy_task
 from vlatool.quantize._stream import work_directory, write_records
 from vlatool.quantize._worker import serve
-from vlatool.sources._shards import StoredTensor, fingerprint, read_header, read_shards, reading, stored_array
-from vlatool.stage import Tell
+from vlatool.stage.base import Tell
+from vlatool.weights.shards import StoredTensor, fingerprint, read_header, read_shards, reading, stored_array
 
 FORM = Format()
 

@@ -12,18 +12,18 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli.inspect import describe
 from vlatool.data import synthetic_observations
 from vlatool.errors import BundleError, DataError, GraphError, OutputError, RecipeError, SourceError
-from vlatool.launch import run_transform
 from vlatool.quantize.weight_only import LOSSES, WEIGHTS, WeightOnly
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.samples._language import DecoderShape
 from vlatool.samples._llama import make, write_llama
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage import Context, build_stage
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import run_transform
 
 SHAPE = DecoderShape(width=128, layers=2, heads=4, shared_heads=2, head_width=32, hidden=352)
 TOKENS = 6

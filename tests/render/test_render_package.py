@@ -10,9 +10,9 @@ from _render_reports import KINDS, optimize
 
 from vlatool import registry
 from vlatool.errors import OutputError, UsageError
+from vlatool.files.writing import writing
 from vlatool.render import FILES, _format, _samples, _scatter, _svg, _tables, render, write_reports
 from vlatool.report import Measurement, Report, Row, read_report
-from vlatool.writing import writing
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ import numpy as np
 import onnx
 import onnx.parser
 
-from vlatool.bundle import Bundle, seal
-from vlatool.finish import save_npz
-from vlatool.manifest import Graph, Manifest, ProgramStep, single_graph
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import ProgramStep, single_graph
+from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.stage.finish import save_npz
 
 X = TensorSpec("x", (1, 2))
 Y = TensorSpec("y", (1, 2))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from _written import MEMORY, SUM, X, Y, written
 
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import GraphError, SpecError
-from vlatool.manifest import ProgramStep
 from vlatool.runtime import load
 from vlatool.runtime.contract import Outputs, Port, check_chunk, written_as_declared
-from vlatool.spec import PolicySpec, TensorSpec
 
 ENGINES = pytest.mark.parametrize("engine", ["ort_cpu", "openvino"])
 LOGITS = TensorSpec("y", (1, 3), kind="discrete", labels=("left", "right", "forward"))

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from _written import ENDLESS, X, Y, written
 
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import BundleError, GraphError
-from vlatool.manifest import ProgramStep
 from vlatool.runtime import Policy, load
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.probe import probe
-from vlatool.spec import TensorSpec
 
 RAISED = ("repeat", "runs", "elements", "state_elements")
 GOLDEN = {"in.x": [[1, 2]], "out.y": [[[1, 2]]]}

@@ -9,17 +9,18 @@ import onnx
 import pytest
 from onnx import helper
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import BundleError, DataError, GraphError
-from vlatool.finish import GOLDEN, save_npz, write_golden
-from vlatool.manifest import Graph, Manifest, ProgramStep
-from vlatool.npz_files import open_npz
+from vlatool.files.npz import open_npz
 from vlatool.runtime import load
-from vlatool.runtime.engines._arithmetic import SATURATING
+from vlatool.runtime.arithmetic import SATURATING
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import load_golden, load_goldens, relative_error
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.stage.finish import GOLDEN, save_npz, write_golden
 
 SPEC = PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0)
 STEP = ProgramStep("main", {"x": "x", "m": "memory"}, {"y": "y", "n": "memory"}, keep={"memory": {"shape": [1, 2]}})

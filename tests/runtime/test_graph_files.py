@@ -9,13 +9,14 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import single_graph
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import BundleError, GraphError
-from vlatool.manifest import Graph, Manifest, single_graph
 from vlatool.registry import load as engine_of
 from vlatool.runtime import graph_files, load
 from vlatool.runtime.graph_files import open_graph
-from vlatool.spec import PolicySpec, TensorSpec
 
 SPEC = PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 3)),), 10.0)
 WEIGHT = np.arange(6, dtype=np.float32).reshape(2, 3)

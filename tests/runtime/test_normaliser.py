@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vlatool.bundle.spec import NORMALISATIONS, STATISTICS_OF, TensorSpec
 from vlatool.errors import SpecError
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.spec import NORMALISATIONS, STATISTICS_OF, TensorSpec
 
 ROWS = {"mean": [1, 2], "std": [2, 4], "min": [-1, 0], "max": [3, 10], "q01": [0, 1], "q99": [4, 9]}
 

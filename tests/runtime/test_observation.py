@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, SpecError
 from vlatool.runtime.observation import ObservationEncoder
-from vlatool.spec import PolicySpec, TensorSpec
 
 OUT = (TensorSpec("action", (1, 2)),)
 GOOD = {"image": np.zeros((2, 2, 3), np.uint8), "state": np.zeros(2, np.float32), "say": "go home", "count": 3}

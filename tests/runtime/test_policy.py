@@ -9,14 +9,15 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import single_graph
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import BundleError, DataError, GraphError, MissingExtra, UsageError
-from vlatool.finish import save_npz
-from vlatool.manifest import Graph, Manifest, single_graph
 from vlatool.runtime import Policy, load
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import refuse_findings, relative_error
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.stage.finish import save_npz
 
 LOGITS = TensorSpec("logits", (1, 3), kind="discrete", labels=("left", "right", "forward"))
 

@@ -4,8 +4,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vlatool.bundle.program import ProgramStep
 from vlatool.errors import DataError
-from vlatool.manifest import ProgramStep
 from vlatool.runtime.program import Program
 
 X = np.array([[1.0, 2.0]], np.float32)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from _written import MEMORY, SUM, X, written
 
+from vlatool.bundle.program import ProgramStep
 from vlatool.errors import DataError, GraphError
-from vlatool.manifest import ProgramStep
 from vlatool.runtime import ChunkQueue, Policy, load
 
 GOOD, HUGE = {"x": [1.0, 2.0]}, {"x": [3e38, 1.0]}

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from vlatool import registry
-from vlatool.manifest import check_program, program_from
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.bundle.program import check_program, program_from
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 
 MILLIONS = {
     "action_expert": 127.0,

@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from vlatool import registry
+from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import UsageError
 from vlatool.samples._observations import smooth_image
 from vlatool.samples._words import LONGEST, instructions, vocabulary
 from vlatool.samples._write import write_sample
-from vlatool.spec import PolicySpec
 
 
 @pytest.mark.parametrize("name", registry.names("samples"))

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from _random_policies import RandomPolicy
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
-from vlatool.export._torch_policy import torch_policy
 from vlatool.export.onnx import ExportOnnx
-from vlatool.launch import run_transform
-from vlatool.pipeline import source_stage
+from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
-from vlatool.stage import Context, Transform, build_stage
+from vlatool.sources import source_stage
+from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.run import run_transform
 
 ENGINES = ("ort_cpu", "openvino")
 FLOAT, HALF, EIGHT_BITS, AT_RUN_TIME, INT8, INT4 = 1e-4, 0.005, 0.05, 0.1, 0.25, 0.7
@@ -93,9 +93,7 @@ def trials(
     made: list[Bundle] = []
 
     def export() -> Bundle:
-        source = run_transform(
-            source_stage(str(policy.write(scratch / "policy")))[0], None, scratch / "source", Context()
-        )
+        source = run_transform(source_stage(str(policy.write(scratch / "policy"))), None, scratch / "source", Context())
         (scratch / "float").mkdir()
         made.append(source)
         return ExportOnnx().run(source, scratch / "float", Context())

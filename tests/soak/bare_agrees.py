@@ -19,7 +19,7 @@ from statistics import median
 
 import numpy as np
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.runtime.policy import Policy
 

@@ -30,13 +30,13 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.benchmark._pairs import Job, measure_pairs
-from vlatool.bundle import Bundle, seal
-from vlatool.claims._found import worst
-from vlatool.gate import Gate, LatencyClaim
-from vlatool.regression import jointly
-from vlatool.run_gate import run_gate
-from vlatool.stage import Context
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.gate.config import Gate, LatencyClaim
+from vlatool.gate.found import worst
+from vlatool.gate.run import run_gate
+from vlatool.measurement.pairs import Job, measure_pairs
+from vlatool.stage.base import Context
+from vlatool.stats.sequential import jointly
 
 NEIGHBOUR = """
 import random, time

@@ -19,7 +19,7 @@ from statistics import median
 import numpy as np
 import onnxruntime
 
-from vlatool.statistics import quantile_interval
+from vlatool.stats.intervals import quantile_interval
 
 PEERS = "evaluation."
 

@@ -28,9 +28,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError
-from vlatool.written import LEDGER
+from vlatool.files.written import LEDGER
 
 COMMANDS = ("export", "quantize", "optimize")
 RECIPE = """\

@@ -26,7 +26,7 @@ from pathlib import Path
 
 from kill9 import differences, drafts
 
-from vlatool.bundle import Bundle, BundleError
+from vlatool.bundle.bundle import Bundle, BundleError
 
 POLICY = {"width": 512, "heads": 8, "shared_heads": 8, "head_width": 64, "hidden": 1376}
 

@@ -4,7 +4,8 @@
     python tests/soak/loadgen_agrees.py
 
 loadgen (single stream, performance only) calls a system that takes as long as a recorded trace says; the latencies that
-loadgen itself logs are then given to ``vlatool.latencies``, in random order: loadgen takes calls for independent, ours
+loadgen itself logs are then given to ``vlatool.stats.percentiles``, in random order: loadgen takes calls for
+independent, ours
 counts calls that follow each other for less. Compared are the percentiles that loadgen prints, and its early-stopping
 estimates, with ours. Of those, loadgen takes the call above the one that its condition asks for, which shows at the
 99th percentile of few calls with a heavy tail.
@@ -21,7 +22,7 @@ from pathlib import Path
 import mlperf_loadgen as loadgen
 import numpy as np
 
-from vlatool.latencies import percentile
+from vlatool.stats.percentiles import percentile
 
 CALLS = 3000
 TRACES = {

@@ -15,7 +15,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from vlatool.latencies import CONFIDENCE, percentile
+from vlatool.stats.percentiles import CONFIDENCE, percentile
 
 Array = np.ndarray
 Shape = tuple[Callable[[np.random.Generator, int], Array], Callable[[float], float]]

@@ -61,7 +61,7 @@ def measure(policy: Path, scratch: Path, options: list[str]) -> tuple[float, flo
 
 def parameters_of(policy: Path) -> int:
     """Count the weights by the headers of the shards."""
-    from vlatool.sources._shards import read_shards
+    from vlatool.weights.shards import read_shards
 
     return sum(tensor.count for tensor in read_shards(policy, "*.safetensors").values())
 

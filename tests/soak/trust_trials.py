@@ -17,20 +17,20 @@ from types import SimpleNamespace
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmark"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "measurement"))
 
 from _policies import Garbage, Memoising, Stalling
 
-from vlatool.benchmark._canary import drift
-from vlatool.benchmark._contest import Contestant, latency_measurements
-from vlatool.benchmark._job import Job
-from vlatool.benchmark._paced import run_paced
-from vlatool.benchmark._trust import MOVED, findings
-from vlatool.benchmark._worker import measure
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
+from vlatool.measurement.clock_drift import drift
+from vlatool.measurement.interleaved import Contestant, latency_measurements
+from vlatool.measurement.job import Job
+from vlatool.measurement.paced import run_paced
+from vlatool.measurement.validity import MOVED, findings
+from vlatool.measurement.worker import measure
 from vlatool.runtime.policy import Action, Policy
-from vlatool.spec import PolicySpec, TensorSpec
 
 
 def main() -> int:

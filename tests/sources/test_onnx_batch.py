@@ -5,10 +5,10 @@ import onnx
 import onnxruntime
 import pytest
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.runtime import load
 from vlatool.sources.onnx import OnnxFile
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 HEAD = '<ir_version: 10, opset_import: ["": 20]> '
 

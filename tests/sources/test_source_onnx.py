@@ -5,14 +5,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.bundle import Bundle
-from vlatool.cli._run import is_bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, RecipeError, SourceError
-from vlatool.hwselect._workload import graph_workload
-from vlatool.pipeline import source_stage
+from vlatool.graph.workload import graph_workload
 from vlatool.runtime import load
+from vlatool.sources import is_bundle, source_stage
 from vlatool.sources.onnx import OnnxFile
-from vlatool.stage import Context, build_stage
+from vlatool.stage.base import Context, build_stage
 
 
 def build(out: Path, model: Path, **options: object) -> Bundle:

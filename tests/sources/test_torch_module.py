@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from vlatool.bundle import LOCATION, Bundle, hash_file
+from vlatool.bundle.bundle import LOCATION, Bundle, hash_file
 from vlatool.errors import SourceError, SpecError
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 
 def build(folder: Path, out: Path, **options: str) -> Bundle:

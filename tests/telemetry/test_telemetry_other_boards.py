@@ -26,7 +26,7 @@ from telemetry_boards import (
     write,
 )
 
-from vlatool import host
+from vlatool.machine import host
 from vlatool.telemetry import totals, vcgencmd
 from vlatool.telemetry.cpufreq import CpufreqReader
 from vlatool.telemetry.process import ProcessReader

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlatool.bundle import Bundle, restate
+from vlatool.bundle.bundle import Bundle, restate
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
 from vlatool.render.terminal import TerminalRenderer
 from vlatool.report import Report
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 from vlatool.verify import Options, check, verify
-from vlatool.verify._compare import Sample, _elements
+from vlatool.verify._compare import _elements
+from vlatool.verify._sample import Sample
 
 ORIGINAL = """\
 import json
@@ -95,7 +96,7 @@ def against(policy_dir: Path):
 
 @pytest.fixture(autouse=True)
 def _trusted(policy_template: Path) -> None:
-    from vlatool import trust
+    from vlatool.user_code import trust
 
     trust.name(policy_template)
 

@@ -11,22 +11,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field, PrivateAttr
 
-from vlatool.benchmark import _agent
-from vlatool.benchmark._contest import MOST
-from vlatool.benchmark._job import Job, Limits
-from vlatool.benchmark._rows import measurements, raw, samples_of, sustained, tables
-from vlatool.benchmark._trust import findings, validity
-from vlatool.bundle import MANIFEST, Bundle
+from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
-from vlatool.host import fingerprint
-from vlatool.hwselect._measured import WORK, whole_work
-from vlatool.hwselect._workload import workload
-from vlatool.printable import one_line
+from vlatool.files.printable import one_line
+from vlatool.graph.workload import WORK, whole_work, workload
+from vlatool.machine.host import fingerprint
+from vlatool.measurement import agent
+from vlatool.measurement.interleaved import MOST
+from vlatool.measurement.job import Job, Limits
+from vlatool.measurement.rows import measurements, raw, samples_of, sustained, tables
+from vlatool.measurement.validity import findings, validity
 from vlatool.report import Finding, Measurement, Report, Row
-from vlatool.stage import Context, Measure
+from vlatool.stage.base import Context, Measure
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 COLD_STARTS = 3
 LOG_LINES = 40
@@ -133,7 +132,7 @@ class Latency(Measure):
         job = self._job(bundles)
         elsewhere = context.elsewhere
         found = (
-            _agent.measure(job, context.tell)
+            agent.measure(job, context.tell)
             if elsewhere is None
             else elsewhere(job.to_dict(), [bundle.path for bundle in bundles], context.tell)
         )

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import UsageError
-from vlatool.host import fingerprint
-from vlatool.manifest import ProgramStep
+from vlatool.machine.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import draw
-from vlatool.stage import Context, Measure
-from vlatool.statistics import quantile_interval
+from vlatool.stage.base import Context, Measure
+from vlatool.stats.intervals import quantile_interval
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 
 ROUND = 40

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import typer
 
-from vlatool import __version__, trust
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, lost, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
@@ -31,7 +30,9 @@ from vlatool.cli.samples import app as samples
 from vlatool.cli.simulate import simulate
 from vlatool.cli.telemetry import telemetry
 from vlatool.cli.verify import verify
-from vlatool.printable import printable
+from vlatool.files.printable import printable
+from vlatool.machine.version import VERSION
+from vlatool.user_code import trust
 
 app = typer.Typer(
     name="vlatool",
@@ -51,7 +52,7 @@ def _trust(folders: list[Path]) -> list[Path]:
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"vlatool {__version__}")
+        typer.echo(f"vlatool {VERSION}")
         raise typer.Exit
 
 

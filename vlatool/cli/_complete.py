@@ -11,7 +11,7 @@ from typing import Any
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.bundle import MANIFEST
+from vlatool.bundle.bundle import MANIFEST
 from vlatool.report import REPORT
 
 MOST = 200
@@ -23,7 +23,7 @@ CompletionItem: Any = importlib.import_module(f"{_CLICK}.shell_completion").Comp
 
 def profiles(incomplete: str) -> list[str]:
     """Return names of profiles, or YAML files and folders."""
-    from vlatool.profile import SUFFIXES, names
+    from vlatool.hardware.profile import SUFFIXES, names
 
     files = _paths(incomplete, lambda path: path.endswith(tuple(SUFFIXES))) if os.sep in incomplete else []
     return [*(name for name in names() if name.startswith(incomplete)), *files]
@@ -31,7 +31,7 @@ def profiles(incomplete: str) -> list[str]:
 
 def platforms(incomplete: str) -> list[str]:
     """Return names of robot platforms."""
-    from vlatool.platforms import platform_names
+    from vlatool.hardware.platforms import platform_names
 
     return [name for name in platform_names() if name.startswith(incomplete)]
 

@@ -18,13 +18,13 @@ import typer
 
 from vlatool.cli._document import document, put, report_document
 from vlatool.errors import GateFailed, Inconclusive, OutputError
-from vlatool.host import cache_directory
-from vlatool.outputs import REPORT, refuse_inputs, refuse_replacing
-from vlatool.printable import one_line, printable
+from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
+from vlatool.files.printable import one_line, printable
+from vlatool.files.writing import writing
+from vlatool.machine.host import cache_directory
 from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
-from vlatool.stage import Context, Tell
-from vlatool.writing import writing
+from vlatool.stage.base import Context, Tell
 
 PLACES = ("-o", "--output", "--cache", "--junit")
 """Options that name a place to write to: where it is on this machine is nobody's business."""

@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from vlatool.errors import VlatoolError
-from vlatool.printable import message_of
+from vlatool.files.printable import message_of
 
 OK = 0
 USAGE = 2

@@ -6,15 +6,15 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlatool.pipeline import Plan
-    from vlatool.stage import Stage
+    from vlatool.optimize.pipeline import Plan
+    from vlatool.stage.base import Stage
 
 
 def plan_document(plan: Plan) -> dict[str, Any]:
     """Return what ``plan.lines()`` says, as values that JSON can say."""
     effort, loop = plan.recipe.effort, plan.closed_loop
     told = {
-        "source": {"policy": str(plan.policy) if plan.policy else None, **_stage(plan.source)},
+        "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
         "export": _stages(plan.export),
         "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
         "search": plan.recipe.search,

@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from vlatool.bundle import MANIFEST, Bundle
-from vlatool.choice import foretold
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
-from vlatool.host import MAX_CPU_ISA
-from vlatool.instruction_sets import ENGINE, board_set
-from vlatool.launch import cache_directory, measured_with, run_transform
-from vlatool.outputs import BUNDLE
+from vlatool.files.outputs import BUNDLE
+from vlatool.machine.host import MAX_CPU_ISA
+from vlatool.machine.instruction_sets import ENGINE, board_set
+from vlatool.optimize.choice import foretold
 from vlatool.report import Report
-from vlatool.stage import Context, Measure, Stage, Transform
+from vlatool.stage.base import Context, Measure, Stage, Transform
+from vlatool.stage.run import cache_directory, measured_with, run_transform
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 
 def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any) -> inspect.Parameter:
@@ -75,17 +75,9 @@ MEASURE_FLAGS = (
 )
 
 
-def is_bundle(source: str) -> bool:
-    """Say whether SOURCE is a bundle rather than a policy to export."""
-    path = Path(source)
-    if (path / MANIFEST).is_file() or not path.is_dir():
-        return (path / MANIFEST).is_file()
-    return not (path / "policy.yaml").is_file() and not any(path.glob("*.onnx"))
-
-
 def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
-    from vlatool.pipeline import exported, source_stage, sourced
+    from vlatool.sources import exported, is_bundle, source_stage, sourced
 
     bundle: Bundle | None
     refuse_existing(out, force, source, *named_files(stage), kind=BUNDLE)
@@ -95,7 +87,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         elif stage.kind() == "export":
             bundle = sourced(source, cache_directory(), context)
             if bundle.manifest.graphs:  # an ONNX file: its source stage is all the export that there is
-                stage, bundle = _onnx_source(stage, source_stage(source)[0]), None
+                stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         made = run_transform(stage, bundle, out, context, force=force)
@@ -152,7 +144,7 @@ def named_files(stage: Stage) -> tuple[Path, ...]:
 
 def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
     """Return the bundle of a policy whose weights the stage reads from their shards itself, None for any other."""
-    from vlatool.pipeline import sourced
+    from vlatool.sources import sourced
 
     if not stage.streams:
         return None
@@ -166,7 +158,7 @@ def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
 
 def opened(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or that of a policy, exported with the default options."""
-    from vlatool.pipeline import exported
+    from vlatool.sources import exported, is_bundle
 
     return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
 
@@ -201,14 +193,14 @@ def measure(
     refuse_existing(out, force, source, file_or_none(profile), *named_files(stage))
     board = None
     if profile:
-        from vlatool.profile import load_profile
+        from vlatool.hardware.profile import load_profile
 
         board = load_profile(profile)
     with progress(workers or default_workers()) as context:
         bundle = opened(source, context)
         stage.check(bundle, board)
         if target is not None:
-            from vlatool.launch.ssh import measure_on
+            from vlatool.remote.ssh import measure_on
 
             context = replace(context, elsewhere=partial(measure_on, target, python=remote_python or ""))
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
@@ -231,7 +223,7 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
 
 def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
     """Add what is predicted for a board; a robot without onnx measures all the same, and is told what is missing."""
-    from vlatool.predict import predictions
+    from vlatool.boards.predict import predictions
 
     row = report.rows[-1] if report.kind == "evaluate" else report.rows[0]
     try:

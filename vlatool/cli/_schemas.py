@@ -7,7 +7,7 @@ from typing import Any
 
 from vlatool import errors
 from vlatool.cli._failure import TYPES
-from vlatool.profile import Profile
+from vlatool.hardware.profile import Profile
 
 Schema = dict[str, Any]
 TEXT: Schema = {"type": "string"}

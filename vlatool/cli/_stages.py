@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 from vlatool import registry
 from vlatool.cli import _complete, _run
 from vlatool.errors import UsageError, nearest
-from vlatool.stage import Measure, Stage, validated
+from vlatool.stage.base import Measure, Stage, validated
 
 DEFAULTS = {"export": "onnx", "quantize": "static-int8", "benchmark": "latency", "evaluate": "recorded"}
 """The method that is meant when a command names none."""

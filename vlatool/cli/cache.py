@@ -13,10 +13,10 @@ import typer
 
 from vlatool.cli._document import document
 from vlatool.errors import DataError, UsageError, nearest
-from vlatool.printable import printable
+from vlatool.files.printable import printable
 
 if TYPE_CHECKING:
-    from vlatool.cache import Contents, Entry, Removed
+    from vlatool.stage.cache import Contents, Entry, Removed
 
 app = typer.Typer(help="Look at finished stages that are kept, and remove them.", no_args_is_help=True,
                   rich_markup_mode=None)  # fmt: skip
@@ -69,7 +69,7 @@ def prune(
 
     What a running process uses stays, and so does everything that vlatool did not write.
     """
-    from vlatool import cache as kept
+    from vlatool.stage import cache as kept
 
     if everything == bool(older_than or max_size):
         raise UsageError("Say what to remove.", "pass --older-than 30d, --max-size 5GB, or both; or --all alone")
@@ -90,8 +90,8 @@ def prune(
 
 
 def _place(cache: Path | None) -> Path:
-    from vlatool.cache import is_cache
-    from vlatool.host import cache_directory
+    from vlatool.machine.host import cache_directory
+    from vlatool.stage.cache import is_cache
 
     place = cache or cache_directory()
     if (cache is not None or place.exists()) and not place.is_dir():
@@ -102,7 +102,7 @@ def _place(cache: Path | None) -> Path:
 
 
 def _contents(cache: Path | None) -> Contents:
-    from vlatool.cache import contents
+    from vlatool.stage.cache import contents
 
     return contents(_place(cache))
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vlatool.bundle import MANIFEST, Bundle
+from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
 from vlatool.cli._side_by_side import read_reports, side_by_side

@@ -12,7 +12,7 @@ from vlatool.cli._document import document
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
     """Say what this machine has: engines, instruction sets, telemetry, clocks, missing extras; and how to mend it."""
-    from vlatool.doctor import diagnose
+    from vlatool.doctor.doctor import diagnose
 
     checks = diagnose()
     if as_json:

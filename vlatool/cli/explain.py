@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
 

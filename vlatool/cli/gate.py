@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
-from vlatool.files import refuse_file, write_own
-from vlatool.outputs import output_errors, refuse_inputs
+from vlatool.files.edited import refuse_file, write_own
+from vlatool.files.outputs import output_errors, refuse_inputs
 
 if TYPE_CHECKING:
-    from vlatool.gate import Gate
+    from vlatool.gate.config import Gate
     from vlatool.report import Report
 
 app = typer.Typer(
@@ -67,7 +67,7 @@ def run(
 
     In a job of GitHub Actions it also prints annotations and writes the step summary.
     """
-    from vlatool.run_gate import run_gate
+    from vlatool.gate.run import run_gate
 
     gate = _gate(config, margin)
     base = baseline or gate.baseline
@@ -102,7 +102,7 @@ def init(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
-    from vlatool.gate_files import gate_files
+    from vlatool.gate.files import gate_files
 
     files = {directory / name: text for name, text in gate_files(baseline.as_posix(), candidate.as_posix()).items()}
     for path in files:
@@ -144,7 +144,7 @@ def _read_by(gate: Gate, base: Path) -> tuple[Path | None, ...]:
 
 
 def _gate(config: Path | None, margin: float | None) -> Gate:
-    from vlatool.gate import Gate, LatencyClaim, read_gate
+    from vlatool.gate.config import Gate, LatencyClaim, read_gate
 
     gate = read_gate(config or CONFIG) if config or CONFIG.is_file() else Gate()
     if margin is None:

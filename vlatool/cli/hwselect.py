@@ -81,7 +81,7 @@ def select(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Rank the boards that can run a policy at a rate, within power, price and memory. Everything is predicted."""
-    from vlatool.select_boards import Asked, carry_count, select_boards
+    from vlatool.boards.answer import Asked, carry_count, select_boards
 
     _above_zero(
         hz=hz, latency_ms=latency_ms, max_watts=max_watts, max_price=max_price, memory=memory, battery_wh=battery_wh,
@@ -136,8 +136,8 @@ def score(
     ] = False,
 ) -> None:
     """Predict every row of a file of published latencies, and print error and interval coverage."""
-    from vlatool.hwselect._refit import refit_points
-    from vlatool.hwselect._score import lines, score_points
+    from vlatool.latency_model.refit import refit_points
+    from vlatool.latency_model.score import lines, score_points
 
     if refit is None:
         found = score_points(points, held_out, seed)
@@ -171,7 +171,7 @@ def fit(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Fit the latency model on published latencies, and write its data files."""
-    from vlatool.hwselect._fit import fit_files
+    from vlatool.latency_model.fit import fit_files
 
     _finite(seconds=seconds)
     fit_files(points, output, seconds, seed, anew, lambda line: typer.echo(line, err=True))

@@ -9,18 +9,18 @@ from typing import Annotated, Any
 
 import typer
 
-from vlatool.bundle import Bundle, manifest_bytes
+from vlatool.bundle.bundle import Bundle, manifest_bytes
+from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.spec import TensorSpec
 from vlatool.cli import _complete
 from vlatool.cli._document import document
 from vlatool.errors import BundleError, GraphError
-from vlatool.manifest import Manifest
-from vlatool.printable import printable
+from vlatool.files.printable import printable
+from vlatool.files.sealed import open_inside
 from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
-from vlatool.sealed_files import open_inside
-from vlatool.spec import TensorSpec
 
 
 def inspect(

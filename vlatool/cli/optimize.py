@@ -14,11 +14,11 @@ from vlatool.cli._console import default_workers, file_or_none, leave, progress,
 from vlatool.cli._document import document, put, report_document
 from vlatool.cli._plan import plan_document
 from vlatool.errors import UsageError
-from vlatool.outputs import BUNDLE
+from vlatool.files.outputs import BUNDLE
 from vlatool.report import REPORT
 
 if TYPE_CHECKING:
-    from vlatool.pipeline import Plan
+    from vlatool.optimize.pipeline import Plan
 
 
 def optimize(
@@ -70,10 +70,11 @@ def optimize(
     Exits 0 when a candidate keeps to the limits, 1 when none does (the nearest one is kept), and 5 when float32 does no
     better than actions that do not look at the observation, so that nothing can be held against it.
     """
-    from vlatool import pipeline
-    from vlatool.launch import cache_directory
-    from vlatool.profile import load_profile
-    from vlatool.recipe import Effort, Limits, default_recipe, read_recipe
+    from vlatool.hardware.profile import load_profile
+    from vlatool.optimize import pipeline
+    from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
+    from vlatool.sources import brings_calibration
+    from vlatool.stage.run import cache_directory
 
     if not dry_run:
         refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
@@ -89,7 +90,7 @@ def optimize(
         asked |= {} if value is None else {name: value}
     asked |= {"accept": tuple(accept)} if accept else {}
     if recipe is None:
-        calibrated = pipeline.brings_calibration(source)
+        calibrated = brings_calibration(source)
         chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine if board else "ort_cpu")
     else:
         read = read_recipe(recipe)

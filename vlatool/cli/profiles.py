@@ -20,7 +20,7 @@ app = typer.Typer(
 @app.command("list")
 def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
     """List the profiles."""
-    from vlatool.profile import load_profile, names
+    from vlatool.hardware.profile import load_profile, names
 
     found = [load_profile(name) for name in names()]
     if as_json:
@@ -40,7 +40,7 @@ def show_profile(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Print one profile with the source of every figure."""
-    from vlatool.profile import load_profile
+    from vlatool.hardware.profile import load_profile
 
     profile = load_profile(name)
     if as_json:
@@ -64,7 +64,7 @@ def diff_profiles(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """Print where two profiles differ: field, first, second."""
-    from vlatool.profile import load_profile
+    from vlatool.hardware.profile import load_profile
 
     pair = [dict(_leaves(load_profile(name).model_dump(mode="json", exclude={"sources"}))) for name in (first, second)]
     found = [
@@ -93,7 +93,7 @@ def validate_profiles(
 ) -> None:
     """Check profiles against the schema; exit 3 when one is wrong, naming every field that is."""
     from vlatool.errors import ProfileError
-    from vlatool.profile import SUFFIXES, load_profile
+    from vlatool.hardware.profile import SUFFIXES, load_profile
 
     valid, wrong = [], []
     for name in files:
@@ -127,7 +127,7 @@ def new_profile(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Write a profile of your own to begin with: another one's figures under a new name."""
-    from vlatool.profile import copy_profile
+    from vlatool.hardware.profile import copy_profile
 
     target = output or Path(f"{name}.yaml")
     copy_profile(like, name, target, force=force)
@@ -151,10 +151,10 @@ def calibrate_profile(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Tell the latency model what was measured on a board: predictions for it rest on that from now on."""
-    from vlatool.bundle import Bundle
-    from vlatool.hwselect._measured import calibrations, elsewhere, measured_in, store
-    from vlatool.hwselect._workload import workload
-    from vlatool.profile import load_profile
+    from vlatool.boards.measured import calibrations, elsewhere, measured_in, store
+    from vlatool.bundle.bundle import Bundle
+    from vlatool.graph.workload import workload
+    from vlatool.hardware.profile import load_profile
 
     load = workload(Bundle.open(bundle)) if bundle else None
     profile = load_profile(name)

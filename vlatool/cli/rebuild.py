@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document, put
 from vlatool.errors import GateFailed, UsageError
-from vlatool.outputs import BUNDLE
+from vlatool.files.outputs import BUNDLE
 
 if TYPE_CHECKING:
-    from vlatool.rebuild import Rebuilt
+    from vlatool.rebuild.rebuild import Rebuilt
 
 Versions = dict[str, tuple[str, str]]
 
@@ -46,9 +46,9 @@ def rebuild(
 
     Exits 0 when all is identical, 1 with --check when a file differs, 3 when the source is not the recorded one.
     """
-    from vlatool.launch import cache_directory
-    from vlatool.rebuild import build_record, version_changes
-    from vlatool.rebuild import rebuild as run
+    from vlatool.rebuild.rebuild import build_record, version_changes
+    from vlatool.rebuild.rebuild import rebuild as run
+    from vlatool.stage.run import cache_directory
 
     if not check and output is None:
         raise UsageError("rebuild has nothing to do.", "pass --check to compare, -o OUT to keep the bundle, or both")

@@ -12,7 +12,7 @@ from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
 from vlatool.errors import MissingExtra, UsageError, VlatoolError, nearest
-from vlatool.writing import writing
+from vlatool.files.writing import writing
 
 app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -45,8 +45,8 @@ def make(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Write a policy with seeded random weights, for latency and memory work."""
-    from vlatool.samples._write import write_sample
-    from vlatool.select_boards import carry_count
+    from vlatool.boards.answer import carry_count
+    from vlatool.samples import write_sample
 
     known = [entry.replace("_", "-") for entry in registry.names("samples")]
     if name.replace("_", "-") not in known:

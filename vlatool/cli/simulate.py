@@ -27,7 +27,7 @@ def simulate(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
-    from vlatool.select_boards import simulated, simulation_lines
+    from vlatool.boards.answer import simulated, simulation_lines
 
     with progress() as context:
         found = simulated(source, profile, mode, engine, precision, context)

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli._console import progress, refuse_existing, show
-from vlatool.cli._run import is_bundle
+from vlatool.sources import is_bundle
 
 
 def verify(
@@ -30,8 +30,8 @@ def verify(
     FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the action in physical
     units. Exits 1 when the actions differ.
     """
-    from vlatool.host import cache_directory
-    from vlatool.pipeline import sourced
+    from vlatool.machine.host import cache_directory
+    from vlatool.sources import sourced
     from vlatool.verify import Options, check
     from vlatool.verify import verify as verified
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlatool.data._doubts import doubts
+from vlatool.data._calibration_checks import doubts
 from vlatool.data._drawn import DRAWN, OTHER, RECORDED, Drawer, Drawn, read_drawn, save_drawn
 from vlatool.data._halves import halves
 from vlatool.data._observations import (

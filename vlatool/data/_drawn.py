@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import TensorSpec
 from vlatool.data._recording import Recording
 from vlatool.errors import DataError
 from vlatool.runtime.statistics import Normaliser, load_normaliser
-from vlatool.spec import TensorSpec
 
 Array = NDArray[Any]
 RECORDED, OTHER, DRAWN = "recorded", "other", "drawn"

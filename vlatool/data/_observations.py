@@ -8,11 +8,11 @@ from typing import Any, overload
 
 import numpy as np
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._halves import LEAST, halves
 from vlatool.data._recording import Recording, read_recording
 from vlatool.errors import DataError
-from vlatool.spec import PolicySpec, TensorSpec
 
 CALIBRATION = "data/calibration.npz"
 EVALUATION = "data/evaluation.npz"

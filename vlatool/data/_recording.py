@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool import registry
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, nearest
-from vlatool.npz_rows import Rows, blocks
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.files.rows import Rows, blocks
 
 Array = NDArray[Any]
 Values = Array | Rows

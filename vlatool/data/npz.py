@@ -7,9 +7,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from vlatool.host import memory
-from vlatool.npz_files import open_rows
-from vlatool.npz_rows import Rows
+from vlatool.files.npz import open_rows
+from vlatool.files.rows import Rows
+from vlatool.machine.host import memory
 
 LIMIT = "recording_bytes"
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import TensorSpec
 from vlatool.data import observations_for
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
-from vlatool.spec import TensorSpec
 
 Array = NDArray[Any]
 CONTROLS = ("random", "constant")

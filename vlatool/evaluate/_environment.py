@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError
-from vlatool.spec import PolicySpec
 
 GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
 

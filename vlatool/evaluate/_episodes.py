@@ -1,7 +1,7 @@
 """Play episodes, spread over child processes; each opens the bundle once.
 
 The environment is a user's code: it runs in children alone, however many, and one that ends its process, prints or
-changes the directory does that there (see ``vlatool.apart``).
+changes the directory does that there (see ``vlatool.user_code.children``).
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool.apart import spread
-from vlatool.bundle import Bundle
+from vlatool.accuracy.outcome import Outcome
+from vlatool.accuracy.success import Success
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, VlatoolError
 from vlatool.evaluate._controls import Array, Blind, answers_of
 from vlatool.evaluate._environment import GUIDE, World
-from vlatool.evaluate._success import Success
-from vlatool.printable import message_of
+from vlatool.files.printable import message_of
+from vlatool.module.factory import call_factory, exits_told
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
-from vlatool.sources._factory import call_factory, exits_told
-from vlatool.stage import Context
+from vlatool.stage.base import Context
+from vlatool.user_code.children import spread
 
 STEP_LIMIT = 100_000
 PRELOAD = ("numpy", "onnxruntime", __name__)
@@ -38,16 +39,6 @@ class Job:
     seeds: tuple[int, ...]
     instruction: str = "right"
     control: str = ""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How one episode ended: after ``steps`` control steps."""
-
-    task: str
-    seed: int
-    success: bool
-    steps: int
 
 
 def run_jobs(bundle: Bundle, jobs: list[Job], engine: str, context: Context) -> list[Outcome]:

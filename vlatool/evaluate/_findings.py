@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 
 
 def found_wrong(bundle: Bundle) -> tuple[str, ...]:

@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from vlatool import trust
-from vlatool.bundle import MANIFEST, Bundle
-from vlatool.credibility import Credibility, credibility
+from vlatool.accuracy.credibility import Credibility, credibility
+from vlatool.accuracy.paired import compare_success, success_row, with_chance
+from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._controls import CONTROLS
 from vlatool.evaluate._episodes import Job, run_jobs
 from vlatool.evaluate._findings import found_wrong
-from vlatool.evaluate._paired import compare_success, success_row, with_chance
-from vlatool.host import fingerprint
+from vlatool.machine.host import fingerprint
+from vlatool.module.description import read_description
+from vlatool.module.factory import factory_file, split_factory
 from vlatool.report import Report, Row
-from vlatool.sources._description import read_description
-from vlatool.sources._factory import factory_file, split_factory
-from vlatool.stage import Context, Measure
+from vlatool.stage.base import Context, Measure
+from vlatool.user_code import trust
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 FIRST_SEED = 5_000_000
 CONTROL_EPISODES = 20

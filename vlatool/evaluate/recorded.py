@@ -12,22 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from vlatool.bundle import MANIFEST, Bundle
-from vlatool.credibility import Credibility, credibility
+from vlatool.accuracy.credibility import Credibility, credibility
+from vlatool.accuracy.losses import agreeing, scale_of
+from vlatool.accuracy.skill import skill, variation
+from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.spec import TensorSpec
 from vlatool.data import CALIBRATION, EVALUATION, Recording, evaluation_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
-from vlatool.evaluate._losses import agreeing, scale_of
-from vlatool.evaluate._skill import skill, variation
-from vlatool.host import fingerprint
+from vlatool.machine.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
-from vlatool.spec import TensorSpec
-from vlatool.stage import Context, Measure
-from vlatool.statistics import wilson
+from vlatool.stage.base import Context, Measure
+from vlatool.stats.intervals import wilson
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 Array = NDArray[Any]
 KEPT = 4

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, VlatoolError
 from vlatool.explain import _tables as tables
 from vlatool.explain._bfloat16 import Phases, phases, told
@@ -26,13 +26,13 @@ from vlatool.explain._origin import (
     sensitivity_stage,
 )
 from vlatool.explain._remedy import measure, plans
-from vlatool.host import fingerprint
-from vlatool.hwselect._workload import workload
-from vlatool.quantize._sensitivity import LayerError, ranges_of, sensitivities
+from vlatool.graph.workload import workload
+from vlatool.machine.host import fingerprint
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.report import Report, Row
 from vlatool.runtime.policy import DEFAULT_ENGINE
-from vlatool.stage import Context
+from vlatool.sensitivity.layers import LayerError, ranges_of, sensitivities
+from vlatool.stage.base import Context
 
 __all__ = ["Options", "explain", "explanation"]
 

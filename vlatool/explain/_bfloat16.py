@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
-from vlatool.quantize._graphs import load, part_phases, save
-from vlatool.quantize._phase import PERIODIC, cut_phases
+from vlatool.graph.files import load, part_phases, save
+from vlatool.graph.phase import PERIODIC, cut_phases
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, Session
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 REASON = (
     "bfloat16 has 8 significant bits: a position or denoising time times a frequency of hundreds of radians, rounded "

@@ -13,10 +13,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, require
-from vlatool.host import onednn_max_cpu_isa
-from vlatool.instruction_sets import ENGINE
+from vlatool.machine.host import onednn_max_cpu_isa
+from vlatool.machine.instruction_sets import ENGINE
 from vlatool.runtime.engines.openvino import compiled, settings_for
 from vlatool.runtime.engines.ort_cpu import left_out
 from vlatool.runtime.policy import DEFAULT_ENGINE, Policy

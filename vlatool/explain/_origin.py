@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vlatool.bundle import MANIFEST, Bundle
+from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.data import recorded_observations, synthetic_observations
 from vlatool.errors import BundleError, VlatoolError
-from vlatool.launch import cache_directory
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.stage import Stage, stage_class, validated
+from vlatool.stage.base import Stage, stage_class, validated
+from vlatool.stage.run import cache_directory
 
 EVALUATION = "data/evaluation.npz"
 INT8 = (StaticInt8, DynamicInt8)

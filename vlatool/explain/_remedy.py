@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.benchmark._contest import Contestant, run_interleaved
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.explain._islands import Fallback
 from vlatool.explain._operators import reference_engine
-from vlatool.launch import run_transform
-from vlatool.quantize._sensitivity import LayerError
+from vlatool.measurement.interleaved import Contestant, run_interleaved
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.policy import Policy, relative_error
-from vlatool.stage import Context, Stage, Transform
+from vlatool.sensitivity.layers import LayerError
+from vlatool.stage.base import Context, Stage, Transform
+from vlatool.stage.run import run_transform
 
 MOST_LAYERS = (1, 2, 4)
 """How many of the worst layers the candidates leave in float32."""

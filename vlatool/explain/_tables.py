@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from vlatool.benchmark._contest import latency_measurements, speedup
 from vlatool.explain._islands import Fallback, Island
 from vlatool.explain._operators import GROUPS, Operator, shares
 from vlatool.explain._origin import command
 from vlatool.explain._remedy import Candidate, Contest
-from vlatool.quantize._sensitivity import LayerError
+from vlatool.measurement.interleaved import latency_measurements, speedup
 from vlatool.report import Measurement, Row
+from vlatool.sensitivity.layers import LayerError
 
 MOST = 10
 MOST_ELEMENTS = 12

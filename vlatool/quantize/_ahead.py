@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from vlatool import errors
-from vlatool.processes import SINGLE, python_command
+from vlatool.machine.processes import SINGLE, python_command
 from vlatool.quantize._records import Record, Tools, compute
 
 

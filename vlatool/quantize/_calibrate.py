@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, GraphError, require
-from vlatool.quantize._graphs import write_beside
+from vlatool.graph.files import write_beside
 from vlatool.quantize._ranges import Statistics
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 Wanted = Mapping[str, Iterable[str]]
 

@@ -6,15 +6,15 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.program import ProgramStep
 from vlatool.data import recorded_observations
 from vlatool.errors import DataError, GraphError, require
-from vlatool.manifest import ProgramStep
 from vlatool.quantize._blocks import METHODS
 from vlatool.quantize._compute import figures, piece, records_of, store, stored_meaning, whole_weight
 from vlatool.quantize._gptq import Rounded, awq, gptq, nearest_codes
@@ -22,13 +22,11 @@ from vlatool.quantize._journal import DATA
 from vlatool.quantize._layerwise import Layerwise, Values
 from vlatool.quantize._records import Record, Tools, padded
 from vlatool.quantize._rewrite import Layer, Task
+from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import draw
-from vlatool.stage import SampleSet
-
-if TYPE_CHECKING:
-    from vlatool.quantize.weight_only import WeightOnly
+from vlatool.stage.base import SampleSet
 
 Array = NDArray[Any]
 SLACK = 2.0
@@ -36,7 +34,7 @@ SLACK = 2.0
 
 
 def calibrated_records(
-    plan: WeightsPlan, bundle: Bundle, stage: WeightOnly, place: Path, seen: SampleSet
+    plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, seen: SampleSet
 ) -> list[Record]:
     """Return all records; those of quantized weights drive the policy from layer to layer and must run in order."""
     observations = [dict(each) for each in seen.watch(recorded_observations(bundle, stage.samples, stage.calibration))]
@@ -54,7 +52,7 @@ class _Walk:
     """The policy on all samples, halted at each layer that is quantized."""
 
     def __init__(
-        self, plan: WeightsPlan, bundle: Bundle, stage: WeightOnly, place: Path, observations: list[dict[str, Any]]
+        self, plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, observations: list[dict[str, Any]]
     ) -> None:
         self._plan, self._bundle, self._stage, self._place = plan, bundle, stage, place
         self._observations = observations

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import calibration_recording, doubts
 from vlatool.errors import DataError
+from vlatool.quantize._base import Quantization
 from vlatool.quantize._calibrate import Wanted, calibrate
-from vlatool.quantize._graphs import Quantization
 from vlatool.quantize._ranges import Statistics
-from vlatool.stage import Context, SampleSet
+from vlatool.stage.base import Context, SampleSet
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 
 class Calibrated(Quantization):

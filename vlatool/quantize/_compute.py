@@ -29,7 +29,7 @@ from vlatool.quantize._blocks import (
 )
 from vlatool.quantize._records import Record, Tools, padded
 from vlatool.quantize._rewrite import PART_BYTES, Piece, Task
-from vlatool.sources._shards import FLOATS, StoredTensor
+from vlatool.weights.shards import FLOATS, StoredTensor
 
 Array = NDArray[Any]
 READ_BYTES = 1 << 22

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
-from vlatool.quantize._nodes import name_nodes, read_names, reads
-from vlatool.quantize._value_types import inferred_values
+from vlatool.graph.nodes import name_nodes, read_names, reads
+from vlatool.graph.types import inferred_values
 
 MOVES = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten")
 """Operators that give all values that they take, each once."""

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.program import ProgramStep
 from vlatool.errors import GraphError, SourceError, nearest, require
-from vlatool.export.onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
-from vlatool.manifest import ProgramStep
-from vlatool.sources._faked import faked_modules, run_faked
-from vlatool.sources._origin import origin_of
-from vlatool.sources._shards import StoredTensor, read_shards, stored_array
+from vlatool.module.faked import faked_modules, run_faked
+from vlatool.module.origin import origin_of
+from vlatool.module.to_onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
+from vlatool.weights.shards import StoredTensor, read_shards, stored_array
 
 FOLDED = 1 << 16
 """Elements up to which constants are computed ahead."""

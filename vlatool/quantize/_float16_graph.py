@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import require
-from vlatool.quantize._nodes import read_names, reads
-from vlatool.quantize._phase import HEAVY, PERIODIC
-from vlatool.quantize._value_types import FLOAT, inferred_values
+from vlatool.graph.nodes import read_names, reads
+from vlatool.graph.phase import HEAVY, PERIODIC
+from vlatool.graph.types import FLOAT, inferred_values
 
 LARGEST = 65504.0
 """Largest finite float16."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
-from vlatool.quantize._layers import Layer
-from vlatool.quantize._nodes import read_names
+from vlatool.graph.layers import Layer
+from vlatool.graph.nodes import read_names
 
 Array = NDArray[Any]
 

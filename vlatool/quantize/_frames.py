@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import require
-from vlatool.quantize._nodes import reads
-from vlatool.quantize._value_types import inferred_values
+from vlatool.graph.nodes import reads
+from vlatool.graph.types import inferred_values
 
 Array = NDArray[Any]
 ARITHMETIC = {"Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide}

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.quantize._nodes import reads
+from vlatool.graph.nodes import reads
 
 DOMAIN = "com.microsoft"
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from vlatool.errors import SourceError
 from vlatool.quantize._records import Record
-from vlatool.sources._shards import Reader, StoredTensor, reading
+from vlatool.weights.shards import Reader, StoredTensor, reading
 
 DATA, JOURNAL = "data", "journal"
 CHECKED_BYTES = 1 << 23

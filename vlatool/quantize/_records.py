@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.quantize._blocks import Scratch
-from vlatool.sources._shards import PAGE, Reader, open_direct
+from vlatool.weights.shards import PAGE, Reader, open_direct
 
 Array = NDArray[Any]
 DIRECT = getattr(os, "O_DIRECT", 0)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from vlatool.quantize._blocks import Format
-from vlatool.sources._shards import FLOATS, StoredTensor
+from vlatool.weights.shards import FLOATS, StoredTensor
 
 if TYPE_CHECKING:
     from vlatool.quantize._fake_export import Skeleton

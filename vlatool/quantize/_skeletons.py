@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
+from vlatool.graph.nodes import free_name
 from vlatool.quantize._compute import as_float32
 from vlatool.quantize._fake_export import Skeleton, export_skeletons, policy_weights
-from vlatool.quantize._nodes import free_name
 from vlatool.quantize._rewrite import INLINE
-from vlatool.sources._shards import FLOATS, NUMPY_NAMES, StoredTensor, fingerprint, reading, shard_files, stored_array
+from vlatool.weights.shards import FLOATS, NUMPY_NAMES, StoredTensor, fingerprint, reading, shard_files, stored_array
 
 BLOCKED_OPSET = 21
 """First opset whose DequantizeLinear has blocks and int4."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.quantize._layers import Layer
-from vlatool.quantize._nodes import reads
-from vlatool.quantize._value_types import FLOAT, static_shapes
+from vlatool.graph.layers import Layer
+from vlatool.graph.nodes import reads
+from vlatool.graph.types import FLOAT, static_shapes
 
 NORMS = ("LayerNormalization", "RMSNormalization")
 HOMOGENEOUS = ("Relu", "LeakyRelu", "Identity", "Dropout")

@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import OutputError
-from vlatool.host import cache_directory
+from vlatool.machine.host import cache_directory
 from vlatool.quantize._ahead import Ahead
 from vlatool.quantize._journal import DATA, Journal, hash_part
 from vlatool.quantize._records import Record
-from vlatool.sources._shards import reading
+from vlatool.weights.shards import reading
 
 if TYPE_CHECKING:
-    from vlatool.stage import Tell
+    from vlatool.stage.base import Tell
 
 LOCK = "lock"
 COMMIT_BYTES = 1 << 28

@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 from vlatool.errors import GraphError
-from vlatool.processes import python_code
+from vlatool.machine.processes import python_code
 
 CODE = """
 import sys

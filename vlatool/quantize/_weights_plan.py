@@ -5,9 +5,9 @@ from __future__ import annotations
 import fnmatch
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest
 from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import padded
@@ -24,9 +24,7 @@ from vlatool.quantize._rewrite import (
     read_as_weight,
 )
 from vlatool.quantize._skeletons import BLOCKED_OPSET
-
-if TYPE_CHECKING:
-    from vlatool.quantize.weight_only import WeightOnly
+from vlatool.quantize._weight_options import WeightOptions
 
 
 @dataclass
@@ -48,7 +46,7 @@ class GraphPlan:
 class WeightsPlan:
     """All tasks in the order of the file, and the graphs that use them."""
 
-    stage: WeightOnly
+    stage: WeightOptions
     file: str
     graphs: dict[str, GraphPlan] = field(default_factory=dict)
     tasks: list[Task] = field(default_factory=list)
@@ -101,7 +99,7 @@ def task_bytes(task: Task) -> int:
     return whole * PART_BYTES + padded(rest)
 
 
-def make_plan(skeletons: dict[str, Skeleton], stage: WeightOnly, bundle: Bundle, file: str) -> WeightsPlan:
+def make_plan(skeletons: dict[str, Skeleton], stage: WeightOptions, bundle: Bundle, file: str) -> WeightsPlan:
     """Decide for every constant of every graph; a tensor that two graphs share is stored once.
 
     Raises:
@@ -148,7 +146,7 @@ def _place(graph: str, source: Any) -> tuple[str, ...]:
     return (str(source.file), str(source.offset), source.name)
 
 
-def _chosen(layers: dict[str, list[Layer]], stage: WeightOnly, bundle: Bundle) -> dict[str, list[Layer]]:
+def _chosen(layers: dict[str, list[Layer]], stage: WeightOptions, bundle: Bundle) -> dict[str, list[Layer]]:
     for pattern in stage.graphs:
         if not fnmatch.filter(layers, pattern):
             raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, layers)}.")
@@ -170,7 +168,7 @@ def _kept(skeleton: Skeleton, layers: list[Layer]) -> list[str]:
     return kept
 
 
-def _raise_opset(name: str, skeleton: Skeleton, stage: WeightOnly, quantized: bool) -> None:
+def _raise_opset(name: str, skeleton: Skeleton, stage: WeightOptions, quantized: bool) -> None:
     """Blocked DequantizeLinear needs opset 21; what opset 20 says of all other operators still holds there."""
     if stage.layout != "qdq" or not quantized:
         return

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import require
-from vlatool.quantize._graphs import Quantization, load, save
-from vlatool.quantize._pixels import use_convolutions
-from vlatool.stage import Context
+from vlatool.graph.files import load, save
+from vlatool.quantize._base import Quantization
+from vlatool.quantize._conv1x1 import use_convolutions
+from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 
 class Bfloat16(Quantization):

@@ -7,18 +7,11 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
-from vlatool.quantize._graphs import (
-    Quantization,
-    foreign_errors,
-    load,
-    quantization_library,
-    quiet_quantizer,
-    read,
-    save,
-)
-from vlatool.quantize._layers import check_weights, find_layers, part_inner_gemms, split_gemm
-from vlatool.stage import Context, source_of
+from vlatool.bundle.bundle import Bundle
+from vlatool.graph.files import foreign_errors, load, read, save
+from vlatool.graph.layers import check_weights, find_layers, part_inner_gemms, split_gemm
+from vlatool.quantize._base import Quantization, quantization_library, quiet_quantizer
+from vlatool.stage.base import Context, source_of
 
 OPS = ("MatMul", "Gemm")
 

@@ -7,14 +7,15 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import GraphError
-from vlatool.quantize._beyond import find_beyond
+from vlatool.graph.files import load, save
+from vlatool.quantize._base import Quantization
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
-from vlatool.quantize._graphs import Quantization, load, save
+from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize._trial_compile import open_apart
-from vlatool.stage import Context, SampleSet, source_of
+from vlatool.stage.base import Context, SampleSet, source_of
 
 
 class Float16(Quantization):

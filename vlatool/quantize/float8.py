@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest, require
+from vlatool.graph.files import foreign_errors, load, save
+from vlatool.graph.layers import Layer, Style, find_layers, wanted_values
+from vlatool.quantize._base import QUANTIZED_OPS
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._float8_qdq import Float8Writer
-from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, save
-from vlatool.quantize._layers import Layer, Style, find_layers, wanted_values
-from vlatool.stage import Context, SampleSet, source_of
+from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 
 class Float8(Calibrated):

@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, require
-from vlatool.finish import TRIALS
+from vlatool.graph.files import foreign_errors, load, save
+from vlatool.graph.layers import find_layers
+from vlatool.graph.nodes import reads
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._graphs import foreign_errors, load, save
-from vlatool.quantize._layers import find_layers
-from vlatool.quantize._nodes import reads
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._smooth_groups import Edit, Group, find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.runtime.policy import load_golden, relative_error
-from vlatool.stage import Context, SampleSet, source_of
+from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.finish import TRIALS
 
 Array = NDArray[Any]
 

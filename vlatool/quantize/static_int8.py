@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest, require
-from vlatool.quantize._calibration import Calibrated
-from vlatool.quantize._early import quantize_early
-from vlatool.quantize._frames import fold_frames
-from vlatool.quantize._graphs import QUANTIZED_OPS, foreign_errors, load, read, save
-from vlatool.quantize._integer_matmul import use_integer_matmul
-from vlatool.quantize._layers import (
+from vlatool.graph.files import foreign_errors, load, read, save
+from vlatool.graph.layers import (
     Layer,
     Style,
     check_weights,
@@ -25,15 +21,20 @@ from vlatool.quantize._layers import (
     split_gemm,
     wanted_values,
 )
-from vlatool.quantize._pixels import use_convolutions
-from vlatool.quantize._qdq import Range, insert_qdq
+from vlatool.graph.qdq import Range, insert_qdq
+from vlatool.quantize._base import QUANTIZED_OPS
+from vlatool.quantize._calibration import Calibrated
+from vlatool.quantize._conv1x1 import use_convolutions
+from vlatool.quantize._early import quantize_early
+from vlatool.quantize._frames import fold_frames
+from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.quantize._ranges import Statistics, choose_range
 from vlatool.quantize._reductions import keep_axes
 from vlatool.quantize._trial_compile import compile_apart
-from vlatool.stage import Context, SampleSet, source_of
+from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 ENGINES = {"ort": "", "qdq": "", "openvino": "openvino"}
 

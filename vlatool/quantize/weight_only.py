@@ -7,28 +7,26 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from pydantic import Field
-
-from vlatool.bundle import Bundle, hash_file, write_manifest
+from vlatool.bundle.bundle import Bundle, hash_file, write_manifest
+from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
-from vlatool.finish import SEED, carry_over, finish, history
-from vlatool.manifest import FileRecord, Graph, Manifest
-from vlatool.quantize._blocks import Format
+from vlatool.graph.files import link
+from vlatool.graph.precision import precision_shares
+from vlatool.module.origin import factory_of
 from vlatool.quantize._compute import records_of
-from vlatool.quantize._graphs import Quantization, link
-from vlatool.quantize._precision import precision_shares
 from vlatool.quantize._records import Record
 from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shards, weights_fingerprint
 from vlatool.quantize._stream import Written, forget, work_directory, work_root, write_records
+from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan, make_plan
-from vlatool.sources._origin import factory_of
-from vlatool.stage import Context, SampleSet, source_of
+from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.finish import SEED, carry_over, finish, history
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from vlatool.hardware.profile import Profile
 
 WEIGHTS = "graphs/weights.data"
 LOSSES = "reports/weights.json"
@@ -39,7 +37,7 @@ WORTH_PROCESSES = 1 << 25
 CALIBRATED = ("gptq", "awq")
 
 
-class WeightOnly(Quantization):
+class WeightOnly(WeightOptions):
     """Quantize the weights of MatMul and Gemm to int4 or int8 in blocks; activations stay in float32.
 
     Works on one tensor at a time, so that a policy of billions of parameters needs little memory: a policy whose
@@ -50,20 +48,6 @@ class WeightOnly(Quantization):
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnx-ir", "onnxscript", "numpy")
     streams: ClassVar[bool] = True
     """Takes a source bundle whose policy describes its shards, without an export before."""
-
-    bits: Literal[4, 8] = Field(4, description="bits of a weight: 4 or 8")
-    block: Literal[32, 64, 128] = Field(32, description="weights that share a scale: 32, 64 or 128")
-    method: Literal["rtn", "hqq", "gptq", "awq"] = Field("rtn", description="how weights are rounded")
-    symmetric: bool = Field(False, description="fix the zero point in the middle")
-    search: bool = Field(True, description="4 bits, rtn and awq: try several ranges for each block")
-    layout: Literal["ort", "qdq"] = Field("ort", description="MatMulNBits, or blocked DequantizeLinear (opset 21)")
-    accuracy_level: int = Field(4, ge=0, le=4, description="MatMulNBits: 4 lets activations be rounded to int8, 1 not")
-    embeddings: Literal["float16", "float32"] = Field("float16", description="how tables that are looked up are kept")
-    calibration: Path | None = Field(None, description="recorded observations for gptq and awq")
-    samples: int = Field(16, ge=1, description="calibration samples for gptq and awq")
-    verify: Literal["auto", "layers", "run"] = Field(
-        "auto", description="compare each layer's weights, or also run the new bundle; auto runs below 1 GiB"
-    )
 
     def inputs(self) -> tuple[Path, ...]:
         """The calibration file, when one is given."""
@@ -133,11 +117,6 @@ class WeightOnly(Quantization):
             return finish(bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle))
         return _sealed(bundle, out, written, made_by, graphs)
 
-    @property
-    def form(self) -> Format:
-        """The format of a quantized weight."""
-        return Format(self.bits, self.block, self.symmetric)
-
     def work(self, source: Bundle) -> Path:
         """Return the directory in which unfinished work on a source is kept."""
         weights = hashlib.sha256(f"{self.key(source.hash)} {weights_fingerprint(source)}".encode()).hexdigest()
@@ -161,13 +140,6 @@ class WeightOnly(Quantization):
             return calibrated_records(plan, bundle, self, place, samples)
         tolerance = self.form.largest_error
         return [record for task in plan.tasks for record in records_of(task, self.form, self.choose, tolerance)]
-
-    @property
-    def choose(self) -> str:
-        """How scale and zero point of a block are found: a name in ``METHODS``."""
-        if self.method == "hqq":
-            return "hqq"
-        return "searched" if self.search and self.bits == 4 else "rtn"
 
     def _identity(self, plan: WeightsPlan, bundle: Bundle) -> str:
         content = [self.key(bundle.hash), weights_fingerprint(bundle), plan.identity()]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from vlatool import registry
-from vlatool.files import whole_file
+from vlatool.files.edited import whole_file
 from vlatool.report import Report
 
 FILES = {"json": "report.json", "html": "report.html", "markdown": "report.md"}

@@ -62,7 +62,7 @@ def load(
         >>> policy.infer({"image": frames, "instruction": "go to the red ball"}).labels  # doctest: +SKIP
         ('forward',)
     """
-    from vlatool.bundle import Bundle
+    from vlatool.bundle.bundle import Bundle
 
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.described(path)

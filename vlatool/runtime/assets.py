@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from vlatool.bundle import ASSETS, Bundle
+from vlatool.bundle.bundle import ASSETS, Bundle
 from vlatool.errors import SpecError
-from vlatool.limits import check
-from vlatool.sealed_files import open_regular, read_all
-from vlatool.typed import outside, shown
+from vlatool.files.limits import check
+from vlatool.files.sealed import open_regular, read_all
+from vlatool.files.typed import outside, shown
 
 Assets = Path | Bundle
 """A folder, or a bundle, of which its ``assets/`` are meant."""

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import GraphError, SpecError, nearest
-from vlatool.manifest import Manifest, ProgramStep
 from vlatool.runtime.observation import all_finite
-from vlatool.spec import PolicySpec, TensorSpec
 
 Array = NDArray[Any]
 AGAIN = "declare in the spec what the policy gives, or mend the policy, and export it again"

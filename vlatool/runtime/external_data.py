@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterator
 
 from vlatool.errors import GraphError
-from vlatool.limits import check, limit
+from vlatool.files.limits import check, limit
 
 LOCATION = b"location"
 VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.manifest import Graph
 from vlatool.errors import BundleError
-from vlatool.limits import MIB
-from vlatool.manifest import Graph
+from vlatool.files.limits import MIB
+from vlatool.files.sealed import open_inside
+from vlatool.files.typed import outside, shown
 from vlatool.runtime.external_data import OpenFile, external_files
-from vlatool.sealed_files import open_inside
-from vlatool.typed import outside, shown
 
 WHOLE = 4 * MIB
 """Bytes of a graph up to which the engine gets its content; a larger one would be in the memory twice."""

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import DataError, SpecError
 from vlatool.runtime.assets import Assets, asset_path, read_asset
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer
-from vlatool.spec import PolicySpec, TensorSpec
 
 FEW = 256
 Array = NDArray[Any]

@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool import registry
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import BundleError, DataError, GraphError, UsageError, nearest
-from vlatool.limits import check
-from vlatool.manifest import GOLDEN_TOLERANCE, check_files
-from vlatool.npz_files import open_npz
-from vlatool.printable import printable
+from vlatool.files.limits import check
+from vlatool.files.npz import open_npz
+from vlatool.files.printable import printable
+from vlatool.runtime.arithmetic import machine, told
 from vlatool.runtime.assets import Assets
 from vlatool.runtime.contract import (
     Outputs,
@@ -29,12 +31,10 @@ from vlatool.runtime.contract import (
     not_finite,
     written_as_declared,
 )
-from vlatool.runtime.engines._arithmetic import machine, told
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
-from vlatool.spec import PolicySpec, TensorSpec
 
 DEFAULT_ENGINE = "ort_cpu"
 FIRST_RUN_S = 60.0

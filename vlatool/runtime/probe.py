@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool import errors
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, VlatoolError
 from vlatool.runtime.contract import allowed_mb
 from vlatool.runtime.policy import FIRST_RUN_S, Policy

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.program import ProgramStep
 from vlatool.errors import DataError, GraphError, VlatoolError, nearest
-from vlatool.manifest import ProgramStep
 from vlatool.runtime.contract import not_finite
 from vlatool.runtime.observation import all_finite
 

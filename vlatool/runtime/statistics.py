@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import STATISTICS_OF, TensorSpec
 from vlatool.errors import SpecError, nearest
-from vlatool.json_files import read_json
+from vlatool.files.json import read_json
 from vlatool.runtime.assets import Assets, asset_path, read_asset
-from vlatool.spec import STATISTICS_OF, TensorSpec
 
 Array = NDArray[np.float32]
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vlatool.errors import SpecError
-from vlatool.limits import check, limit
+from vlatool.files.limits import check, limit
 
 STEPS = {
     "BertNormalizer": 24, "Lowercase": 2, "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Nmt": 1, "Strip": 1,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import DataError, SpecError, VlatoolError, require
-from vlatool.json_files import read_json
-from vlatool.limits import check
+from vlatool.files.json import read_json
+from vlatool.files.limits import check
 from vlatool.runtime.assets import read_asset
 from vlatool.runtime.token_growth import growth
 

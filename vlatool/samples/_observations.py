@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.samples._words import instructions
-from vlatool.spec import PolicySpec, TensorSpec
 
 GRIDS = ((3, 60.0), (8, 35.0), (28, 15.0))  # cells across the image, amplitude in grey levels
 Ranges = Mapping[str, tuple[float, float]]

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from vlatool import registry
+from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import require
 from vlatool.samples._observations import observations
 from vlatool.samples._words import vocabulary
-from vlatool.spec import PolicySpec
 
 COUNTS = {"calibration": 48, "evaluation": 12}
 

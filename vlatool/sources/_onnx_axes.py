@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import SourceError, require
-from vlatool.spec import PolicySpec
 
 INFERRED_BYTES = 1_500_000_000
 """Above this protobuf cannot hand a model to the inference of shapes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.quantize._nodes import free_name
+from vlatool.graph.nodes import free_name
 
 
 def add_batch_axes(model: Any) -> list[str]:

@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import single_graph
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, InputError, SourceError, nearest, require
-from vlatool.export._draws import refuse_drawing_file
-from vlatool.finish import SEED, finish
-from vlatool.manifest import Graph, Manifest, single_graph
-from vlatool.quantize._precision import precision_shares
+from vlatool.graph.draws import refuse_drawing_file
+from vlatool.graph.precision import precision_shares
+from vlatool.module.description import FILE, Description, copy_assets, read_description
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.runtime.program import Program
-from vlatool.sources._description import Description, read_description
 from vlatool.sources._onnx_axes import fix_axes, opset_of, told, with_opset
 from vlatool.sources._onnx_batch import add_batch_axes
-from vlatool.sources.torch_module import copy_assets
-from vlatool.spec import PolicySpec, TensorSpec
-from vlatool.stage import Context, Transform
+from vlatool.sources._source import Source
+from vlatool.stage.base import Context
+from vlatool.stage.finish import SEED, finish
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from typing_extensions import Self
+
+    from vlatool.hardware.profile import Profile
 
 TOLERANCE = 1e-3
 """Largest relative L2 difference between a file and what it was converted to."""
@@ -37,10 +40,11 @@ DTYPE_OF = {1: "float32", 2: "uint8", 6: "int32", 7: "int64", 9: "bool", 10: "fl
 """ONNX element type -> dtype of a spec."""
 
 
-class OnnxFile(Transform):
+class OnnxFile(Source):
     """A policy that is one ONNX file; the spec comes from a description, or from the file's inputs and outputs."""
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
+    has_graphs: ClassVar[bool] = True
 
     model: Path = Field(description="the ONNX file; external data is found beside it")
     policy: Path | None = Field(
@@ -48,6 +52,22 @@ class OnnxFile(Transform):
     )
     opset: int | None = Field(None, ge=7, le=23, description="convert the default ONNX domain to this opset")
     control_hz: float = Field(10.0, gt=0, description="rate of the control loop when there is no policy.yaml, in Hz")
+
+    @classmethod
+    def accepting(cls, typed: str) -> Self | None:
+        """Take a .onnx file; point out the file where a directory holds one and names no factory."""
+        path = Path(typed)
+        if path.is_dir():
+            _refuse_bare(path)
+        if path.suffix != ".onnx" or path.is_dir():
+            return None
+        beside = path.parent / FILE
+        return cls(model=path, policy=beside if beside.is_file() else None)
+
+    def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
+        """Convert to the opset of the record, where it has one."""
+        opset = entry.get("options", {}).get("opset")
+        return self.model_copy(update={"opset": opset}) if isinstance(opset, int) else self
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file exists."""
@@ -206,6 +226,25 @@ def _compare(
 
 
 def _observations(described: Description, out: Path, manifest: Manifest) -> list[dict[str, Any]]:
-    from vlatool.bundle import seal
+    from vlatool.bundle.bundle import seal
 
     return observations_for(seal(out, manifest), 2)
+
+
+def _refuse_bare(folder: Path) -> None:
+    """Refuse a directory that holds ONNX files and names no factory: the file itself is the source.
+
+    Raises:
+        SourceError: naming the file, or all of them.
+    """
+    files = sorted(folder.glob("*.onnx"))
+    described = (folder / FILE).is_file()
+    if not files or (described and read_description(folder).factory):
+        return
+    names = ", ".join(str(file) for file in files[:4])
+    lacks = f"a {FILE} without a 'source'" if described else f"no {FILE}"
+    beside = "" if described else f"; a {FILE} beside it may describe inputs and outputs"
+    raise SourceError(
+        f"{folder} holds ONNX files ({', '.join(file.name for file in files[:4])}) and {lacks}.",
+        f"name the file: {names if len(files) == 1 else f'one of {names}'}{beside}",
+    )

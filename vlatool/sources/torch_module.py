@@ -2,34 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from vlatool import trust
-from vlatool.bundle import Bundle, hash_file, seal
-from vlatool.errors import MissingExtra, SourceError, SpecError
-from vlatool.kept_files import carry
-from vlatool.manifest import Manifest
-from vlatool.runtime.observation import ObservationEncoder
-from vlatool.runtime.statistics import load_normaliser
-from vlatool.sources._description import Description, read_description, write_location
-from vlatool.sources._factory import factory_file, split_factory
-from vlatool.sources._imports import imported_files
-from vlatool.sources._shards import fingerprint, sampled_hash, shard_files
-from vlatool.stage import Context, Transform
+from vlatool.bundle.bundle import Bundle, hash_file, seal
+from vlatool.bundle.manifest import Manifest
+from vlatool.errors import SourceError
+from vlatool.module.description import Description, copy_assets, read_description, write_location
+from vlatool.module.factory import factory_file, split_factory
+from vlatool.module.imports import imported_files
+from vlatool.sources._source import Source
+from vlatool.stage.base import Context
+from vlatool.user_code import trust
+from vlatool.weights.shards import fingerprint, sampled_hash, shard_files
 
 if TYPE_CHECKING:
-    from vlatool.profile import Profile
+    from typing_extensions import Self
+
+    from vlatool.hardware.profile import Profile
 
 DATA = ("*.safetensors", "*.pt", "*.pt2", "*.pth", "*.bin", "*.ckpt")
 """Files beside the factory that it may read, where ``files`` in policy.yaml does not say which it does."""
 
 
-class TorchModule(Transform):
+class TorchModule(Source):
     """A policy that a Python function builds as a torch module (or, for several graphs, as a dict of modules).
 
     The bundle holds the spec, the assets and the recorded data; code and weights stay where they are and are recorded
@@ -38,6 +37,30 @@ class TorchModule(Transform):
 
     policy: Path = Field(description="policy.yaml, or the directory that holds it")
     factory: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
+
+    @classmethod
+    def accepting(cls, typed: str) -> Self | None:
+        """Take a directory or YAML file that describes a policy, or ``path.py:make`` beside one."""
+        path = Path(typed)
+        if path.is_dir() or path.suffix in (".yaml", ".yml"):
+            return cls(policy=path).named()
+        where, _, function = typed.rpartition(":")
+        if not where.endswith(".py") or not function:
+            return None
+        if not Path(where).is_file():
+            raise SourceError(f"There is no file {where} (from '{typed}').")
+        return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}").named()
+
+    def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
+        """Take the factory of the record: a function in the policy's own files, or what its description names."""
+        factory = entry.get("factory", "")
+        if self.factory and self.factory != factory:
+            raise SourceError(f"{self.policy} names the factory {self.factory}; {bundle.path} was made by {factory}.")
+        described = read_description(self.policy)
+        file = factory_file(factory, described.folder)
+        if factory != described.factory and (file is None or not file.is_relative_to(described.folder.resolve())):
+            raise SourceError(f"The build record of {bundle.path} names the factory {factory}; {self.policy} does not.")
+        return self.model_copy(update={"factory": factory})
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The description is readable and names a factory that exists."""
@@ -59,7 +82,7 @@ class TorchModule(Transform):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the spec, the assets and the recorded data."""
         described = read_description(self.policy)
-        self.name_it()
+        self.named()
         copy_assets(described, out)
         factory = self._factory(described)
         root = self._root(described)
@@ -79,9 +102,10 @@ class TorchModule(Transform):
         )
         return seal(out, manifest)
 
-    def name_it(self) -> None:
+    def named(self) -> Self:
         """Let the policy's code run in this process: the user named its folder."""
         trust.name(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
+        return self
 
     def _factory(self, described: Description) -> str:
         factory = self.factory or described.factory
@@ -139,40 +163,3 @@ def _weights(described: Description) -> dict[str, str]:
     if not described.weights:
         return {}
     return {"weights": described.weights, "shards": sampled_hash(shard_files(described.folder, described.weights))}
-
-
-def copy_assets(described: Description, out: Path) -> None:
-    """Copy tokenizers and statistics to ``assets/``, recorded data to ``data/``.
-
-    Raises:
-        SourceError: when a file that the spec names is missing.
-        SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
-    """
-    for name in sorted(described.assets()):
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise SourceError(f"The spec names {name}, which is not inside {described.folder}.")
-        if not (described.folder / name).is_file():
-            raise SourceError(f"The spec names {name}, which is not in {described.folder}.")
-        target = out / "assets" / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(described.folder / name, target)
-    check_assets(described, out / "assets")
-    for key, path in (("calibration", described.calibration), ("evaluation", described.evaluation)):
-        if path is not None:
-            (out / "data").mkdir(exist_ok=True)
-            carry(path, out / "data" / f"{key}.npz")
-
-
-def check_assets(described: Description, copies: Path) -> None:
-    """Read the copies of tokenizers and statistics as a robot would; what a robot would need for it may be absent.
-
-    Raises:
-        SpecError: when one does not fit the spec; names the file that was copied.
-    """
-    try:
-        with contextlib.suppress(MissingExtra):
-            ObservationEncoder(described.spec, copies)
-        for tensor in described.spec.outputs:
-            load_normaliser(tensor, copies)
-    except SpecError as error:
-        raise SpecError(error.message.replace(str(copies), str(described.folder)), error.fix) from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from vlatool import registry
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry._reading import Absent, Reader, Run
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from vlatool.host import ROOT, read_number
+from vlatool.machine.host import ROOT, read_number
 
 Kind = Literal["gauge", "counter"]
 Run = Callable[[Sequence[str]], "str | None"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry._reading import MEGAHERTZ, THROTTLE, Absent, Reader, Reading, Run, counter, gauge, listed, scaled
 
 CPUS = "sys/devices/system/cpu"

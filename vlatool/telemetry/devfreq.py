@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry._reading import MEGAHERTZ, SHARE, Absent, Reader, Reading, Run, gauge, listed, scaled
 
 GPU = re.compile(r"\.(gpu|ga10b|gp10b|gv11b)$|^gpu-gpc-\d+$")

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlatool.host import ROOT, read_text
+from vlatool.machine.host import ROOT, read_text
 from vlatool.telemetry._reading import WATT, Absent, Reader, Reading, Run, gauge, listed, scaled
 
 HWMON = (

@@ -10,7 +10,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry import _reading
 from vlatool.telemetry._reading import Absent, Reader, Reading, Run, counter, gauge
 

@@ -9,7 +9,7 @@ import math
 import re
 from pathlib import Path
 
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry._reading import COUNT, Absent, Reader, Reading, Run, gauge, runner
 
 COMMAND = ("nvpmodel", "-q")

@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from vlatool.host import ROOT, read_text
+from vlatool.machine.host import ROOT, read_text
 from vlatool.telemetry import _reading
 from vlatool.telemetry._reading import Absent, Reader, Reading, Run, counter, gauge, listed
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from vlatool.host import ROOT, read_text
+from vlatool.machine.host import ROOT, read_text
 from vlatool.telemetry._reading import JOULE, Absent, Reader, Reading, Run, counter, listed, scaled
 
 ZONE = re.compile(r"intel-rapl:\d+$")

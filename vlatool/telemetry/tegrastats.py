@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry import _reading
 from vlatool.telemetry._reading import Absent, Reader, Reading, Run, gauge, runner
 

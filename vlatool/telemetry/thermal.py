@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from vlatool.host import ROOT, read_text
+from vlatool.machine.host import ROOT, read_text
 from vlatool.telemetry._reading import DEGREE, Absent, Reader, Reading, Run, gauge, listed, scaled
 
 COLDEST = -200.0

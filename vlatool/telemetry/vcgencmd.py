@@ -10,7 +10,7 @@ import math
 import re
 from pathlib import Path
 
-from vlatool.host import ROOT
+from vlatool.machine.host import ROOT
 from vlatool.telemetry._reading import DEGREE, THROTTLE, WATT, Absent, Reader, Reading, Run, counter, gauge, runner
 
 BITS = {0: "under-voltage", 1: "arm frequency capped", 2: "throttled", 3: "soft temperature limit"}

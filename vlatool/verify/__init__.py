@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool import apart, trust
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
 from vlatool.errors import UsageError
-from vlatool.host import fingerprint
+from vlatool.machine.host import fingerprint
+from vlatool.module.factory import factory_file, split_factory
 from vlatool.report import Measurement, Report, Row
-from vlatool.sources._factory import factory_file, split_factory
-from vlatool.stage import Context
+from vlatool.stage.base import Context
+from vlatool.user_code import children, trust
 
 PRELOAD = ("torch", "onnxruntime", "vlatool.verify._compare")
 STAGES, ELEMENTS = "stage by stage", "action, element by element"
@@ -60,7 +60,7 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
         "tolerance": options.tolerance, "seed": options.seed,
     }  # fmt: skip
     about = split_factory(options.against)[0]
-    found = apart.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
+    found = children.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
     return _report(bundle, options, found)
 
 

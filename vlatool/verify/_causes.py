@@ -12,7 +12,7 @@ from vlatool.errors import VlatoolError
 from vlatool.runtime.policy import Policy
 
 if TYPE_CHECKING:
-    from vlatool.verify._compare import Sample
+    from vlatool.verify._sample import Sample
 
 Array = NDArray[Any]
 Change = Callable[["Sample"], Mapping[str, Array]]
@@ -212,7 +212,7 @@ def _physical(sample: Sample, name: str) -> Array:
 
 def _equal(policy: Policy, samples: Sequence[Sample], change: Change, tolerance: float) -> bool:
     """Say whether both are equal when the network takes other inputs; only what forgets can be asked twice."""
-    from vlatool.verify._compare import error_of
+    from vlatool.verify._sample import error_of
 
     if policy.program.keeps:
         return False

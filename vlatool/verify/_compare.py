@@ -3,53 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.bundle import Bundle
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import PolicySpec
 from vlatool.data import CALIBRATION, EVALUATION, Recording, read_recording, synthetic_observations
-from vlatool.export._torch_policy import torch_policy
+from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import draw
-from vlatool.spec import PolicySpec
 from vlatool.verify._causes import causes
 from vlatool.verify._original import Original, as_fed
+from vlatool.verify._sample import Sample, error_of
 
 Array = NDArray[Any]
 LARGEST = 1e9
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One observation and what both sides made of it.
-
-    Args:
-        number: Its place in the recording.
-        observation: Physical values.
-        noise: What both were given in the place of noise of their own.
-        encoded: What this policy's network takes, with a batch axis.
-        raw: What its network gives.
-        chunk: Its action: (T, A) float64, or (T,) int64.
-        wanted: The original's, the same, as many leading steps as it gives.
-        inputs: What the original's network takes, as far as it tells it.
-        wanted_raw: What that gives, None when it does not tell it.
-        error: Relative error of the action.
-    """
-
-    number: int
-    observation: dict[str, Any]
-    noise: dict[str, Array]
-    encoded: dict[str, Array]
-    raw: Array
-    chunk: Array
-    wanted: Array
-    inputs: dict[str, Array] = field(default_factory=dict)
-    wanted_raw: Array | None = None
-    error: float = 0.0
 
 
 def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
@@ -119,13 +90,6 @@ def _sample(
         number, observation, noise, encoded, action.outputs[policy.spec.action.name], chunk, wanted, inputs,
         original.raw(observation, noise, number), error_of(policy, chunk, wanted),
     )  # fmt: skip
-
-
-def error_of(policy: Policy, got: Array, wanted: Array) -> float:
-    """Return the relative error of an action: by the spread of each element; the share of others where discrete."""
-    if policy.spec.action.kind == "discrete":
-        return float(np.mean(got != wanted))
-    return min(policy.chunk_error(got, wanted), LARGEST)
 
 
 def _elements(spec: PolicySpec, samples: list[Sample]) -> list[dict[str, Any]]:

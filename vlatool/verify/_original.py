@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError, VlatoolError
-from vlatool.printable import message_of
-from vlatool.sources._factory import exits_told, import_factory
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.files.printable import message_of
+from vlatool.module.factory import exits_told, import_factory
 
 Array = NDArray[Any]
 

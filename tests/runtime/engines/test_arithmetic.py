@@ -10,8 +10,8 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from vlatool.errors import GraphError
-from vlatool.runtime.engines import _arithmetic
-from vlatool.runtime.engines._arithmetic import (
+from vlatool.runtime import arithmetic
+from vlatool.runtime.arithmetic import (
     EXACT,
     EXACT_BY_OPTION,
     PRECISE,
@@ -86,7 +86,7 @@ def test_an_engine_says_how_it_computes(engine):
 def test_openvino_is_asked_by_a_product_of_its_own(monkeypatch):
     """Weights whose product is not the one wanted stand for a processor that saturates."""
     pytest.importorskip("openvino")
-    monkeypatch.setattr(_arithmetic, "WANTED", WANTED + 1)
+    monkeypatch.setattr(arithmetic, "WANTED", WANTED + 1)
     assert OpenvinoSession.arithmetic() == SATURATING
 
 
@@ -94,7 +94,7 @@ def test_openvino_is_asked_by_a_product_of_its_own(monkeypatch):
 def saturating(monkeypatch):
     """A processor without VNNI: what it would compute is believed."""
     found = {False: SATURATED, True: WANTED}
-    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False, written=False: found[precise])
+    monkeypatch.setattr(arithmetic, "ort_product", lambda ort, precise=False, written=False: found[precise])
     return found
 
 
@@ -109,7 +109,7 @@ def test_where_products_saturate_the_option_is_set(tmp_path: Path, saturating):
 
 def test_a_build_that_cannot_compute_the_product_opens_float32_all_the_same(tmp_path: Path, monkeypatch):
     ort_product.cache_clear()
-    monkeypatch.setattr(_arithmetic, "model", lambda written=False: b"no model")
+    monkeypatch.setattr(arithmetic, "model", lambda written=False: b"no model")
     try:
         assert np.isnan(ort_product(onnxruntime))
         assert {OrtCpuSession.arithmetic(), ReferenceSession.arithmetic()} == {UNKNOWN}
@@ -122,7 +122,7 @@ def test_a_build_that_cannot_compute_the_product_opens_float32_all_the_same(tmp_
 
 def test_openvino_that_cannot_compute_the_product_says_so(monkeypatch):
     pytest.importorskip("openvino")
-    monkeypatch.setattr(_arithmetic, "model", lambda written=False: b"no model")
+    monkeypatch.setattr(arithmetic, "model", lambda written=False: b"no model")
     assert OpenvinoSession.arithmetic() == UNKNOWN
 
 
@@ -166,7 +166,7 @@ def test_the_first_error_is_told(tmp_path: Path, saturating):
 
 
 def test_where_products_are_exact_nothing_is_set(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(_arithmetic, "ort_product", lambda ort, precise=False, written=False: WANTED)
+    monkeypatch.setattr(arithmetic, "ort_product", lambda ort, precise=False, written=False: WANTED)
     session = OrtCpuSession(integer_product(tmp_path / "product.onnx", TensorProto.UINT8), threads=1)
     assert OrtCpuSession.arithmetic() == EXACT
     with pytest.raises(RuntimeError):

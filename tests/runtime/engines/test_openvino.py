@@ -13,7 +13,7 @@ import onnx
 import onnx.parser
 import pytest
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, MissingExtra
 from vlatool.runtime import load

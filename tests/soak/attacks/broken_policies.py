@@ -28,19 +28,20 @@ from broken_cases import CASES, WRAPPER, Case
 from onnx import numpy_helper
 from toy_robot import write_robot
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main as vlatool
 from vlatool.errors import VlatoolError
-from vlatool.evidence import with_accuracy
-from vlatool.finish import write_golden
-from vlatool.gate import AccuracyClaim, Gate
-from vlatool.pipeline import exported, judged_rows, make_plan, verdict_of
+from vlatool.gate.config import AccuracyClaim, Gate
+from vlatool.gate.run import run_gate
+from vlatool.optimize.evidence import with_accuracy
+from vlatool.optimize.pipeline import judged_rows, make_plan, verdict_of
+from vlatool.optimize.recipe import Effort, Limits, Recipe
 from vlatool.quantize.dynamic_int8 import DynamicInt8
-from vlatool.recipe import Effort, Limits, Recipe
 from vlatool.report import Measurement, Row
-from vlatool.run_gate import run_gate
 from vlatool.runtime.policy import load_goldens
-from vlatool.stage import Context
+from vlatool.sources import exported
+from vlatool.stage.base import Context
+from vlatool.stage.finish import write_golden
 
 EPISODES = 20
 DROP = 0.05

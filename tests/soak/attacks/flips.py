@@ -18,7 +18,7 @@ from pathlib import Path
 
 import victim
 
-from vlatool.bundle import DIGEST, MANIFEST, digest_of
+from vlatool.bundle.bundle import DIGEST, MANIFEST, digest_of
 from vlatool.errors import VlatoolError
 
 OTHER, FAR, RAW = "loaded, another answer", "loaded, another golden answer", "raw exception"

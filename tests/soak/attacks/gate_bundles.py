@@ -24,13 +24,13 @@ from gate_graphs import (
 )
 from onnx import TensorProto, helper
 
-from vlatool.bundle import Bundle, restate, seal
+from vlatool.bundle.bundle import Bundle, restate, seal
+from vlatool.bundle.manifest import FileRecord
+from vlatool.bundle.spec import TensorSpec
 from vlatool.data import DRAWN, Drawer, read_recording
 from vlatool.evaluate.recorded import run_recorded
-from vlatool.manifest import FileRecord
 from vlatool.runtime.policy import Policy, load_goldens
-from vlatool.spec import TensorSpec
-from vlatool.stage import Context
+from vlatool.stage.base import Context
 
 Make = Callable[[Bundle, Path], Bundle]
 

@@ -59,8 +59,8 @@ from gate_graphs import (
     wrong_when,
 )
 
-from vlatool.bundle import Bundle
-from vlatool.stage import Context
+from vlatool.bundle.bundle import Bundle
+from vlatool.stage.base import Context
 
 RECORDED_TEXTS = ((2, 3, 4, 7), (2, 3, 4, 8), (5, 7, 0, 0), (6, 8, 0, 0))
 FAST = {"latency": None}
@@ -222,9 +222,9 @@ def exported(folder: Path) -> Bundle:
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from _tiny import write_policy
 
-    from vlatool import trust
     from vlatool.export.onnx import ExportOnnx
     from vlatool.sources.torch_module import TorchModule
+    from vlatool.user_code import trust
 
     policy = folder / "policy"
     write_policy(policy)

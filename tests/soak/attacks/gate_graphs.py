@@ -12,10 +12,10 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
-from vlatool.bundle import Bundle, seal
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Manifest
 from vlatool.data import observations_for
-from vlatool.finish import write_golden
-from vlatool.manifest import Manifest
+from vlatool.stage.finish import write_golden
 
 Change = Callable[[onnx.ModelProto], None]
 SIZE, PRODUCTS = 128, 30

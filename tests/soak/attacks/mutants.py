@@ -31,8 +31,8 @@ from typing import Any
 import victim
 from mutations import Files, mutated, read, repaired, without_golden
 
-from vlatool import sealed_files
 from vlatool.errors import VlatoolError
+from vlatool.files import sealed
 
 HANG = 10.0
 MEMORY = 1 << 30
@@ -131,7 +131,7 @@ class Attack:
 def work(original: Files, folder: Path, seed: int, numbers: range, now: mmap.mmap, out: Path) -> None:
     """Go through some tries in this process; what was found is written after each that may be the last."""
     warnings.simplefilter("ignore")
-    sealed_files.TICK_NS = 0  # nobody else writes here, so that nothing can change within a tick of the clock
+    sealed.TICK_NS = 0  # nobody else writes here, so that nothing can change within a tick of the clock
     found = Found()
     attack = Attack(original, folder, seed)
     for number in numbers:

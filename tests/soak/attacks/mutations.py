@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.bundle import DIGEST, MANIFEST, digest_of
+from vlatool.bundle.bundle import DIGEST, MANIFEST, digest_of
 from vlatool.errors import VlatoolError
-from vlatool.finish import GOLDEN, save_npz
-from vlatool.npz_files import open_npz
+from vlatool.files.npz import open_npz
+from vlatool.stage.finish import GOLDEN, save_npz
 
 Files = dict[str, bytes]
 STRANGE: tuple[Any, ...] = (

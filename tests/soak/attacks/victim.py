@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-from vlatool.bundle import Bundle, seal
-from vlatool.finish import GOLDEN, save_npz, write_golden
-from vlatool.manifest import Graph, Manifest, ProgramStep
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import Graph, Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.runtime import load
 from vlatool.runtime.policy import Policy, relative_error
-from vlatool.spec import PolicySpec, TensorSpec
+from vlatool.stage.finish import GOLDEN, save_npz, write_golden
 
 VOCABULARY = {"kind": "words", "pad": 0, "unknown": 1, "words": {"go": 2, "to": 3, "the": 4, "red": 5, "ball": 6}}
 STATISTICS = {

@@ -17,9 +17,9 @@ from typing import Any
 
 import victim
 
-from vlatool.bundle import Bundle, seal, write_manifest
+from vlatool.bundle.bundle import Bundle, seal, write_manifest
+from vlatool.bundle.manifest import FileRecord
 from vlatool.errors import VlatoolError
-from vlatool.manifest import FileRecord
 from vlatool.runtime import load
 
 SECONDS = 10.0

@@ -5,7 +5,7 @@ numbers than the graph says, and an answer of its own would not show it.
 
 Where integer operators saturate, they do so in a session that rewrites nothing, too, and a saturated answer is not what
 the graph says. There the option that makes them exact is set, with the rewriting that it takes and no more
-(``_arithmetic.as_written``), and the product is asked again: an option is not believed.
+(``arithmetic.as_written``), and the product is asked again: an option is not believed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.runtime.engines import _arithmetic
+from vlatool.runtime import arithmetic
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession, session_options
 
 
@@ -25,10 +25,10 @@ class ReferenceSession(OrtCpuSession):
     @staticmethod
     def _ways(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
-        wanted = [True, False] if _exact(ort) == _arithmetic.EXACT_BY_OPTION else [False]
+        wanted = [True, False] if _exact(ort) == arithmetic.EXACT_BY_OPTION else [False]
         ways = [session_options(ort, threads) for _ in wanted]
         for options, precise in zip(ways, wanted, strict=True):
-            _arithmetic.as_written(ort, options, precise)
+            arithmetic.as_written(ort, options, precise)
         return ways
 
     @staticmethod
@@ -42,8 +42,8 @@ class ReferenceSession(OrtCpuSession):
 
 
 def _exact(ort: Any) -> str:
-    plain = _arithmetic.said(_arithmetic.ort_product(ort, written=True))
-    if plain != _arithmetic.SATURATING:
+    plain = arithmetic.said(arithmetic.ort_product(ort, written=True))
+    if plain != arithmetic.SATURATING:
         return plain
-    exact = _arithmetic.ort_product(ort, precise=True, written=True) == _arithmetic.WANTED
-    return _arithmetic.EXACT_BY_OPTION if exact else plain
+    exact = arithmetic.ort_product(ort, precise=True, written=True) == arithmetic.WANTED
+    return arithmetic.EXACT_BY_OPTION if exact else plain

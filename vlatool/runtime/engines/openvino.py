@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, nearest, require
-from vlatool.host import MAX_CPU_ISA, onednn_max_cpu_isa
+from vlatool.machine.host import MAX_CPU_ISA, onednn_max_cpu_isa
+from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
-from vlatool.runtime.engines import _arithmetic
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
 
@@ -192,10 +192,10 @@ class OpenvinoSession:
         openvino = require("openvino", "openvino")
         try:
             core = openvino.Core()
-            compiled = core.compile_model(core.read_model(io.BytesIO(_arithmetic.model())), DEVICE, settings_for(1, ""))
-            return _arithmetic.said(float(compiled(_arithmetic.operand())[0].min()))
+            compiled = core.compile_model(core.read_model(io.BytesIO(arithmetic.model())), DEVICE, settings_for(1, ""))
+            return arithmetic.said(float(compiled(arithmetic.operand())[0].min()))
         except Exception:  # the seam: older processors lack the kernels of any int8 product
-            return _arithmetic.UNKNOWN
+            return arithmetic.UNKNOWN
 
 
 def _remedy(error: Exception) -> str:

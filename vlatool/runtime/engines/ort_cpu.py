@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
+from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port, port
-from vlatool.runtime.engines import _arithmetic
 from vlatool.runtime.stored_types import has_float8
 
 PROVIDER = "CPUExecutionProvider"
@@ -136,9 +136,9 @@ class OrtCpuSession:
         And ONNX Runtime (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has
         no such type.
         """
-        saturates = _arithmetic.ort_product(ort) < _arithmetic.WANTED
-        first = [_arithmetic.PRECISE, _arithmetic.SIGNED] if saturates else [None]
-        entries = [*first, _arithmetic.UNFUSED]
+        saturates = arithmetic.ort_product(ort) < arithmetic.WANTED
+        first = [arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]
+        entries = [*first, arithmetic.UNFUSED]
         ways = [session_options(ort, threads) for _ in entries]
         for options, entry in zip(ways, entries, strict=True):
             if entry is not None:
@@ -162,11 +162,11 @@ class OrtCpuSession:
             MissingExtra: when onnxruntime is not installed.
         """
         ort = require("onnxruntime", "ort")
-        plain = _arithmetic.said(_arithmetic.ort_product(ort))
-        if plain != _arithmetic.SATURATING:
+        plain = arithmetic.said(arithmetic.ort_product(ort))
+        if plain != arithmetic.SATURATING:
             return plain
-        exact = _arithmetic.ort_product(ort, precise=True) == _arithmetic.WANTED
-        return _arithmetic.EXACT_BY_OPTION if exact else plain
+        exact = arithmetic.ort_product(ort, precise=True) == arithmetic.WANTED
+        return arithmetic.EXACT_BY_OPTION if exact else plain
 
 
 class _Bound:

@@ -1,0 +1,191 @@
+import pytest
+
+from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.errors import SpecError
+
+IMAGE = {"name": "image", "shape": [1, 8, 8, 3], "dtype": "uint8", "unit": "rgb"}
+STATE = {"name": "state", "shape": [1, 2], "unit": ["m", "rad"], "normalisation": "min_max", "statistics": "s.json#x"}
+TEXT = {"name": "say", "kind": "text", "tokenizer": "words.json", "max_tokens": 5}
+ACTION = {"name": "action", "shape": [1, 4, 2], "labels": ["dx", "dy"], "mode": "delta"}
+LOGITS = {"name": "logits", "kind": "discrete", "shape": [1, 3], "labels": ["left", "right", "forward"]}
+SPECS = [
+    {"inputs": [IMAGE], "outputs": [ACTION], "control_hz": 20},
+    {"inputs": [IMAGE, STATE, TEXT], "outputs": [ACTION], "control_hz": 12.5, "chunk": 4, "execute": 2},
+    {
+        "inputs": [{"name": "cloud", "shape": [1, "points", 3], "dtype": "float16"}],
+        "outputs": [LOGITS],
+        "control_hz": 5,
+    },
+    {"inputs": [STATE], "outputs": [LOGITS, {"name": "value", "shape": [1, 1]}], "control_hz": 1},
+]
+
+
+@pytest.mark.parametrize("data", SPECS)
+def test_a_spec_survives_the_round_trip(data):
+    spec = PolicySpec.from_dict(data)
+    assert PolicySpec.from_dict(spec.to_dict()) == spec
+    assert spec.to_dict() == PolicySpec.from_dict(spec.to_dict()).to_dict()
+
+
+def test_only_what_differs_from_the_defaults_is_written():
+    assert PolicySpec.from_dict(SPECS[0]).to_dict() == SPECS[0]
+
+
+def test_a_text_input_sees_ids_of_its_width():
+    text = TensorSpec.from_dict(TEXT)
+    assert (text.dtype, text.shape) == ("int64", (1, 5))
+
+
+def test_width_elements_and_units():
+    state, cloud = TensorSpec.from_dict(STATE), TensorSpec("cloud", (1, "points", 3), unit="m")
+    assert (state.width, state.elements, state.units()) == (2, 2, ("m", "rad"))
+    assert (cloud.width, cloud.elements, cloud.units()) == (3, 3, ("m", "m", "m"))
+    assert TensorSpec("free", (1, "n")).width == 0
+    assert TensorSpec("scalar", ()).width == 0
+
+
+def test_the_action_is_the_first_output_and_the_rate_follows_from_what_is_executed():
+    spec = PolicySpec.from_dict(SPECS[1])
+    assert spec.action.name == "action"
+    assert spec.inference_hz == pytest.approx(6.25)
+    assert PolicySpec.from_dict({**SPECS[1], "execute": 0}).inference_hz == pytest.approx(12.5 / 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": ""}, "name of a tensor must be text"),
+        ({"name": 3}, "name of a tensor must be text .*got 3"),
+        ({"dtype": "float23"}, "dtype 'float23'; did you mean 'float32'"),
+        ({"kind": "tekst"}, "kind 'tekst'; did you mean 'text'"),
+        ({"normalisation": "meanstd"}, "normalisation 'meanstd'; did you mean 'mean_std'"),
+        ({"mode": "deltas"}, "mode 'deltas'; did you mean 'delta'"),
+        ({"shape": [1, 0]}, "each axis is a whole number from 1"),
+        ({"shape": [1, 2.5]}, "each axis is a whole number from 1"),
+        ({"shape": [True, 2]}, "each axis is a whole number from 1"),
+        ({"shape": 4}, "needs 'name' and 'shape'"),
+        ({"shape": None}, "needs 'name' and 'shape'"),
+        ({"labels": ["a", "b", "c"]}, "3 labels for a last axis of 2"),
+        ({"unit": ["m"]}, "1 unit for a last axis of 2"),
+        ({"normalisation": "mean_std"}, "'statistics' is ''"),
+        ({"normalisation": "mean_std", "statistics": "stats.json"}, "FILE#KEY"),
+        ({"kind": "discrete", "shape": [1, "n"]}, "needs 'labels'"),
+        ({"kind": "discrete", "labels": []}, "needs 'labels'"),
+        ({"kind": "discrete", "shape": [1, True]}, "each axis is a whole number|needs 'labels'"),
+        ({"kind": "discrete", "shape": [1, 10**15]}, "limit 'elements'"),
+        ({"colour": "red"}, "unknown key 'colour'"),
+        ({"shape": [1, 10**9]}, "1000000000 elements; the limit 'elements'"),
+        ({"shape": [2**62, 2**62]}, "more than 2"),
+        ({"name": "\ud800"}, "half of a character"),
+        ({"labels": [1, 2]}, "label or unit of 'state' must be text"),
+        ({"dtype": ["float32"]}, "it must be text"),
+        ({"kind": "text", "tokenizer": "words.json", "max_tokens": 10**9}, "limit 'tokens'"),
+        ({"kind": "text", "tokenizer": "words.json", "max_tokens": True}, "max_tokens of 'state' must be a whole"),
+        ({"shpe": [1]}, "unknown key 'shpe'; did you mean 'shape'"),
+    ],
+)
+def test_an_impossible_tensor_is_refused(change, message):
+    with pytest.raises(SpecError, match=message) as caught:
+        TensorSpec.from_dict({"name": "state", "shape": [1, 2], **change})
+    assert caught.value.exit_code == 3
+
+
+def test_a_discrete_output_without_labels_has_the_indices_as_labels():
+    tokens = TensorSpec.from_dict({"name": "tokens", "kind": "discrete", "shape": [1, 7, 256]})
+    assert tokens.labels == tuple(str(index) for index in range(256))
+    assert TensorSpec.from_dict(tokens.to_dict()) == tokens
+
+
+@pytest.mark.parametrize(
+    ("file", "reason"),
+    [
+        ("../words.json", "leaves the directory"),
+        ("deep/../../words.json", "leaves the directory"),
+        ("/etc/passwd", "is absolute"),
+        ("..", "leaves the directory"),
+        ("C:\\words.json", "characters that no file"),
+        ("..\\words.json", "characters that no file"),
+        ("words\0.json", "characters that no file"),
+        ("./words.json", "empty or a dot"),
+        ("deep//words.json", "empty or a dot"),
+        ("x" * 300, "too long"),
+    ],
+)
+def test_a_file_that_is_not_in_the_folder_is_refused(file, reason):
+    with pytest.raises(SpecError, match=reason):
+        TensorSpec.from_dict({**TEXT, "tokenizer": file})
+    with pytest.raises(SpecError, match=reason):
+        TensorSpec.from_dict({**STATE, "statistics": f"{file}#x"})
+
+
+def test_the_files_of_a_tensor():
+    assert TensorSpec.from_dict(TEXT).assets() == ["words.json"]
+    assert TensorSpec.from_dict(STATE).assets() == ["s.json"]
+    assert TensorSpec.from_dict(IMAGE).assets() == []
+
+
+@pytest.mark.parametrize("change", [{"tokenizer": ""}, {"max_tokens": 0}])
+def test_a_text_input_needs_tokenizer_and_width(change):
+    with pytest.raises(SpecError, match=r"text input 'say' needs 'tokenizer'.*'max_tokens'"):
+        TensorSpec.from_dict({**TEXT, "shape": [1, 5], **change})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"statistics": 5, "normalisation": "mean_std"},
+        {"kind": "text", "tokenizer": "words.json", "max_tokens": "many", "shape": [1, 5]},
+        {"labels": "xy"},
+        {"labels": 7},
+    ],
+    ids=str,
+)
+def test_a_value_of_a_wrong_type_is_a_spec_error_and_no_traceback(change):
+    with pytest.raises(SpecError):
+        TensorSpec.from_dict({"name": "state", "shape": [1, 2], **change})
+
+
+@pytest.mark.parametrize("data", [None, "image", 3, ["image"]])
+def test_a_tensor_must_be_a_mapping(data):
+    with pytest.raises(SpecError, match="must be a mapping"):
+        TensorSpec.from_dict(data)
+
+
+def test_a_tensor_without_a_name_is_refused():
+    with pytest.raises(SpecError, match="needs 'name'"):
+        TensorSpec.from_dict({"shape": [1, 2]})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inputs": []}, "at least one input"),
+        ({"outputs": []}, "at least one input and one output"),
+        ({"inputs": None}, "needs 'inputs', a list"),
+        ({"outputs": {"name": "action"}}, "needs 'outputs', a list"),
+        ({"inputs": [IMAGE, IMAGE]}, "'image' occurs 2 times"),
+        ({"outputs": [{**ACTION, "name": "image"}]}, "'image' occurs 2 times"),
+        ({"control_hz": 0}, "control_hz is 0"),
+        ({"control_hz": -1.0}, "control_hz is -1.0"),
+        ({"control_hz": float("nan")}, "control_hz must be a number; got nan"),
+        ({"control_hz": True}, "control_hz must be a number; got True"),
+        ({"control_hz": "fast"}, "control_hz must be a number; got 'fast'"),
+        ({"chunk": 0}, "chunk must be a whole number from 1; got 0"),
+        ({"chunk": 2.0}, "chunk must be a whole number from 1; got 2.0"),
+        ({"chunk": 2, "execute": 3}, "execute 3"),
+        ({"chunks": 2}, "unknown key 'chunks'; did you mean 'chunk'"),
+    ],
+)
+def test_an_impossible_spec_is_refused(change, message):
+    with pytest.raises(SpecError, match=message):
+        PolicySpec.from_dict({**SPECS[0], **change})
+
+
+def test_a_spec_needs_its_rate():
+    with pytest.raises(SpecError, match="needs 'control_hz'"):
+        PolicySpec.from_dict({"inputs": [IMAGE], "outputs": [ACTION]})
+
+
+def test_a_step_count_of_a_wrong_type_is_a_spec_error_and_no_traceback():
+    with pytest.raises(SpecError):
+        PolicySpec.from_dict({**SPECS[0], "execute": "all"})

@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import DataError
+from vlatool.gate.claims import accuracy
+from vlatool.gate.claims.accuracy import data_of, examine
+from vlatool.gate.config import AccuracyClaim
+from vlatool.stage.base import Context
+
+
+def test_a_bundle_is_no_worse_than_itself(float_bundle: Bundle) -> None:
+    found = examine(float_bundle, float_bundle, AccuracyClaim(max_drop=0.0), Context())
+    assert found.verdict == "pass"
+    (measured,) = found.measurements
+    assert (measured.name, measured.value, measured.low, measured.high) == ("recorded_drop", 0, 0, 0)
+    assert "more distance from the expert's actions than the baseline has: +0.00%" in found.sentence
+
+
+@pytest.mark.parametrize(("off", "verdict"), [(0.0, "pass"), (3.0, "fail")])
+def test_actions_that_leave_the_experts_fail(
+    float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, off: float, verdict: str
+) -> None:
+    real = accuracy.run_recorded
+
+    def run(bundle, recording, indices, engine, context):
+        found = real(float_bundle, recording, indices, engine, context)
+        return found + off if bundle is worse else found
+
+    monkeypatch.setattr(accuracy, "run_recorded", run)
+    worse = Bundle.open(float_bundle.path)
+    assert examine(worse, float_bundle, AccuracyClaim(), Context()).verdict == verdict
+
+
+@pytest.mark.parametrize("expert", [True, False])
+def test_an_element_that_should_hold_still_and_does_not_fails(
+    float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, expert: bool
+) -> None:
+    """The last element never changes in the recordings: the expert's standard deviation of it is 0."""
+    real = accuracy.run_recorded
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files if expert or name != "action"}
+    if expert:
+        data["action"][..., -1] = -1.0
+    np.savez(tmp_path / "still.npz", **data)
+
+    def run(bundle, recording, indices, engine, context):
+        found = real(float_bundle, recording, indices, engine, context).copy()
+        found[..., -1] = 1.0 if bundle is opens else -1.0
+        return found
+
+    monkeypatch.setattr(accuracy, "run_recorded", run)
+    opens, claim = Bundle.open(float_bundle.path), AccuracyClaim(data=tmp_path / "still.npz")
+    assert examine(float_bundle, float_bundle, claim, Context()).verdict == "pass"
+    assert examine(opens, float_bundle, claim, Context()).verdict == "fail"
+
+
+def test_without_an_expert_the_baselines_actions_are_right(
+    float_bundle: Bundle, int8_bundle: Bundle, tmp_path: Path
+) -> None:
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        np.savez(tmp_path / "own.npz", **{name: stored[name] for name in stored.files if name != "action"})
+    claim = AccuracyClaim(max_drop=1.0, data=tmp_path / "own.npz")
+    found = examine(int8_bundle, float_bundle, claim, Context())
+    assert "distance from the baseline's actions:" in found.sentence
+    assert found.measurements[0].value > 0
+    assert examine(float_bundle, float_bundle, claim, Context()).measurements[0].value == 0
+
+
+def test_a_gate_says_how_much_of_a_chunk_is_judged(float_bundle: Bundle, tmp_path: Path) -> None:
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files}
+    np.savez(tmp_path / "first.npz", **data | {"action": data["action"][:, 0]})
+    found = examine(float_bundle, float_bundle, AccuracyClaim(data=tmp_path / "first.npz"), Context())
+    assert "first.npz records 1 of the 4 actions of each chunk: the first one alone is held" in found.sentence
+    whole = examine(float_bundle, float_bundle, AccuracyClaim(), Context())
+    assert "of each chunk" not in whole.sentence
+
+
+def test_a_baseline_that_does_not_do_its_task_decides_nothing(float_bundle: Bundle, tmp_path: Path) -> None:
+    with np.load(float_bundle.path / "data/evaluation.npz") as stored:
+        data = {name: stored[name] for name in stored.files}
+    np.savez(tmp_path / "other.npz", **data | {"action": data["action"][::-1]})
+    claim = AccuracyClaim(max_drop=1.0, data=tmp_path / "other.npz")
+    found = examine(float_bundle, float_bundle, claim, Context())
+    assert found.verdict == "inconclusive"
+    assert found.sentence.startswith("The reference fails, so that nothing can be held against it: the baseline makes")
+    assert {each.name for each in found.baseline} == {"skill_expert", "variation"}
+
+
+def test_a_world_that_everybody_succeeds_in_decides_nothing(float_bundle: Bundle, policy_dir: Path) -> None:
+    world = policy_dir / "environment.py"
+    world.write_text(world.read_text().replace('{"success": done and good}', '{"is_success": True}'))
+    claim = AccuracyClaim(max_drop=0.5, episodes=8, policy=policy_dir)
+    found = examine(float_bundle, float_bundle, claim, Context())
+    assert found.verdict == "inconclusive"
+    assert "100.0% of 8 closed-loop episodes, and actions that do not look" in found.sentence
+
+
+def test_episodes_are_paired(float_bundle: Bundle, int8_bundle: Bundle, policy_dir: Path) -> None:
+    claim = AccuracyClaim(max_drop=0.5, episodes=8, policy=policy_dir)
+    found = examine(int8_bundle, float_bundle, claim, Context())
+    recorded, loop = found.measurements
+    assert (recorded.name, loop.name, loop.samples) == ("recorded_drop", "success_drop", 8)
+    assert "more failed episodes: +0.00%" in found.sentence
+    strict = examine(int8_bundle, float_bundle, claim.model_copy(update={"max_drop": 0.01}), Context())
+    assert strict.verdict in ("inconclusive", "fail"), "eight episodes do not show that at most 1 % more fail"
+
+
+def test_without_data_and_episodes_there_is_nothing_to_examine(float_bundle: Bundle, tmp_path: Path, resealed) -> None:
+    bare = Bundle.open(shutil.copytree(float_bundle.path, tmp_path / "bare"))
+    shutil.rmtree(bare.path / "data")
+    bare = resealed(bare)
+    with pytest.raises(DataError, match=r"the baseline .*bare carries no evaluation data .*no episodes") as caught:
+        data_of(bare, AccuracyClaim())
+    assert "accuracy: null" in caught.value.fix
+    assert data_of(bare, AccuracyClaim(episodes=5)) is None
+    assert data_of(bare, AccuracyClaim(data=tmp_path)) == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "wanted"), [(0.0, -0.02, 0.02, 400), (0.02, 0.0, 0.04, 400), (0, 0, 0.1, 10_000)]
+)
+def test_it_says_how_many_would_decide(value: float, low: float, high: float, wanted: int) -> None:
+    told = accuracy._Drop("recorded_drop", "away:", value, low, high, 100).told(0.01)
+    assert told.endswith(f", about {wanted:,} would decide")
+
+
+def test_what_is_decided_needs_no_more() -> None:
+    assert "would decide" not in accuracy._Drop("recorded_drop", "away:", 0.0, -0.01, 0.01, 100).told(0.01)
+    assert "would decide" not in accuracy._Drop("recorded_drop", "away:", 0.01, -0.01, 0.03, 100).told(0.01)
+
+
+def test_one_recorded_episode_decides_nothing() -> None:
+    told = accuracy._Drop("recorded_drop", "away:", 0.2, -math.inf, math.inf, 60)
+    assert told.verdict(0.01) == "inconclusive"
+    assert told.told(0.01) == (
+        "away: +20.00% (unbounded to unbounded, 60 of them; allowed: +1.00%), of one episode alone, "
+        "which says nothing of others"
+    )
+    assert accuracy.finite(-math.inf) is None

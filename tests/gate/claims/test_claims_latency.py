@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from vlatool.gate.claims.latency import change, examine, examine_all, slower, told
+from vlatool.gate.config import LatencyClaim
+from vlatool.measurement.pairs import Pairs
+from vlatool.stats.sequential import Decision
+
+
+@pytest.mark.parametrize(
+    ("slowdown", "verdict"), [(0.0, "pass"), (-0.3, "pass"), (0.12, "fail"), (0.5, "fail"), (0.05, "inconclusive")]
+)
+def test_the_verdict_follows_the_slowdown(timed, slowdown: float, verdict: str) -> None:
+    found = examine(timed(slowdown), LatencyClaim())
+    assert (found.claim, found.verdict) == ("latency", verdict)
+    assert [measured.name for measured in found.measurements] == ["latency_ratio", "latency_mean_ratio"]
+    for measured in found.measurements:
+        assert measured.low < 1 + slowdown < measured.high
+        assert measured.samples == (40 if verdict == "inconclusive" else 10)
+
+
+def test_a_few_slow_observations_fail_by_the_mean(timed, monkeypatch) -> None:
+    """Two of twenty observations take twice as long: the median is that of the baseline."""
+
+    def measured(job, timeout):
+        base = 5 * np.exp(0.02 * np.random.default_rng(job.seed).normal(size=60))
+        places = [number % 20 for number in range(60)]
+        mine = [2 * ms if place < 2 else ms for ms, place in zip(base, places, strict=True)]
+        return Pairs(tuple(base), tuple(mine), tuple(places))
+
+    processes = timed()
+    monkeypatch.setattr(timed, "measure_pairs", measured)
+    found = examine(processes, LatencyClaim())
+    assert found.verdict == "fail"
+    assert found.sentence.startswith("the mean over observations is 7.2% slower")
+    assert found.measurements[0].value == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("slow", "verdict"), [(20, "fail"), (19, "fail"), (18, "pass"), (0, "pass")])
+def test_one_observation_that_is_slow_each_time_fails(timed, monkeypatch, slow: int, verdict: str) -> None:
+    def measured(job, timeout):
+        further = (math.log(3),) * slow + (0.0,) * (20 - slow)
+        return Pairs((5.0,) * 60, (5.0,) * 60, slow=further if job.seed == 3 else (), slow_input="recorded: 3x")
+
+    processes = timed()
+    monkeypatch.setattr(timed, "measure_pairs", measured)
+    found = examine(processes, LatencyClaim())
+    assert found.verdict == verdict
+    assert ("1 of 10 processes found an observation that is slower by more than 50% each time: recorded: 3x"
+            in found.sentence) == (verdict == "fail")  # fmt: skip
+    assert examine(processes, LatencyClaim(worst=2.5)).verdict == "pass"
+
+
+@pytest.mark.parametrize(("slow", "verdicts"), [(4, ["pass", "fail"]), (1, ["fail", "pass"])])
+def test_each_number_of_threads_is_a_claim_of_its_own(timed, monkeypatch, slow: int, verdicts: list[str]) -> None:
+    """As fast as the baseline with one thread, slower with four: and the other way round."""
+
+    def measured(job, timeout):
+        base = 5 * np.exp(0.02 * np.random.default_rng(job.seed).normal(size=60))
+        return Pairs(tuple(base), tuple(base * (1.3 if job.threads == slow else 1.0)))
+
+    processes = timed()
+    monkeypatch.setattr(timed, "measure_pairs", measured)
+    found = examine_all(processes, LatencyClaim(also_threads=(4,)))
+    assert [each.verdict for each in found] == verdicts
+    assert [each.claim for each in found] == ["latency", "latency, 4 threads"]
+    assert len({each.name for part in found for each in part.measurements}) == 4
+
+
+def test_a_process_that_was_measured_is_not_measured_again(timed) -> None:
+    processes = timed(0.0)
+    examine(processes, LatencyClaim())
+    assert len(processes.pairs) == 10
+    first = [pairs.log_ratio for pairs in processes.pairs]
+    examine(processes, LatencyClaim(looks=(12,)))
+    assert [pairs.log_ratio for pairs in processes.pairs][:10] == first
+    assert len(processes.pairs) == 12
+
+
+def test_the_sentence_says_what_was_found_and_what_could_have_been() -> None:
+    fine = told(Decision("pass", 0.98, 0.95, 1.01, 0.05, 10, 0.02))
+    assert fine.startswith("2.0% faster (-5.0% to +1.0%, 10 processes; allowed: +5.0%); a slowdown of ")
+    assert "would decide" not in fine
+    open_ = told(Decision("inconclusive", 1.04, 0.0, math.inf, 0.05, 10, 0.02))
+    assert "4.0% slower (unbounded to unbounded, 10 processes" in open_
+    assert "processes would decide" in open_
+    assert (slower(1.0), change(1.1)) == ("0.0% slower", "+10.0%")

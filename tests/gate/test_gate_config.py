@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vlatool.errors import RecipeError
+from vlatool.gate.config import Gate, LatencyClaim, read_gate
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "gate.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_the_defaults_claim_everything_but_a_deadline(tmp_path: Path) -> None:
+    gate = read_gate(written(tmp_path, "{}"))
+    assert gate == Gate()
+    assert gate.latency == LatencyClaim()
+    assert gate.latency.margin == 0.05
+    assert gate.latency.looks == (10, 20, 40)
+    assert gate.accuracy
+    assert gate.memory
+    assert gate.size
+    assert gate.deadline is None
+
+
+def test_a_gate_is_read_as_it_was_written(tmp_path: Path) -> None:
+    first = read_gate(written(tmp_path, "{latency: {margin: 0.02, looks: [12]}, size: null, deadline: {ms: 20}}"))
+    assert read_gate(written(tmp_path, first.to_yaml())) == first
+    assert first.size is None
+    assert first.deadline
+    assert (first.deadline.ms, first.deadline.percent) == (20, 99)
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
+    text = "{baseline: models/base, accuracy: {data: ../d.npz, policy: /abs}}"
+    gate = read_gate(written(tmp_path, text))
+    assert gate.baseline == tmp_path / "models/base"
+    assert gate.accuracy
+    assert gate.accuracy.data == tmp_path / "../d.npz"
+    assert gate.accuracy.policy == Path("/abs")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("- 1", "must be a mapping; got list"),
+        ("{latency: {margin: -1}}", "latency.margin: Input should be greater than or equal to 0"),
+        ("{latency: {looks: [3]}}", "looks must ascend and begin at 8 or later"),
+        ("{latency: {looks: [5, 20, 40]}}", "looks must ascend and begin at 10 or later"),
+        ("{latency: {looks: [20, 10]}}", "looks must ascend"),
+        ("{latency: {looks: []}}", "looks must ascend"),
+        ("{latency: {also_threads: [0]}}", "also_threads.0: Input should be greater than or equal to 1"),
+        ("{answers: {follows: 2}}", "answers.follows: Input should be less than or equal to 1"),
+        ("{answers: {observations: 3}}", "answers.observations: Input should be greater than or equal to 24"),
+        ("{latency: {speed: 3}}", "latency.speed: Extra inputs are not permitted"),
+        ("{memroy: {margin: 1}}", "memroy: Extra inputs are not permitted"),
+        ("{deadline: {ms: 0}}", "deadline.ms: Input should be greater than 0"),
+        ("{deadline: {ms: 5, percent: 98}}", "percent must be one of 50, 90, 95, 99, 99.9"),
+        ("{deadline: {}}", "deadline.ms: Field required"),
+        ("{accuracy: {max_drop: 2}}", "accuracy.max_drop: Input should be less than or equal to 1 (got 2)"),
+        ("{latency: null, accuracy: null, answers: null, memory: null, size: null}", "every claim is null"),
+        ("{schema: 2}", "schema: Input should be less than or equal to 1"),
+        ("{latency: {margin: fast}}", "latency.margin: Input should be a valid number"),
+        ("{latency: {margin: yes}}", "latency.margin: Input should be a number, not a truth value (got True)"),
+        ("{a: [", "is not valid YAML"),
+        ("baseline: 2024-02-30", "is not valid YAML: day is out of range"),
+    ],
+)
+def test_what_is_impossible_is_named(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(RecipeError) as caught:
+        read_gate(written(tmp_path, text))
+    assert says in caught.value.message
+    assert "gate.yaml" in caught.value.message
+
+
+def test_a_percentage_is_told_how_a_share_is_written(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"max_drop: .* \(got '1%'\)") as caught:
+        read_gate(written(tmp_path, "{accuracy: {max_drop: 1%}}"))
+    assert "0.05 is 5 %" in caught.value.fix
+    with pytest.raises(RecipeError) as caught:
+        read_gate(written(tmp_path, "{accuracy: {max_drop: 2}}"))
+    assert caught.value.fix == "docs/reference/gate.md says what each key takes"
+
+
+def test_a_missing_gate_says_how_to_write_one(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"There is no gate") as caught:
+        read_gate(tmp_path / "gate.yaml")
+    assert caught.value.fix == "write one: vlatool gate init"
+    with pytest.raises(RecipeError, match=r"cannot be read"):
+        read_gate(tmp_path)

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import read_drawn
+from vlatool.errors import DataError
+from vlatool.gate import inputs
+from vlatool.gate.inputs import AGREEMENT, TIMING, Inputs
+
+
+def states(drawn) -> list[list[float]]:
+    return [each.observation["proprio"].tolist() for each in drawn]
+
+
+def test_each_process_and_purpose_draws_its_own_and_a_seed_draws_them_again(float_bundle: Bundle) -> None:
+    inputs = Inputs(float_bundle, None, seed=7)
+    first = states(inputs.draw(20, TIMING, 0))
+    assert states(Inputs(float_bundle, None, seed=7).draw(20, TIMING, 0)) == first
+    for other in (
+        inputs.draw(20, TIMING, 1),
+        inputs.draw(20, AGREEMENT),
+        Inputs(float_bundle, None, 8).draw(20, TIMING),
+    ):
+        assert states(other) != first
+
+
+def test_recordings_are_the_baselines_and_the_gates(float_bundle: Bundle, policy_dir: Path) -> None:
+    assert [len(each) for each in Inputs(float_bundle, None, 0).recordings] == [16, 24]
+    inputs = Inputs(float_bundle, policy_dir / "calibration.npz", 0)
+    assert [len(each) for each in inputs.recordings] == [24, 16, 24]
+    assert inputs.told().startswith("observations are drawn from 64 recorded ones and the vocabulary with the seed 0; ")
+
+
+def test_without_recordings_the_spec_alone_is_drawn_from(float_bundle: Bundle, tmp_path: Path, resealed) -> None:
+    bare = Bundle.open(shutil.copytree(float_bundle.path, tmp_path / "bare"))
+    shutil.rmtree(bare.path / "data")
+    inputs = Inputs(resealed(bare), None, 0)
+    assert {each.kind for each in inputs.draw(20, TIMING)} == {"drawn"}
+    assert "from the spec alone: none is recorded" in inputs.told()
+
+
+def test_large_observations_are_fewer(float_bundle: Bundle, monkeypatch) -> None:
+    monkeypatch.setattr(inputs, "LARGEST", 3000)
+    assert len(Inputs(float_bundle, None, 0).draw(50, TIMING)) == 11
+
+
+def test_the_file_is_gone_in_the_end(float_bundle: Bundle) -> None:
+    inputs = Inputs(float_bundle, None, 3)
+    with inputs.file(9, TIMING, 2) as path:
+        assert states(read_drawn(path)) == states(inputs.draw(9, TIMING, 2))
+    assert not path.parent.exists()
+
+
+def test_data_of_another_policy_are_an_error(float_bundle: Bundle, tmp_path: Path) -> None:
+    np.savez(tmp_path / "own.npz", image=np.zeros((3, 8, 8, 3), np.uint8))
+    with pytest.raises(DataError, match="has no 'proprio'"):
+        _ = Inputs(float_bundle, tmp_path / "own.npz", 0).recordings

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import GateFailed, GraphError, MissingExtra, TargetError, UsageError
+from vlatool.measurement import child
+from vlatool.measurement.child import SAID, answer, ask, ended, message, raise_said, signal_name
+from vlatool.measurement.job import Limits
+
+
+def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def fail() -> dict[str, object]:
+        raise MissingExtra("onnxruntime is absent.", "pip install it")
+
+    answer(fail)
+    line = capsys.readouterr().out
+    assert f'"{SAID}": "MissingExtra"' in line
+    done = SimpleNamespace(stdout="noise\n" + line, stderr="", returncode=0)
+    monkeypatch.setattr(child.subprocess, "run", lambda *_, **__: done)
+    with pytest.raises(MissingExtra, match="onnxruntime is absent") as caught:
+        ask("any", (), "", "x")
+    assert (caught.value.fix, caught.value.exit_code) == ("pip install it", 4)
+
+
+def test_a_real_process_says_what_is_wrong(float_bundle: Bundle) -> None:
+    with pytest.raises(UsageError, match="There is no engine 'foo'") as caught:
+        ask("vlatool.measurement.cold_start", (str(float_bundle.path), "foo", "1"), "", "x")
+    assert caught.value.exit_code == 2
+
+
+def test_a_process_that_dies_is_named() -> None:
+    with pytest.raises(GraphError, match=r"x cannot be run in a fresh process: .*no_such_module"):
+        ask("vlatool.no_such_module", (), "", "x")
+
+
+@pytest.mark.parametrize(
+    ("code", "log", "told"),
+    [
+        (-9, "", "was killed (SIGKILL) while it was measured, as it is when memory runs out"),
+        (-11, "noise", "ended with SIGSEGV while it was measured"),
+        (3, "first\nlast line", "last line"),
+        (1, "", "exit code 1"),
+    ],
+)
+def test_how_a_process_ended_is_told(code, log, told) -> None:
+    error = ended("x", code, log, Limits(), "while it was measured")
+    assert isinstance(error, GraphError)
+    assert told in error.message
+
+
+def test_a_process_under_a_limit_did_not_fit_only_where_memory_ended_it() -> None:
+    limits = Limits(memory_mb=50)
+    assert isinstance(ended("x", -9, "", limits), GraphError), "something else killed it"
+    assert isinstance(ended("x", 1, "MemoryError", limits), GateFailed)
+    with pytest.raises(GateFailed, match="more than 50 MB"):
+        raise_said({SAID: "GraphError", "message": "std::bad_alloc", "fix": ""}, limits)
+    raise_said({"result": 1}, limits)
+
+
+@pytest.mark.parametrize("name", ["annotations", "require", "NoSuchError", "ValueError"])
+def test_what_is_no_error_of_vlatool_is_raised_as_the_other_one(name):
+    with pytest.raises(TargetError, match="it broke"):
+        raise_said({SAID: name, "message": "it broke"}, otherwise=TargetError)
+
+
+def test_signals_have_names_where_there_are_some():
+    assert [signal_name(code) for code in (-9, -40)] == ["SIGKILL", "signal 40"]
+    assert "SIGSEGV" in ended("x", -11, "", Limits()).message
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ('{"a": 1}\n', {"a": 1}),
+        ('{"result": {"blocks_ms": [[0.1, 0.', {}),
+        ("an engine says hello", {}),
+        ("[1]", {}),
+        ("", {}),
+    ],
+)
+def test_a_line_that_its_process_did_not_live_to_end_is_no_message(text, wanted) -> None:
+    assert message(text) == wanted

@@ -1,0 +1,142 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from vlatool.bundle.bundle import LOCATION
+from vlatool.bundle.program import single_graph
+from vlatool.errors import SourceError, SpecError
+from vlatool.module.description import read_description, read_location, write_location
+
+SPEC = {
+    "inputs": [{"name": "x", "shape": [1, 2]}],
+    "outputs": [{"name": "y", "shape": [1, 2]}],
+    "control_hz": 10,
+}
+STEP = {"graph": "main", "feeds": {"x": "x"}, "gives": {"y": "y"}}
+
+
+def write(folder: Path, data: Any = None, **changes: Any) -> Path:
+    content = data if data is not None else {"name": "tiny", "spec": SPEC, **changes}
+    (folder / "policy.yaml").write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return folder
+
+
+def test_a_complete_description(policy_dir: Path):
+    described = read_description(policy_dir)
+    assert (described.name, described.version, described.license) == ("tiny", "1.2.0", "MIT")
+    assert described.factory == "policy.py:make"
+    assert described.arguments == {"layers": 1}
+    assert described.environment["tasks"] == ["reach", "push"]
+    assert described.parts["head"] == ["head"]
+    assert described.program == single_graph(described.spec)
+    assert described.assets() == {"statistics.json", "vocabulary.json"}
+    assert described.calibration == policy_dir / "calibration.npz"
+    assert described.evaluation == policy_dir / "evaluation.npz"
+
+
+def test_file_and_directory_say_the_same(policy_dir: Path):
+    assert read_description(policy_dir / "policy.yaml") == read_description(policy_dir)
+
+
+def test_a_short_description_has_defaults(tmp_path: Path):
+    described = read_description(write(tmp_path))
+    assert (described.version, described.factory, described.arguments) == ("0.0.0", "", {})
+    assert described.calibration is None
+    assert described.assets() == set()
+
+
+def test_an_own_program_is_read(tmp_path: Path):
+    described = read_description(write(tmp_path, program=[{**STEP, "graph": "head", "repeat": 2}]))
+    assert described.program[0].repeat == 2
+
+
+def test_recorded_data_may_have_another_name(tmp_path: Path):
+    (tmp_path / "walks.npz").touch()
+    assert read_description(write(tmp_path, calibration="walks.npz")).calibration == tmp_path / "walks.npz"
+
+
+@pytest.mark.parametrize("named", ["file", "folder"])
+def test_no_description(tmp_path: Path, named):
+    with pytest.raises(SourceError, match=r"There is no .*policy.yaml") as caught:
+        read_description(tmp_path / "policy.yaml" if named == "file" else tmp_path)
+    assert "your-own-policy" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("name: [", "is not valid YAML"),
+        ("name: !!python/object/apply:os.getcwd []", "only plain values are read"),
+        ("", "must be a mapping; got NoneType"),
+        ("- name", "must be a mapping; got list"),
+        ({"spec": SPEC}, "has no 'name'"),
+        ({"name": "tiny"}, "has no 'spec'"),
+        ({"name": "tiny", "spec": SPEC, "sauce": "policy.py:make"}, "unknown key 'sauce'; did you mean 'source'"),
+        (
+            {"name": "tiny", "spec": SPEC, "calibration": "absent.npz"},
+            "calibration data absent.npz, which does not exist",
+        ),
+        ({"name": "tiny", "spec": SPEC, "evaluation": "absent.npz"}, "evaluation data absent.npz"),
+    ],
+)
+def test_a_description_that_is_wrong(tmp_path: Path, data, message):
+    with pytest.raises(SourceError, match=message):
+        read_description(write(tmp_path, data))
+
+
+def test_text_that_is_no_utf8(tmp_path: Path):
+    (tmp_path / "policy.yaml").write_bytes(b"\xff\xfe")
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_description(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"spec": None},
+        {"spec": {**SPEC, "control_hz": 0}},
+        {"program": []},
+        {"program": [{**STEP, "feeds": {"x": "z"}}]},
+    ],
+    ids=["no spec", "rate", "empty program", "unknown value"],
+)
+def test_an_impossible_spec_or_program(tmp_path: Path, changes):
+    with pytest.raises(SpecError):
+        read_description(write(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"arguments": ["layers"]}, {"environment": "env.py:make"}, {"parts": "head"}],
+    ids=lambda value: str(value),
+)
+def test_a_mapping_that_is_none_is_a_source_error_and_no_traceback(tmp_path: Path, changes):
+    with pytest.raises(SourceError, match=next(iter(changes))):
+        read_description(write(tmp_path, **changes))
+
+
+def test_a_newer_schema_asks_for_an_upgrade(tmp_path: Path):
+    with pytest.raises(SourceError, match="schema") as caught:
+        read_description(write(tmp_path, schema=99))
+    assert caught.value.fix == "upgrade vlatool"
+
+
+def test_the_place_of_the_code_is_noted(tmp_path: Path):
+    bundle, folder = tmp_path / "bundle", tmp_path / "policy"
+    bundle.mkdir()
+    folder.mkdir()
+    write_location(bundle, folder)
+    assert read_location(bundle) == folder
+    folder.rmdir()
+    with pytest.raises(SourceError, match="which is gone"):
+        read_location(bundle)
+
+
+@pytest.mark.parametrize("text", [None, "", "{}", "[]"])
+def test_a_bundle_that_does_not_say_where_its_code_is(tmp_path: Path, text):
+    if text is not None:
+        (tmp_path / LOCATION).write_text(text)
+    with pytest.raises(SourceError, match="does not say where the policy's code is"):
+        read_location(tmp_path)

@@ -1,0 +1,241 @@
+"""The search: variants, mixed plans, resuming, and what it never does."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.hardware.profile import load_profile
+from vlatool.optimize import search as search_module
+from vlatool.optimize.judge import Budget
+from vlatool.optimize.recipe import Limits
+from vlatool.optimize.search import BF16, Search, Trial, built, processor_has, variants_for
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.sensitivity.layers import LayerError
+from vlatool.stage.base import Context
+from vlatool.stage.run import cached_transform
+
+BAD = ({"quantize.static_int8": {"samples": 1, "method": "percentile", "percentile": 60, "per_channel": False}},)
+
+
+@pytest.fixture
+def search(float_bundle, tmp_path):
+    def start(profile: str | None = "raspberry-pi-5", **limits) -> Search:
+        given = limits or {"metric": "relative_error", "max_metric": 0.1}
+        return Search(float_bundle, Limits(**given), load_profile(profile) if profile else None, tmp_path, Context())
+
+    return start
+
+
+def test_a_board_with_onnx_runtime_alone_gets_its_variants() -> None:
+    assert set(variants_for(load_profile("raspberry-pi-5"), calibrated=True)) == {
+        "dynamic_int8",
+        "static_int8",
+        "static_int8_mse",
+        "static_int8_attention",
+    }
+    assert set(variants_for(load_profile("raspberry-pi-5"), calibrated=False)) == {"dynamic_int8"}
+
+
+def test_bfloat16_is_tried_only_where_the_processor_has_it() -> None:
+    nuc = variants_for(load_profile("intel-nuc-13-pro"), calibrated=True)
+    assert "openvino_int8" in nuc
+    assert "openvino_bf16" not in nuc
+    assert not processor_has(load_profile("intel-nuc-13-pro"), *BF16)
+
+
+def test_convolutions_are_tried_only_where_the_processor_has_matrix_units(monkeypatch: pytest.MonkeyPatch) -> None:
+    def options(*features: str) -> list[dict[str, Any]]:
+        monkeypatch.setattr(search_module, "isa", lambda: features)
+        return [each for (stage,) in variants_for(None, calibrated=True).values() for each in stage.values()]
+
+    assert not any("convolutions" in each for each in options("avx512_vnni", "avx512_bf16"))
+    with_amx = options("amx_tile", "amx_bf16", "amx_int8")
+    assert {"layout": "openvino", "compute": "bfloat16"} in with_amx, "the same without convolutions races, too"
+    assert {"layout": "openvino", "compute": "bfloat16", "convolutions": True, "attention": True} in with_amx
+    assert {"convolutions": True} in [each for (stage,) in variants_for(None, calibrated=False).values()
+                                      for each in stage.values()]  # fmt: skip
+
+
+def test_a_plan_with_the_graphs_of_another_one_is_not_tried_again(search) -> None:
+    run = search(metric="relative_error", max_metric=0.5)
+    stages = ({"quantize.static_int8": {}},)
+    first, again = run._try("first", stages), run._try("again", stages)
+    assert first.speedup > 0
+    assert (again.speedup, again.note) == (0.0, "It has the graphs of first.")
+    assert run._try("first", stages).speedup > 0
+
+
+def test_every_variant_can_be_built_as_stages() -> None:
+    for stages in variants_for(None, calibrated=True).values():
+        assert len(built(stages)) == 1
+
+
+def test_every_plan_is_tried_and_the_fastest_inside_join(search) -> None:
+    run = search(metric="relative_error", max_metric=0.5)
+    found = run.run({"static_int8": ({"quantize.static_int8": {}},)})
+    assert {trial.name for trial in run.trials} >= {"static_int8", "static_int8_mse", "dynamic_int8"}
+    assert all(trial.speedup > 0 and math.isfinite(trial.error) for trial in run.trials)
+    assert "static_int8" not in found
+    table = run.tables()["Plans tried by the search"]
+    assert len(table) == len(run.trials)
+
+
+def test_a_plan_that_cannot_be_made_is_a_trial_that_says_why(search) -> None:
+    run = search()
+    trial = run._try("lost", ({"quantize.static_int8": {"include": ["nothing_like_it"]}},))
+    assert trial.speedup == 0
+    assert "nothing_like_it" in trial.note
+    assert not trial.within
+
+
+@pytest.mark.filterwarnings("ignore:ranges from")
+def test_a_bad_plan_is_mended_by_leaving_layers_in_float(search) -> None:
+    run = search(metric="relative_error", max_metric=1.0)
+    bad = run._try("bad", BAD)
+    assert bad.error > 0.02
+    run.budget = Budget("relative_error", 0.6 * bad.error)
+    run._mix(bad, built(BAD)[-1])
+    mixed = [trial for trial in run.trials if "mixed" in trial.name]
+    assert mixed
+    assert min(trial.error for trial in mixed) < bad.error
+    assert any(trial.within for trial in mixed)
+    assert all("exclude" in trial.stages[-1]["quantize.static_int8"] for trial in mixed)
+
+
+def test_when_nothing_is_inside_the_most_accurate_plan_stays(search) -> None:
+    run = search(metric="relative_error", max_metric=0.0)
+    found = run.run({})
+    assert len(found) == 1
+    least = min((trial for trial in run.trials if trial.speedup), key=lambda trial: trial.error)
+    assert list(found) == [least.name]
+
+
+def made_at(cache: Path) -> dict[Path, int]:
+    """Return when each file of the stages in a cache was written."""
+    return {path: path.stat().st_mtime_ns for path in (cache / "stages").rglob("*") if path.is_file()}
+
+
+def test_a_second_search_makes_and_measures_nothing_again(search, tmp_path) -> None:
+    search().run({})
+    before = made_at(tmp_path)
+    search().run({})
+    assert made_at(tmp_path) == before
+
+
+def test_an_interrupted_search_goes_on_where_it_was(search, tmp_path) -> None:
+    first = search()
+    told: list[str] = []
+
+    def stop(what: str, share: float | None) -> None:
+        told.append(what)
+        if "plan 2" in what:
+            raise KeyboardInterrupt
+
+    first.context = Context(stop)
+    with pytest.raises(KeyboardInterrupt):
+        first.run({})
+    kept = made_at(tmp_path)
+    assert kept
+    search().run({})
+    assert made_at(tmp_path).items() >= kept.items()
+    assert "of at most" in told[0]
+
+
+def test_the_estimate_leaves_out_as_many_layers_as_independent_errors_need(search) -> None:
+    run = search()
+    run.budget = Budget("relative_error", 0.05)
+    layers = [
+        LayerError(str(index), "main", error, {}, 0.0, 0.0, 0.1) for index, error in enumerate((0.09, 0.03, 0.03))
+    ]
+    assert run._estimate(layers, 0.1) == 1
+    assert run._estimate(layers, 0.05) == 1
+    assert run._estimate(layers, 10.0) == 3
+
+
+def test_finalists_are_the_fastest_inside_and_the_most_accurate(search) -> None:
+    run = search()
+    run.trials = [
+        Trial("a", BAD, 4.0, 0.04, True),
+        Trial("b", BAD, 3.9, 0.03, True),
+        Trial("c", BAD, 5.0, 0.09, False),
+        Trial("d", BAD, 1.5, 0.01, True),
+        Trial("e", BAD, 0.5, 0.001, True),
+    ]
+    assert [trial.name for trial in run._finalists()] == ["a", "b"]
+    run.trials.pop()
+    assert [trial.name for trial in run._finalists()] == ["a", "b", "d"]
+
+
+def test_the_plan_of_a_trial_makes_the_bundle_that_was_tried(search, float_bundle: Bundle, tmp_path: Path) -> None:
+    run = search(metric="relative_error", max_metric=0.5)
+    trial = run._try("static_int8", ({"quantize.static_int8": {"samples": 8}},))
+    stage = built(trial.stages)[-1]
+    assert isinstance(stage, StaticInt8)
+    made = cached_transform(stage, float_bundle, tmp_path, Context())
+    assert run._error(made, Context()) == trial.error
+
+
+@pytest.mark.parametrize(("isa", "tried"), [("[avx2, fma, f16c]", True), ("[avx2, fma, f16c, avx_vnni]", False)])
+def test_a_board_without_vnni_also_tries_products_that_do_not_saturate(tmp_path: Path, isa: str, tried: bool) -> None:
+    pytest.importorskip("openvino")
+    text = (Path(__file__).parents[2] / "profiles/intel-nuc-13-pro.yaml").read_text(encoding="utf-8")
+    (tmp_path / "board.yaml").write_text(text.replace("[avx2, fma, f16c, avx_vnni]", isa), encoding="utf-8")
+    found = variants_for(load_profile(tmp_path / "board.yaml"), calibrated=True)
+    assert ("openvino_int8_reduced" in found) is tried
+    assert "openvino_int8" in found, "int8 is tried, though it may lose"
+
+
+def test_engines_that_cannot_be_compared_have_finalists_of_their_own(search) -> None:
+    run = search()
+    run.trials = [
+        Trial("a", BAD, 4.0, 0.04, True, "", "ort_cpu"),
+        Trial("b", BAD, 0.7, 0.03, True, "", "openvino"),
+        Trial("c", BAD, 0.6, 0.09, False, "", "openvino"),
+        Trial("d", BAD, 2.0, 0.05, True, "", "ort_cpu"),
+    ]
+    assert [trial.name for trial in run._finalists()] == ["a", "b"]
+    run._apart = True
+    table = run.tables()["Plans tried by the search"]
+    assert [(each["plan"], each["against float32 in"]) for each in table] == [
+        ("b", "openvino"), ("c", "openvino"), ("a", "ort_cpu"), ("d", "ort_cpu"),
+    ]  # fmt: skip
+
+
+def test_a_plan_is_mended_though_another_engine_is_faster_on_this_host(search, monkeypatch) -> None:
+    mended: list[str] = []
+    monkeypatch.setattr(Search, "_mix", lambda _self, trial, _stage: mended.append(trial.name))
+    for engine, wanted in (("openvino", ["slow"]), ("ort_cpu", [])):
+        run = search()
+        run.trials = [
+            Trial("fast", BAD, 4.0, 0.01, True, "", "ort_cpu"),
+            Trial("slow", BAD, 2.0, 0.5, False, "", engine),
+        ]
+        mended.clear()
+        run._repair()
+        assert mended == wanted
+
+
+def test_a_trial_is_timed_against_float32_in_its_own_engine_where_engines_are_apart(search, monkeypatch) -> None:
+    pytest.importorskip("openvino")
+    seen: dict[str, str] = {}
+    measure = search_module.cached_measure
+
+    def watched(stage: Any, *more: Any) -> Any:
+        if stage.name() == "benchmark.latency":
+            seen[stage.against[0].name.split("-")[0]] = stage.engine
+        return measure(stage, *more)
+
+    monkeypatch.setattr(search_module, "cached_measure", watched)
+    run = search(metric="relative_error", max_metric=0.5)
+    run._apart = True
+    own = run._try("own", ({"quantize.dynamic_int8": {}},))
+    other = run._try("other", ({"quantize.static_int8": {"samples": 8, "layout": "openvino"}},))
+    assert seen == {"quantize.dynamic_int8": "ort_cpu", "quantize.static_int8": "openvino"}
+    assert (own.engine, other.engine) == ("ort_cpu", "openvino")
+    assert own.speedup > 0
+    assert other.speedup > 0

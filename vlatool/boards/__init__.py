@@ -1,0 +1,1 @@
+"""What a policy would do on a board."""

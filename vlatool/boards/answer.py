@@ -1,0 +1,274 @@
+"""Which board for a policy: from a source or bundle to a report (``vlatool hwselect``)."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vlatool.boards.board import Candidate, outcomes, quantized_as
+from vlatool.boards.measured import measured_questions
+from vlatool.boards.report import boards_report
+from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
+from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
+from vlatool.boards.torch_workload import counted_apart
+from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.errors import DataError, OutputError, SourceError, UsageError, nearest
+from vlatool.export.onnx import ExportOnnx
+from vlatool.files.written import note_file
+from vlatool.graph.stored import digest, read_workload, refuse_other, write_workload
+from vlatool.graph.workload import PRECISIONS, Workload, workload
+from vlatool.hardware.platforms import load_platform
+from vlatool.hardware.profile import Profile, load_profile, names
+from vlatool.latency_model.model import LatencyModel, shipped
+from vlatool.machine.host import cache_directory
+from vlatool.module.description import read_location
+from vlatool.module.origin import origin_of
+from vlatool.report import Report
+from vlatool.sources import sourced
+from vlatool.stage.base import Context
+from vlatool.stage.run import cached_transform
+
+CARRIED = "workload.json"
+"""File beside ``policy.yaml`` that holds the count of a policy."""
+
+
+@dataclass(frozen=True)
+class Asked(Wants):
+    """What a user asks for, and where to look.
+
+    Args:
+        platform: Robot platform that gives rate, watts and battery where they are not given.
+        boards: Profiles to look at; all when empty.
+        cloud: Whether to compare with rented machines.
+    """
+
+    platform: str | None = None
+    boards: tuple[str, ...] = ()
+    cloud: bool = False
+
+
+def select_boards(source: str, asked: Asked, context: Context, calibration: Path | None = None) -> Report:
+    """Return the report of ``vlatool hwselect``.
+
+    Raises:
+        UsageError: when a precision is unknown.
+        ProfileError: when a board or platform is unknown.
+        VlatoolError: when the policy cannot be counted.
+    """
+    if asked.per_chunk and asked.latency_ms and not asked.hz:
+        raise UsageError("--per-chunk asks how often the loop ticks.", "give --hz, too, or leave it out")
+    for precision in asked.precisions:
+        if precision not in PRECISIONS:
+            raise UsageError(f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.")
+    if asked.platform:
+        sheet = load_platform(asked.platform)
+        asked = replace(
+            asked,
+            hz=asked.hz or (None if asked.latency_ms else sheet.control_hz),
+            watts=asked.watts or sheet.compute_watts,
+            battery_wh=asked.battery_wh or sheet.battery_wh,
+        )
+    boards = [load_profile(name) for name in (asked.boards or names())]
+    bundle = opened(source, context)
+    load = counted(bundle, context)
+    spec = bundle.manifest.spec
+    asked = replace(asked, execute=spec.executed)
+    if asked.hz is None and asked.latency_ms is None:
+        asked = replace(asked, hz=spec.control_hz)
+    model = shipped().conditioned(measured_questions(calibration))
+    owned = [board for board in boards if board.price_usd_per_hour is None]
+    rented = [board for board in boards if board.price_usd_per_hour is not None]
+    context.tell("predicting", None)
+    cloud = _cheapest(rented, load, model, asked) if asked.cloud else None
+    choices = choose(owned or rented, load, model, asked)
+    return boards_report(source, load, choices, asked, cloud, context.command)
+
+
+def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wants: Wants) -> Choice | None:
+    """Return the cheapest rented machine that answers in time, network included."""
+    if not rented:
+        return None
+    found = [choice for choice in choose(rented, load, model, in_the_cloud(wants)) if choice.state == "fits"]
+    prices = {choice.profile.name: choice.profile.price_usd_per_hour for choice in found}
+    return min(found, key=lambda choice: prices[choice.profile.name].value, default=None)  # type: ignore[union-attr]
+
+
+def opened(source: str, context: Context) -> Bundle:
+    """Return the bundle that is named, or the source bundle of a policy."""
+    if (Path(source) / MANIFEST).is_file():
+        return Bundle.open(Path(source), verify=False)
+    return sourced(source, cache_directory(), context)
+
+
+def counted(bundle: Bundle, context: Context) -> Workload:
+    """Return the work of one inference of a bundle or source.
+
+    It is kept in the cache by the bundle's hash; a policy may carry its count, too (``carry_count``).
+    """
+    file = cache_directory() / "workloads" / f"{bundle.hash.removeprefix('sha256:')[:32]}.json"
+    if (found := read_workload(file)) is not None:
+        return found
+    if bundle.manifest.graphs:
+        found = workload(bundle)
+    elif _may_carry(bundle) and (carried := read_workload(_beside(bundle), digest(bundle))) is not None:
+        return carried
+    elif "factory" in bundle.manifest.source:
+        found = _counted_source(bundle, context)
+    else:
+        found = _counted_export(bundle, context)
+    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+        write_workload(file, found)
+    return found
+
+
+def _counted_source(bundle: Bundle, context: Context) -> Workload:
+    """Count a policy without its weights; where that cannot be, export it and count its graphs.
+
+    A factory that reads its own weights cannot fill modules that have none, and may look at their values.
+    """
+    context.tell("counting the policy's work, without its weights", None)
+    with contextlib.suppress(SourceError):  # what is wrong with the policy itself, the export says
+        return counted_apart(bundle, context.tell)
+    context.tell("it cannot be counted so; exporting the policy to count its graphs", None)
+    return _counted_export(bundle, context)
+
+
+def _counted_export(bundle: Bundle, context: Context) -> Workload:
+    return workload(cached_transform(ExportOnnx(), bundle, cache_directory(), context))
+
+
+def carry_count(source: str, context: Context) -> Path:
+    """Write the count of a policy beside its ``policy.yaml``: whoever has it then chooses boards without torch.
+
+    The count holds as long as all of ``digest`` is what was counted.
+
+    Raises:
+        UsageError: when the source is a bundle or an ONNX file, which are counted without torch, or its factory lies in
+            a package, whose changes nobody would notice.
+        OutputError: when the file cannot be written, or is none that was counted.
+    """
+    bundle = opened(source, context)
+    if not _may_carry(bundle):
+        if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
+            raise UsageError(f"{source} is counted without torch; only a policy with code carries a count.")
+        raise UsageError(
+            f"The factory of {source} lies in a package ({bundle.manifest.source['factory']}), whose changes nobody "
+            "would notice.",
+            "put the code beside policy.yaml, or leave --carry-count out: the count is in the cache",
+        )
+    file = origin_of(bundle).folder / CARRIED
+    refuse_other(file)
+    found = counted(bundle, context)
+    try:
+        write_workload(file, found, digest(bundle))
+        note_file(file)
+    except OSError as error:
+        raise OutputError(f"{file} cannot be written: {error.strerror}.", "make the folder writable") from error
+    return file
+
+
+def _may_carry(bundle: Bundle) -> bool:
+    """Say whether a count can be known to be of this code: it lies beside ``policy.yaml``, or comes with vlatool."""
+    if bundle.manifest.graphs:
+        return False
+    source = bundle.manifest.source
+    return bool(source.get("code")) or str(source.get("factory", "")).startswith("vlatool.")
+
+
+def _beside(bundle: Bundle) -> Path:
+    return read_location(bundle.path) / CARRIED
+
+
+def simulated(
+    source: str, board: str, mode: str | None, engine: str | None, precision: str, context: Context
+) -> dict[str, Any]:
+    """Return what ``vlatool simulate`` prints, as JSON values.
+
+    Raises:
+        ProfileError: when the board, its mode or its engine is unknown.
+        UsageError: when the engine does not compute in the precision.
+        DataError: when nothing can be predicted; says why.
+    """
+    profile = load_profile(board)
+    name = mode or profile.default_mode
+    profile.mode(name)
+    candidate = Candidate(profile, name, engine or profile.engine, precision)
+    if precision and precision not in candidate.figures.dtypes:
+        raise UsageError(f"--precision is '{precision}'; {nearest(precision, candidate.figures.dtypes)}.")
+    bundle = opened(source, context)
+    spec, load = bundle.manifest.spec, counted(bundle, context)
+    model = shipped().conditioned(measured_questions())
+    outcome = outcomes([candidate], load, model)[0]
+    if not outcome.latency.known:
+        raise DataError(f"{source} on {board}: {outcome.latency.why}.", _fix_of(load))
+    phases = bounds(outcome, model.shares)
+    return {
+        "source": source, "profile": board, "mode": name, "engine": candidate.engine,
+        "precision": precision or quantized_as(load) or "float32", "origin": "predicted",
+        "latency_ms": [outcome.latency.ms, outcome.latency.low, outcome.latency.high],
+        "regime": outcome.latency.regime, "memory_mb": outcome.memory_mb, "watts": outcome.watts,
+        "joules": outcome.joules, "execute": spec.executed, "control_hz": spec.control_hz,
+        "phases": [
+            {"name": bound.phase.name, "runs": bound.phase.runs, "ms": bound.phase.ms, "shares": dict(bound.shares),
+             "parts": parts_of(bound.phase, load.graphs[bound.phase.name], model.shares)}
+            for bound in phases
+        ],
+        "timeline": [*timeline(phases)],
+        "changes": [_change(change) for change in changes(candidate, load, model)],
+    }  # fmt: skip
+
+
+FIXED_SHAPES = (
+    "give every axis a number: write the shapes into the spec of a policy.yaml beside the ONNX file, or export it with "
+    "fixed shapes"
+)
+
+
+def _fix_of(load: Workload) -> str:
+    return FIXED_SHAPES if load.unknown else "try another --engine or --precision"
+
+
+def _part_lines(phases: list[dict[str, Any]]) -> list[str]:
+    told = []
+    for phase in phases:
+        shares = sorted(phase["parts"].items(), key=lambda item: -item[1])
+        if shares:
+            told.append(f"  {phase['name']}: {', '.join(f'{name} {share:.0%}' for name, share in shares)}")
+    return ["parts of a graph, by the work that they have", *told] if told else []
+
+
+def _change(change: Change) -> dict[str, Any]:
+    latency = change.outcome.latency
+    return {
+        "name": change.name, "latency_ms": latency.ms if latency.known else None, "why": latency.why,
+        "memory_mb": change.outcome.memory_mb[0], "joules": change.outcome.joules if latency.known else None,
+    }  # fmt: skip
+
+
+def simulation_lines(found: dict[str, Any]) -> list[str]:
+    """Return the text of a simulation."""
+    ms, low, high = found["latency_ms"]
+    where = ", ".join(found[name] for name in ("profile", "mode", "engine", "precision"))
+    costs = f"{found['memory_mb'][0]:.0f} MB, {found['watts'][0]:.0f} W, {found['joules']:.3g} J"
+    count, hz = found["execute"], found["control_hz"]
+    actions = f"each of the {count} actions that are executed of it" if count > 1 else "each action"
+    share = ms / count * hz / 1e3
+    busy = f"busy {share:.1%} of the time" if share < 1 else f"{share:.3g} times the time that there is"
+    lines = [
+        f"PREDICTED for {where}; nothing was run there",
+        f"{ms:.4g} ms an inference (80 %: {low:.4g}-{high:.4g}), {costs}",
+        f"{actions}: {ms / count:.3g} ms, {found['joules'] / count:.3g} J; at the policy's {hz:g} Hz {busy}",
+        "", *found["timeline"], *_part_lines(found["phases"]), "", "what a change would give",
+    ]  # fmt: skip
+    for change in found["changes"]:
+        if change["latency_ms"] is None:
+            lines.append(f"  {change['name']}: unknown ({change['why']})")
+            continue
+        ratio = ms / change["latency_ms"]
+        word = f"{ratio:.2f}x as fast" if ratio >= 1 else f"{1 / ratio:.2f}x slower"
+        costs = f"{change['memory_mb']:.0f} MB, {change['joules']:.3g} J"
+        lines.append(f"  {change['name']}: {change['latency_ms']:.3g} ms ({word}), {costs}")
+    return lines

@@ -1,0 +1,268 @@
+"""A policy on a board: what computes, how long it takes, how much memory, power and energy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from vlatool.errors import ProfileError, nearest
+from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
+from vlatool.hardware.profile import EngineFigures, Profile
+from vlatool.latency_model.features import Place, Question, Shares, Work, roofline_parts
+from vlatool.latency_model.model import LatencyModel, Predicted
+from vlatool.latency_model.published import published_as
+
+FLOAT32 = 4
+BUSY, BUSY_LOW, BUSY_HIGH = 0.65, 0.45, 0.95
+"""Share of a mode's power limit that a board draws at the wall while it infers. Of 414 published runs on Jetson AGX
+Orin 32 GB and AGX Xavier (MLPerf, wall power) the medians by runtime lie at 0.46-0.82."""
+IDLE = 0.3
+"""Share of the limit drawn when nothing runs, where the profile does not know it."""
+PACKED, PACKED_HIGH = 1.3, 2.0
+"""Times the weights that a process holds: engines keep a packed copy of some. Measured with ONNX Runtime and OpenVINO
+on an x86 host: 1.0 to 1.9."""
+ARENA, ARENA_HIGH = 3.0, 5.0
+"""Times the live tensors that an engine reserves."""
+EXTRA_MB, EXTRA_HIGH_MB = 15.0, 40.0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A board, how it is driven, and how the policy is stored.
+
+    Args:
+        precision: Of the weights and activations (a key of ``PRECISIONS``); empty: as the bundle is.
+    """
+
+    profile: Profile
+    mode: str
+    engine: str
+    precision: str = ""
+
+    @property
+    def figures(self) -> EngineFigures:
+        """What the profile says of the engine."""
+        return engine_figures(self.profile, self.engine)
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One graph of an inference on a candidate.
+
+    Args:
+        name: Of the graph.
+        runs: In one inference.
+        each: One run, predicted.
+        question: What was asked.
+    """
+
+    name: str
+    runs: int
+    each: Predicted
+    question: Question
+
+    @property
+    def ms(self) -> float:
+        """All runs."""
+        return self.runs * self.each.ms
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a candidate would do with one inference.
+
+    Args:
+        latency: Milliseconds of the whole inference.
+        memory_mb: Of the process, with bounds (10^6 bytes).
+        watts: At the wall while it infers, with bounds.
+    """
+
+    candidate: Candidate
+    phases: tuple[Phase, ...]
+    latency: Predicted
+    memory_mb: tuple[float, float, float]
+    watts: tuple[float, float, float]
+
+    @property
+    def joules(self) -> float:
+        """Energy of one inference; NaN when the latency is unknown."""
+        return self.watts[0] * self.latency.ms / 1e3
+
+    def average_watts(self, hz: float) -> float:
+        """Return what the board draws when it infers at that rate, idle in between."""
+        busy = min(1.0, hz * self.latency.ms / 1e3)
+        idle = idle_watts(self.candidate)
+        return idle + (self.watts[0] - idle) * busy
+
+
+def engine_figures(profile: Profile, engine: str) -> EngineFigures:
+    """Return what a profile says of an engine.
+
+    Raises:
+        ProfileError: when it has no such engine.
+    """
+    if engine not in profile.engines:
+        raise ProfileError(f"{profile.name} has no engine '{engine}'; {nearest(engine, profile.engines)}.")
+    return profile.engines[engine]
+
+
+def candidates(profile: Profile, load: Workload, modes: Iterable[str] | None = None) -> list[Candidate]:
+    """Return every way of running a policy on a board, the preferred engine and its fastest precision first.
+
+    A bundle that is quantized already is taken as it is, by the engines that compute in its precision.
+    """
+    if stored := quantized_as(load):
+        integer = any(graph.integer_ops for graph in load.graphs.values())
+        return [
+            Candidate(profile, mode, engine)
+            for mode in (profile.modes if modes is None else modes)
+            for engine, figures in profile.engines.items()
+            if stored in figures.dtypes and (figures.integer_ops or not integer)
+        ]
+    return [
+        Candidate(profile, mode, engine, precision)
+        for mode in (profile.modes if modes is None else modes)
+        for engine, figures in profile.engines.items()
+        for precision in figures.dtypes
+    ]
+
+
+def place_of(candidate: Candidate) -> Place:
+    """Return what computes, at the clocks of the power mode."""
+    profile, figures = candidate.profile, candidate.figures
+    caps, part = profile.mode(candidate.mode), profile.units[figures.unit]
+    unit = "igpu" if figures.runtime == "openvino-igpu" else figures.unit
+    peaks = {dtype: profile.peak_tops(figures.unit, dtype, candidate.mode) or math.nan for dtype in part.peak_tops}
+    own = part.bandwidth_gb_s.value if part.bandwidth_gb_s else math.inf
+    return Place(
+        published_as().get((profile.name, unit), profile.name), unit,
+        caps.cores.get(figures.unit, part.cores.value), caps.clock_mhz.get(figures.unit, part.clock_mhz.value) / 1e3,
+        peaks, min(own, caps.bandwidth_gb_s), candidate.mode, " ".join(part.isa),
+    )  # fmt: skip
+
+
+def outcomes(asked: Sequence[Candidate], load: Workload, model: LatencyModel) -> list[Outcome]:
+    """Predict every candidate; all questions go to the model at once."""
+    questions: list[Question] = []
+    spans: list[list[tuple[str, int]]] = []
+    for candidate in asked:
+        place = place_of(candidate)
+        spans.append([(name, runs) for name, runs in load.runs.items() if load.graphs[name].layers])
+        for name, _ in spans[-1]:
+            graph = load.graphs[name]
+            precision = candidate.precision or stored_precision(graph)
+            questions.append(Question(work_of(graph), place, candidate.figures.runtime, precision))
+    told = [_floored(*pair) for pair in zip(questions, model.predict(questions), strict=True)]
+    answers = iter(zip(questions, told, strict=True))
+    found = []
+    for candidate, span in zip(asked, spans, strict=True):
+        phases = tuple(
+            Phase(name, runs, answer, question) for (name, runs), (question, answer) in zip(span, answers, strict=False)
+        )
+        latency = _whole(candidate, load, phases)
+        found.append(Outcome(candidate, phases, latency, memory_mb(candidate, load), watts(candidate)))
+    return found
+
+
+def work_of(graph: GraphWorkload) -> Work:
+    """Return one run of a graph as the latency model sees it."""
+    return Work(sum(graph.macs.values()), graph.reads, graph.activations, graph.layers, graph.traits)
+
+
+def quantized_as(load: Workload) -> str:
+    """Return the precision of a bundle that is not float32 any more, empty for one that is."""
+    if all(set(graph.macs) <= {"float32"} for graph in load.graphs.values()):
+        return ""
+    name = max(load.graphs, key=lambda graph: sum(load.graphs[graph].macs.values()) * load.runs.get(graph, 0))
+    return stored_precision(load.graphs[name])
+
+
+def _floored(question: Question, answer: Predicted) -> Predicted:
+    """Lift a prediction to what the peaks allow: no board is faster than its operations and its memory."""
+    if not answer.known:
+        return answer
+    parts = roofline_parts(question, Shares(1.0, 1.0, 1.0, 0.0))
+    least = max(parts["compute"], parts["memory"])
+    return replace(answer, ms=max(answer.ms, least), low=max(answer.low, least), high=max(answer.high, least))
+
+
+def _whole(candidate: Candidate, load: Workload, phases: Sequence[Phase]) -> Predicted:
+    """Add up the phases; their errors are of one board and one runtime, so the bounds add up too."""
+    if load.unknown:
+        count = len(load.unknown)
+        return Predicted(math.nan, why=f"{count} layers have no static shape, for example {load.unknown[0]}")
+    if not phases:
+        return Predicted(math.nan, why="the graphs have no matrix product or convolution to count")
+    if not candidate.figures.runtime:
+        return Predicted(math.nan, why=f"no latency was published for {candidate.engine}")
+    unknown = next((phase.each for phase in phases if not phase.each.known), None)
+    if unknown is not None:
+        return unknown
+    ms, low, high = (sum(phase.runs * getattr(phase.each, name) for phase in phases) for name in ("ms", "low", "high"))
+    regimes = {phase.each.regime for phase in phases}
+    return Predicted(ms, low, high, "unseen" if "unseen" in regimes else min(regimes))
+
+
+def memory_mb(candidate: Candidate, load: Workload) -> tuple[float, float, float]:
+    """Return the memory of the process in MB (10^6 bytes) and its bounds, which are a judgement."""
+    base = candidate.figures.base_mb.value
+    weights = weight_bytes(load, candidate.precision) / 1e6
+    width = PRECISIONS[candidate.precision][1] / FLOAT32 if candidate.precision else 1.0
+    live = load.peak_bytes * width / 1e6
+    return (
+        base + PACKED * weights + ARENA * live + EXTRA_MB, base + weights + live,
+        base + PACKED_HIGH * weights + ARENA_HIGH * live + EXTRA_HIGH_MB,
+    )  # fmt: skip
+
+
+def weight_bytes(load: Workload, precision: str) -> float:
+    """Return the bytes of all weights at a precision; tables that are looked up stay at 16 bits at least."""
+    if not precision:
+        return float(load.weight_bytes)
+    each, other = PRECISIONS[precision][0], max(2.0, PRECISIONS[precision][0])
+    products = sum(graph.weights for graph in load.graphs.values())
+    elements = sum(_elements(graph) for graph in load.graphs.values())
+    return products * each + max(0.0, elements - products) * other
+
+
+def _elements(graph: GraphWorkload) -> float:
+    """Return the numbers in all weights of a float32 graph; of another one, those of its products."""
+    whole = set(graph.macs) <= {"float32"}
+    return graph.weight_bytes / FLOAT32 if whole else graph.weights
+
+
+def watts(candidate: Candidate) -> tuple[float, float, float]:
+    """Return what the board draws while it infers, and its bounds: shares of the limit of the mode."""
+    limit = power_limit(candidate)
+    return BUSY * limit, BUSY_LOW * limit, BUSY_HIGH * limit
+
+
+def power_limit(candidate: Candidate) -> float:
+    """Return the most that the board draws in the mode."""
+    return candidate.profile.mode(candidate.mode).power_w or candidate.profile.power_w.value
+
+
+def idle_watts(candidate: Candidate) -> float:
+    """Return what the board draws when nothing runs."""
+    idle = candidate.profile.idle_w
+    limit = power_limit(candidate)
+    return min(idle.value if idle else IDLE * limit, BUSY_LOW * limit)
+
+
+def at(load: Workload, scale: dict[str, tuple[float, float, float]], runs: dict[str, int] | None = None) -> Workload:
+    """Return a workload with graphs changed: name -> factors of multiply-accumulates, weights and activations."""
+    graphs = {}
+    for name, graph in load.graphs.items():
+        macs, weights, activations = scale.get(name, (1.0, 1.0, 1.0))
+        graphs[name] = replace(
+            graph,
+            macs={kind: int(count * macs) for kind, count in graph.macs.items()},
+            weights=int(graph.weights * weights),
+            read_again=int(graph.read_again * weights),
+            weight_bytes=int(graph.weight_bytes * weights),
+            activations=int(graph.activations * activations),
+            activation_bytes=int(graph.activation_bytes * activations),
+            peak_bytes=int(graph.peak_bytes * activations),
+        )
+    return Workload(graphs, {**load.runs, **(runs or {})})

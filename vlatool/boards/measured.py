@@ -1,0 +1,168 @@
+"""Measurements of a user on a board, as the latency model takes them: ``vlatool profiles calibrate``."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vlatool.boards.board import Candidate, place_of
+from vlatool.errors import DataError, ProfileError
+from vlatool.files.edited import whole_file
+from vlatool.graph.workload import PRECISIONS, TRAITS, WORK, Workload, whole_work
+from vlatool.hardware.profile import Profile, load_profile, names
+from vlatool.latency_model.features import Question, Work
+from vlatool.machine.host import matches
+from vlatool.report import read_report
+
+PLACES = "VLATOOL_CALIBRATIONS"
+NUMBERS = ("macs", "weights", "activations", "layers")
+LAYOUT = 1
+AGAIN = "remove it, and make it again: vlatool profiles calibrate PROFILE --from REPORT"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One latency on a board.
+
+    Args:
+        profile, mode, engine, precision: As in a profile.
+        work: One inference.
+        ms: Median.
+    """
+
+    profile: str
+    mode: str
+    engine: str
+    precision: str
+    work: Mapping[str, Any]
+    ms: float
+
+    def question(self) -> Question:
+        """Return what the model would have been asked.
+
+        Raises:
+            ProfileError: when the profile, its mode or its engine is gone.
+        """
+        candidate = Candidate(load_profile(self.profile), self.mode, self.engine, self.precision)
+        macs, weights, activations, layers = (float(self.work[name]) for name in NUMBERS)
+        work = Work(macs, weights, activations, layers, frozenset(self.work.get("traits", ())))
+        return Question(work, place_of(candidate), candidate.figures.runtime, self.precision)
+
+
+def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload | None = None) -> list[Measured]:
+    """Return the latencies of a benchmark report that was made on a board.
+
+    Args:
+        report: ``report.json`` or the directory that holds it.
+        profile: The board that it was made on.
+        mode: Its power mode; the default one when None.
+        load: The work of the policy, for a report that does not hold it.
+
+    Raises:
+        DataError: when there is no such report, or it holds no latency with its work.
+        ProfileError: when the profile has no such mode.
+    """
+    found = []
+    missing = 0
+    name = mode or profile.default_mode
+    profile.mode(name)
+    told = read_report(report)
+    run = told.environment.get("run")
+    if isinstance(run, dict) and (run.get("rate_hz") or run.get("emulates")):
+        how = "was paced (--rate)" if run.get("rate_hz") else f"emulates {run['emulates']} on another machine"
+        raise DataError(f"{report} cannot calibrate {profile.name}: it {how}.", "measure back to back, on the board")
+    for row in told.rows:
+        latency = row.get("latency_p50")
+        if latency is None or not latency.known:
+            continue
+        tables = row.details.get(WORK) or [whole_work(load) if load else {}]
+        described = tables[0]
+        if not described:
+            missing += 1
+            continue
+        engine = str(described.get("engine") or profile.engine)
+        work = {key: described.get(key) for key in (*NUMBERS, "traits")}
+        made = Measured(profile.name, name, engine, str(described.get("precision")), work, latency.value)
+        if engine in profile.engines and is_sound(made):
+            found.append(made)
+    if not found:
+        why = "its rows do not say what they compute" if missing else "it holds no latency of an engine of this board"
+        raise DataError(
+            f"{report} cannot calibrate {profile.name}: {why}.",
+            "name the bundle that was measured with --bundle, or measure it again: vlatool benchmark BUNDLE -o DIR",
+        )
+    return found
+
+
+def elsewhere(report: Path, profile: Profile) -> str:
+    """Return what a report was made on when that is not the profile's board; empty when it is, or is not said."""
+    made_on = read_report(report).environment
+    said = [str(made_on[key]) for key in ("board", "cpu") if made_on.get(key)]
+    return "" if matches(profile.model_strings, made_on) else ", ".join(said)
+
+
+def store(measured: list[Measured]) -> Path:
+    """Keep measurements beside those of other boards; return the file."""
+    file = calibrations() / f"{measured[0].profile}.json"
+    known = [item for item in _read(file) if item not in measured] if file.is_file() else []
+    file.parent.mkdir(parents=True, exist_ok=True)
+    rows = [dict(vars(item)) for item in (*known, *measured)]
+    with whole_file(file) as draft:
+        draft.write_text(json.dumps({"schema": LAYOUT, "measured": rows}, indent=1) + "\n", encoding="utf-8")
+    return file
+
+
+def calibrations() -> Path:
+    """Return where measurements are kept: ``$VLATOOL_CALIBRATIONS``, or the user's data directory."""
+    named = os.environ.get(PLACES)
+    data = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return Path(named) if named else data / "vlatool" / "calibrations"
+
+
+def measured_questions(file: Path | None = None) -> list[tuple[Question, float]]:
+    """Return what a file of ``store`` holds, or all that is kept.
+
+    Raises:
+        DataError: when the file is missing or malformed, or its board's profile has changed.
+    """
+    found = []
+    for each in [file] if file else sorted(calibrations().glob("*.json")):
+        try:
+            found += [(item.question(), item.ms) for item in _read(each) if file or item.profile in names()]
+        except ProfileError as error:
+            raise DataError(f"The calibration {each} does not fit any more: {error.message}", AGAIN) from error
+    return found
+
+
+def _read(file: Path) -> list[Measured]:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+        found = [Measured(**row) for row in data["measured"]]
+    except OSError as error:
+        raise DataError(f"The calibration {file} cannot be read: {error.strerror}.", AGAIN) from error
+    except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
+        raise DataError(f"The calibration {file} is malformed: {type(error).__name__}: {error}.", AGAIN) from error
+    for item in found:
+        if not is_sound(item):
+            raise DataError(f"The calibration {file} is malformed: {item}.", AGAIN)
+    return found
+
+
+def is_sound(item: Measured) -> bool:
+    """Say whether a measurement can be learnt from: names, numbers above zero, a known precision, known traits."""
+    named = (item.profile, item.mode, item.engine, item.precision)
+    if not isinstance(item.work, Mapping) or not all(isinstance(name, str) for name in named):
+        return False
+    numbers = [item.ms, *(item.work.get(name) for name in NUMBERS)]
+    traits = item.work.get("traits")
+    return (
+        all(isinstance(value, int | float) and math.isfinite(value) and value > 0 for value in numbers)
+        and item.precision in PRECISIONS
+        and isinstance(traits, list | tuple)
+        and set(map(str, traits)) <= set(TRAITS)
+    )

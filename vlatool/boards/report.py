@@ -1,0 +1,169 @@
+"""The answer of ``hwselect`` as a report: a row for each board, with the reason in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from vlatool.boards.board import Outcome
+from vlatool.boards.select import Choice, Wants, cost
+from vlatool.bundle.bundle import MANIFEST
+from vlatool.graph.workload import Workload
+from vlatool.latency_model.model import LEVEL
+from vlatool.report import Measurement, Report, Row
+
+ROLES = {"fits": "within", "may fit": "subject", "unknown": "subject", "no": "outside"}
+WAY = "way"
+"""Table of a row that says how the board is driven: state, power mode, engine, precision."""
+
+
+def boards_report(
+    name: str, load: Workload, choices: Sequence[Choice], wants: Wants, cloud: Choice | None, command: str = ""
+) -> Report:
+    """Return the report, the best board first."""
+    first = next((choice for choice in choices if choice.state == "fits"), None)
+    rows = tuple(_row(choice, wants, cloud, chosen=choice is first) for choice in choices)
+    return Report(
+        "hwselect",
+        f"Boards for {name}",
+        "pass" if first else "fail" if all(choice.state == "no" for choice in choices) else "inconclusive",
+        summary=(*_summary(name, choices, first, wants), work_sentence(load), *chunk_sentence(first, wants)),
+        rows=rows,
+        limits=limits(wants),
+        command=command,
+        created=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        warnings=_warnings(first),
+    )
+
+
+def work_sentence(load: Workload) -> str:
+    """Say what one inference computes, graph by graph."""
+    parts = []
+    for name, runs in load.runs.items():
+        graph = load.graphs[name]
+        weights, macs = graph.weights, sum(graph.macs.values())
+        times = f", run {runs} times" if runs > 1 else ""
+        parts.append(f"{name} {_si(macs)} multiply-accumulates with {_si(weights)} weights{times}")
+    return f"One inference: {'; '.join(parts)}."
+
+
+def chunk_sentence(first: Choice | None, wants: Wants) -> list[str]:
+    """Say what a chunk of actions costs on the chosen board, and each action of it."""
+    if wants.execute < 2 or first is None or first.outcome is None:
+        return []
+    ms, joules, count = first.outcome.latency.ms, first.outcome.joules, wants.execute
+    told = (
+        f"One inference gives a chunk, of which {count} actions are executed: with one inference for each chunk, a "
+        f"control tick costs {_number(ms / count)} ms and {_number(joules / count)} J there."
+    )
+    if wants.per_chunk or not wants.hz:
+        return [told]
+    return [f"{told} This answer is for an inference at every tick; for one in each chunk: --per-chunk."]
+
+
+def limits(wants: Wants) -> dict[str, Any]:
+    """Return what was asked for: name with its unit -> value."""
+    asked = {
+        "hz": wants.hz, "ticks_an_inference": wants.execute if wants.per_chunk else None,
+        "latency_ms": wants.latency_ms, "max_watts": wants.watts, "max_price_usd": wants.price,
+        "memory_gb": wants.memory_gb, "precision": ", ".join(wants.precisions) or None,
+    }  # fmt: skip
+    return {name: value for name, value in asked.items() if value is not None}
+
+
+def _summary(name: str, choices: Sequence[Choice], first: Choice | None, wants: Wants) -> list[str]:
+    count = sum(choice.state == "fits" for choice in choices)
+    if first is None or first.outcome is None:
+        near = [choice for choice in choices if choice.state == "may fit"]
+        told = f"No board is certain to run {name} as asked"
+        if near:
+            return [f"{told}; {len(near)} may: {', '.join(choice.profile.name for choice in near[:4])}."]
+        return [f"{told}. The reasons stand beside the boards."]
+    found, way = first.outcome, first.outcome.candidate
+    fit = f"{count} boards that fit" if count > 1 else "1 board that fits"
+    text = (
+        f"{first.profile.name} is the cheapest of {fit}: {way.precision or 'as it is'} "
+        f"with {way.engine} at {way.mode}, about {_number(found.latency.ms)} ms "
+        f"({_number(found.latency.low)}-{_number(found.latency.high)}), {found.watts[0]:.0f} W, "
+        f"{first.profile.price_usd.value:,.0f} dollars."
+    )
+    hz = f" --hz {wants.inference_hz:g}" if wants.inference_hz else ""
+    if not way.precision:  # a bundle that is quantized already
+        return [text]
+    if (Path(name) / MANIFEST).is_file():
+        quantize = f"Next: vlatool quantize static-int8 {name} -o out/int8"
+        return [text, quantize] if way.precision == "int8" else [text]
+    out = f"out/{Path(name).stem}"
+    return [text, f"Next: vlatool optimize {name} --profile {first.profile.name}{hz} --max-drop 1% -o {out}"]
+
+
+def _warnings(first: Choice | None) -> tuple[str, ...]:
+    told = ["everything here is predicted; measure before you buy many: vlatool benchmark on one board, then "
+            "vlatool profiles calibrate --from its report"]  # fmt: skip
+    if first is not None:
+        told += list(first.profile.caveats[:2])
+    return tuple(told)
+
+
+def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) -> Row:
+    outcome = choice.outcome
+    way: dict[str, Any] = {"state": choice.state}
+    measurements = [Measurement("price", choice.profile.price_usd.value, "USD", "predicted", choice.profile.name)]
+    if outcome is not None:
+        candidate = outcome.candidate
+        way |= {"power mode": candidate.mode, "engine": candidate.engine, "precision": candidate.precision}
+        measurements += numbers(outcome, wants.execute)
+        spent = cost(choice, wants, cloud)
+        for name, value, unit in (
+            ("average_watts", spent.average_watts, "W"), ("owned_cost", spent.owned, "USD"),
+            ("cloud_cost", spent.cloud, "USD"), ("break_even", spent.break_even_hours, "h"),
+            ("battery_life", spent.battery_hours, "h"),
+        ):  # fmt: skip
+            if not math.isnan(value):
+                measurements.append(Measurement(name, value, unit, "predicted", choice.profile.name))
+    tables: Mapping[str, list[dict[str, Any]]] = {WAY: [way]}
+    role = "chosen" if chosen else ROLES[choice.state]
+    return Row(choice.profile.name, role, choice.reason, tuple(measurements), details=tables)
+
+
+def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
+    """Return latency, memory, power and energy of an inference as predictions, and of each action executed of it."""
+    where, latency = outcome.candidate.profile.name, outcome.latency
+    way = f"{outcome.candidate.engine}, power mode {outcome.candidate.mode}"
+    note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
+    low, high = (latency.low, latency.high) if latency.known else (None, None)
+    memory, power = outcome.memory_mb, outcome.watts
+    found = [
+        Measurement("latency_p50", latency.ms, "ms", "predicted", where, 0, low, high, LEVEL, note),
+        Measurement("memory", memory[0], "MB", "predicted", where, 0, memory[1], memory[2], LEVEL, JUDGED),
+        Measurement("usable_memory", 1e3 * outcome.candidate.profile.usable_memory_gb.value, "MB", "predicted", where),
+        Measurement("watts", power[0], "W", "predicted", where, 0, power[1], power[2], LEVEL, JUDGED),
+    ]
+    if latency.known:
+        ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
+        found.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
+        each = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
+        found += [Measurement(name, value / execute, unit, "predicted", where) for name, value, unit in each]
+    return found
+
+
+EVIDENCE = {
+    "known": "this runtime and precision were measured on this device",
+    "unseen": "from other devices, runtimes or precisions",
+    "calibrated": "with your own measurement on this device",
+}
+JUDGED = "bounds are a judgement, not a confidence interval"
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _si(value: float) -> str:
+    for factor, letter in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= factor:
+            return f"{value / factor:.3g} {letter}"
+    return f"{value:.0f}"

@@ -1,0 +1,1 @@
+"""A bundle: what its manifest says, its spec, its files."""

@@ -1,0 +1,263 @@
+"""A bundle on disk: open, verify, hash."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.manifest import FileRecord, Manifest, check_files
+from vlatool.errors import BundleError
+from vlatool.files.json import read_json
+from vlatool.files.limits import check, limit
+from vlatool.files.sealed import FIX, LITTER, held, open_inside, read_all, read_sealed, unlisted, verify_sealed
+from vlatool.files.written import LEDGER, hash_once
+
+MANIFEST = "manifest.json"
+DIGEST = "manifest.sha256"
+"""The SHA-256 of the manifest, as ``sha256sum`` writes it: what protects everything that the manifest says."""
+LOCATION = "location.json"
+REPORTS = "reports"
+UNRECORDED = (REPORTS, "recipe.yaml", MANIFEST, DIGEST, "SIGNATURE", LOCATION, LEDGER)
+"""Names at the top of a bundle that the manifest holds no hash of: they are written about the bundle."""
+ASSETS = "assets"
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A directory with a manifest whose files were verified when it was opened.
+
+    Example:
+        >>> bundle = Bundle.open(Path("out/vln-babyai"))     # doctest: +SKIP
+        >>> bundle.manifest.spec.control_hz                  # doctest: +SKIP
+        5
+    """
+
+    path: Path
+    manifest: Manifest
+    _verified: set[str] = field(default_factory=set, repr=False, compare=False)
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str], *, verify: bool = True) -> Bundle:
+        """Read the manifest, hold it against its digest, and check every file before anything else is parsed.
+
+        Args:
+            path: The directory.
+            verify: Check that the files are those of the manifest, with their sizes and SHA-256, and no others.
+
+        Raises:
+            BundleError: when the directory is missing, is no bundle, or a file is missing, changed, a link or unknown.
+            SpecError: for an impossible spec or program.
+        """
+        bundle = cls.described(path)
+        if verify:
+            bundle.verify()
+        return bundle
+
+    @classmethod
+    def described(cls, path: str | os.PathLike[str]) -> Bundle:
+        """Read the manifest, hold it against its digest; the files are checked when they are read (``read``).
+
+        Raises:
+            BundleError: when the directory is missing or is no bundle, or the manifest is changed or makes no sense.
+            SpecError: for an impossible spec or program.
+        """
+        root = Path(path)
+        bundle = cls(root, Manifest.from_dict(_read_manifest(root)))
+        check("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
+        return bundle
+
+    def verify(self, prefix: str = "") -> None:
+        """Check every file that was not verified by reading it, and that nothing else is there.
+
+        Args:
+            prefix: Check the content only of files whose names start with it.
+
+        Raises:
+            BundleError: when a file is missing, changed, a link, or not in the manifest.
+        """
+        self.check_tree()
+        for name in [name for name in self.manifest.files if name.startswith(prefix) and name not in self._verified]:
+            verify_sealed(self.path, name, *self._record(name))
+
+    def check_tree(self) -> None:
+        """Refuse what the manifest does not record, and a manifest that names files which it does not record.
+
+        Raises:
+            BundleError: naming the first such file.
+        """
+        check_files(self.manifest)
+        try:
+            stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
+        except OSError as error:
+            raise BundleError(f"{self.path} cannot be read: {error.strerror}.") from error
+        if stranger and (self.path / stranger).is_symlink():
+            raise BundleError(f"The bundle {self.path} holds {stranger}, which is a link; a bundle has none.", FIX)
+        if stranger:
+            raise BundleError(
+                f"The bundle {self.path} holds {stranger}, which its manifest does not record.",
+                f"remove it, or put it into {self.path / REPORTS}; or copy or export the bundle again",
+            )
+
+    def read(self, name: str, allowed: str = "") -> bytes:
+        """Return the content of a recorded file: the very bytes that were verified, read once.
+
+        Args:
+            name: As in the manifest.
+            allowed: Name of the limit on its size.
+
+        Raises:
+            BundleError: when the manifest does not record it, it is larger than the limit, or it is not what the
+                manifest says.
+        """
+        sha256, size = self._record(name)
+        if allowed:
+            check(allowed, size, f"{self.path / name}", BundleError)
+        content = read_sealed(self.path, name, sha256, size)
+        self._verified.add(name)
+        return content
+
+    def asset(self, name: str, allowed: str = "") -> bytes:
+        """Return the content of a file of ``assets/``; see ``read``."""
+        return self.read(f"{ASSETS}/{name}", allowed)
+
+    @contextlib.contextmanager
+    def held(self, folder: str, names: Iterable[str]) -> Iterator[Path]:
+        """Verify files that an engine opens by name, and give the directory ``folder`` while they stay as they are.
+
+        Raises:
+            BundleError: when a file is not what the manifest says, or changed before the block ended.
+        """
+        files = {name: self._record(name) for name in names}
+        with held(self.path, folder, files) as place:
+            yield place
+        self._verified.update(files)
+
+    def _record(self, name: str) -> tuple[str, int]:
+        if name not in self.manifest.files:
+            raise BundleError(f"The bundle {self.path} has no file '{name}'.")
+        record = self.manifest.files[name]
+        return record.sha256, record.bytes
+
+    @property
+    def hash(self) -> str:
+        """``sha256:...`` of the manifest, which in turn holds the hash of every file."""
+        return "sha256:" + hashlib.sha256(manifest_bytes(self.manifest)).hexdigest()
+
+    def file(self, name: str) -> Path:
+        """Return the path of a recorded file, to which no link leads.
+
+        Raises:
+            BundleError: when the manifest does not record it, or it or a directory above it is a link.
+        """
+        self._record(name)
+        path = self.path
+        for part in name.split("/"):
+            path /= part
+            if path.is_symlink():
+                raise BundleError(f"The bundle {self.path} lacks the file {name} (missing, or a link).", FIX)
+        return path
+
+    @property
+    def size_bytes(self) -> int:
+        """Sum of the sizes of all recorded files in bytes."""
+        return sum(record.bytes for record in self.manifest.files.values())
+
+    @property
+    def graph_bytes(self) -> int:
+        """Bytes of all graphs, with the weights that lie beside them, whatever their files are called."""
+        graphs = tuple(graph.file for graph in self.manifest.graphs.values())
+        folders = tuple(f"{folder}/" for graph in graphs if (folder := graph.rpartition("/")[0]))
+        beside = () if len(folders) == len(graphs) else tuple(name for name in self.manifest.files if "/" not in name)
+        wanted = (*graphs, *folders, *beside)
+        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(wanted))
+
+
+def seal(directory: Path, manifest: Manifest) -> Bundle:
+    """Hash every file below ``directory``, write ``manifest.json`` and its digest last, and return the bundle."""
+    files = {}
+    for path in sorted(directory.rglob("*")):
+        name = path.relative_to(directory).as_posix()
+        if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
+            found = path.stat()
+            linked = found.st_nlink > 1  # shared among stages of the cache, and read-only
+            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), found.st_size)
+    sealed = replace(manifest, files=files)
+    write_manifest(directory, sealed)
+    return Bundle(directory, sealed)
+
+
+def restate(bundle: Bundle, manifest: Manifest) -> Bundle:
+    """Write another manifest for a bundle whose files stay as they are, and return it."""
+    write_manifest(bundle.path, manifest)
+    return Bundle(bundle.path, manifest)
+
+
+def write_manifest(directory: Path, manifest: Manifest) -> None:
+    """Write ``manifest.json`` and ``manifest.sha256``."""
+    content = manifest_bytes(manifest)
+    (directory / MANIFEST).write_bytes(content)
+    (directory / DIGEST).write_bytes(digest_of(content))
+
+
+def manifest_bytes(manifest: Manifest) -> bytes:
+    """Return the one way in which a manifest is written."""
+    return (json.dumps(manifest.to_dict(), indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def digest_of(content: bytes) -> bytes:
+    """Return what ``manifest.sha256`` says of a manifest: ``sha256sum -c manifest.sha256`` reads it, too."""
+    return f"{hashlib.sha256(content).hexdigest()}  {MANIFEST}\n".encode()
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file as hex."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _digest(stream)
+
+
+def _digest(stream: Any) -> str:
+    """``hashlib.file_digest`` for Python 3.10."""
+    digest = hashlib.sha256()
+    while block := stream.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+def _read_manifest(root: Path) -> Any:
+    if not root.exists():
+        raise BundleError(f"There is no bundle at {root}.")
+    path = root / MANIFEST
+    if not path.is_file():
+        found = ", ".join(sorted(entry.name for entry in root.iterdir())[:6]) if root.is_dir() else "a file"
+        raise BundleError(
+            f"{root} is not a bundle: it has no {MANIFEST} (found: {found or 'nothing'}).",
+            "make one with: vlatool export SOURCE -o BUNDLE",
+        )
+    content = _read_small(root, MANIFEST, limit("manifest_bytes"))
+    check("manifest_bytes", len(content), f"{path}", BundleError)
+    _check_digest(root, content)
+    return read_json(content, f"{path}", BundleError, "export the policy again", strict=True)
+
+
+def _check_digest(root: Path, content: bytes) -> None:
+    if not (root / DIGEST).exists():
+        raise BundleError(
+            f"{root} has no {DIGEST}: a vlatool before there was one made it, or the file was taken away.",
+            f"export the policy again; or, if you trust this copy: cd {root} && sha256sum {MANIFEST} > {DIGEST}",
+        )
+    if _read_small(root, DIGEST, 4096) != digest_of(content):
+        raise BundleError(
+            f"{root / MANIFEST} has changed: its SHA-256 is not what {DIGEST} says.", "copy or export the bundle again"
+        )
+
+
+def _read_small(root: Path, name: str, most: int) -> bytes:
+    """Return the content of a file that is not recorded: up to ``most`` bytes, and one more when it has more."""
+    with open_inside(root, name) as handle:
+        return read_all(handle, min(os.fstat(handle).st_size, most))

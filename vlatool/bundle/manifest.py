@@ -1,0 +1,271 @@
+"""``manifest.json``: what a bundle is, which files it has, and how its graphs are run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from typing import Any
+
+from vlatool.bundle.program import ProgramStep, check_program, program_from
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import BundleError
+from vlatool.files.limits import check
+from vlatool.files.typed import finite, known, listed, mapping, outside, shown, text, whole
+
+SCHEMA = 1
+GOLDEN_TOLERANCE = 0.05
+"""Allowed relative L2 difference from the golden action where a manifest says none."""
+COMPUTES = ("", "float32", "bfloat16")
+SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """Size in bytes and SHA-256 (hex) of one file of a bundle."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Graph:
+    """One ONNX file of a policy.
+
+    Args:
+        file: Path inside the bundle.
+        precision: Share of the multiply-accumulates that run in each dtype, as exported (0-1); ``int4 weights`` where
+            the weights alone are int4.
+        opset: Opset of the default ONNX domain.
+        compute: Dtype in which the engine computes what is not quantized: ``bfloat16``, or float32 when empty.
+    """
+
+    file: str
+    precision: dict[str, float] = field(default_factory=dict)
+    opset: int = 0
+    compute: str = ""
+
+    def __post_init__(self) -> None:
+        _inside(self.file)
+        for name, share in mapping(self.precision, f"The precision of {self.file}", BundleError).items():
+            if not 0 <= finite(share, f"The share of {name} in {self.file}", BundleError) <= 1.001:
+                raise BundleError(f"The share of {name} in {self.file} is {shown(share)}; allowed: 0 to 1.")
+        whole(self.opset, f"The opset of {self.file}", BundleError)
+        if self.compute not in COMPUTES:
+            raise BundleError(
+                f"The graph {self.file} computes in {shown(self.compute)}; allowed: {', '.join(COMPUTES[1:])}."
+            )
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The content of ``manifest.json``.
+
+    Args:
+        name: Name of the policy.
+        version: Version of the policy, as its author counts.
+        spec: What the policy consumes and produces.
+        graphs: Graph name -> graph; empty in a source bundle.
+        program: How the graphs are run, in order.
+        files: Path inside the bundle -> SHA-256 and size, of every file but the reports.
+        parent: ``sha256:...`` of the bundle that this one was made from.
+        made_by: Version of vlatool, stage, options, versions of the packages that change the result.
+        build: The build record: for each stage from the source to this bundle what ``made_by`` says, the seed, the hash
+            of its input, the SHA-256 of its graphs, of its input files and of its calibration samples.
+        source: Factory and hashes of the code and weights (a source bundle, and those exported from it).
+        environment: Factory and tasks of the closed-loop evaluation.
+        parts: Part of the policy -> globs of module names.
+        golden: File with golden inputs and outputs; the outputs are what the graphs say, computed operator by operator.
+        golden_tolerance: Largest relative L2 difference from the golden action with which a machine loads the bundle,
+            from what was measured when it was made; ``GOLDEN_TOLERANCE`` when 0.
+        golden_chunk_tolerance: The same for the action in physical units, each element from the offset of its
+            statistics and in units of their spread; ``golden_tolerance`` when 0.
+        findings: What a stage found to be wrong: ``name``, ``message`` and what was measured. ``load``, ``optimize``
+            and ``gate`` refuse the bundle unless each is overruled by its name.
+        accuracy: Measured accuracy: name -> value, interval, samples.
+        description: One sentence.
+        license: SPDX identifier of the policy's licence.
+        engine: Engine that the graphs were made for; ONNX Runtime on the CPU when empty.
+        schema: Version of this format.
+    """
+
+    name: str
+    version: str
+    spec: PolicySpec
+    graphs: dict[str, Graph] = field(default_factory=dict)
+    program: tuple[ProgramStep, ...] = ()
+    files: dict[str, FileRecord] = field(default_factory=dict)
+    parent: str = ""
+    made_by: dict[str, Any] = field(default_factory=dict)
+    build: tuple[dict[str, Any], ...] = ()
+    source: dict[str, Any] = field(default_factory=dict)
+    environment: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, list[str]] = field(default_factory=dict)
+    golden: str = ""
+    golden_tolerance: float = 0.0
+    golden_chunk_tolerance: float = 0.0
+    findings: tuple[dict[str, Any], ...] = ()
+    accuracy: dict[str, Any] = field(default_factory=dict)
+    description: str = ""
+    license: str = ""
+    engine: str = ""
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        check("files", len(self.files), "The manifest", BundleError)
+        check("graphs", len(self.graphs), "The manifest", BundleError)
+        for path in (*self.files, *(graph.file for graph in self.graphs.values())):
+            _inside(path)
+        for graph in self.graphs.values():
+            if graph.file not in self.files:
+                raise BundleError(f"The manifest names the graph {graph.file}, but records no hash for it.")
+        if self.graphs and not self.program:
+            raise BundleError(f"The manifest has graphs, but no program that runs them to '{self.spec.action.name}'.")
+        for name, found in self.accuracy.items():
+            if not isinstance(found, Mapping) or "value" not in found:
+                raise BundleError(
+                    f"The manifest's accuracy '{name}' must have a number as 'value'; got {shown(found)}."
+                )
+            finite(found["value"], f"The manifest's accuracy '{name}'", BundleError)
+        if self.program:
+            check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> Manifest:
+        """Build from the parsed JSON.
+
+        Raises:
+            BundleError: for a newer schema, a missing key or a wrong type.
+            SpecError: for an impossible spec or program.
+        """
+        if not isinstance(data, Mapping):
+            raise BundleError(f"The manifest must be a mapping; got {type(data).__name__}.")
+        values = mapping(data, "The manifest", BundleError)
+        check_schema(values.get("schema"))
+        known(values, [item.name for item in fields(cls)], "The manifest", BundleError)
+        for item in fields(cls):
+            if item.name in values:
+                _check_type(item.name, values[item.name], item)
+        for key in ("name", "version", "spec"):
+            if key not in values:
+                raise BundleError(f"The manifest has no '{key}'.", "export the policy again")
+        check("files", len(values.get("files", ())), "The manifest", BundleError)
+        values["spec"] = PolicySpec.from_dict(values["spec"])
+        values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
+        values["program"] = program_from(values.get("program", []))
+        values["build"] = _build_record(values.get("build", ()))
+        values["findings"] = _findings(values.get("findings", ()))
+        values["files"] = {path: _record(path, record) for path, record in values.get("files", {}).items()}
+        for part, globs in values.get("parts", {}).items():
+            for glob in listed(globs, f"The part '{part}' of the manifest", BundleError):
+                text(glob, f"A glob of the part '{part}'", BundleError)
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``from_dict`` turns back into an equal manifest; empty values are left out."""
+        plain: dict[str, Any] = {"schema": self.schema, "name": self.name, "version": self.version}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name not in plain and value:
+                plain[item.name] = value
+        plain["spec"] = self.spec.to_dict()
+        plain["graphs"] = {name: _nonempty(graph) for name, graph in self.graphs.items()}
+        plain["program"] = [_nonempty(step) for step in self.program]
+        plain["files"] = {path: asdict(record) for path, record in sorted(self.files.items())}
+        return plain
+
+
+def check_files(manifest: Manifest) -> None:
+    """Check that every file which the manifest names has a record: golden file, statistics and tokenizers.
+
+    Raises:
+        BundleError: naming the first that has none.
+    """
+    named = {manifest.golden: "the golden file"} if manifest.golden else {}
+    for tensor in (*manifest.spec.inputs, *manifest.spec.outputs) if manifest.graphs else ():
+        for file in tensor.assets():
+            named[f"assets/{file}"] = f"which '{tensor.name}' needs"
+    for path, what in named.items():
+        if path not in manifest.files:
+            raise BundleError(f"The manifest names {path}, {what}, but records no hash for it.", "export it again")
+
+
+def check_schema(schema: Any) -> None:
+    """Check the version of a manifest.
+
+    Raises:
+        BundleError: when it is newer than this vlatool, or none.
+    """
+    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
+        raise BundleError(f"The manifest has the schema {shown(schema)}; this vlatool reads 1 to {SCHEMA}.")
+    if schema > SCHEMA:
+        raise BundleError(
+            f"The bundle has the manifest schema {shown(schema)}; this vlatool reads up to {SCHEMA}.",
+            "upgrade vlatool",
+        )
+
+
+def _check_type(name: str, value: Any, item: Any) -> None:
+    """Hold a value against the type that its field has by default: text, a mapping or a list."""
+    where = f"The manifest's '{name}'"
+    if name in ("spec", "schema"):
+        return
+    if name in ("golden_tolerance", "golden_chunk_tolerance"):
+        if finite(value, where, BundleError) < 0:
+            raise BundleError(f"{where} is {shown(value)}; allowed: a number from 0.")
+        return
+    if item.default == "" or (item.default is MISSING and item.default_factory is MISSING):
+        text(value, where, BundleError, empty=item.default == "")
+    elif item.default_factory is dict:
+        mapping(value, where, BundleError)
+    elif name != "program":
+        listed(value, where, BundleError)
+
+
+def _graph(name: str, data: Any) -> Graph:
+    values = mapping(data, f"The graph '{name}'", BundleError)
+    known(values, [item.name for item in fields(Graph)], f"The graph '{name}'", BundleError)
+    if "file" not in values:
+        raise BundleError(f"The graph '{name}' has no 'file'.", "export the policy again")
+    return Graph(**values)
+
+
+def _record(path: str, data: Any) -> FileRecord:
+    values = mapping(data, f"The record of {shown(path)}", BundleError)
+    known(values, ("sha256", "bytes"), f"The record of {shown(path)}", BundleError)
+    digest = values.get("sha256")
+    if not isinstance(digest, str) or not SHA256.fullmatch(digest):
+        raise BundleError(f"The record of {shown(path)} has the SHA-256 {shown(digest)}; it must be 64 hex digits.")
+    return FileRecord(digest, whole(values.get("bytes"), f"The size of {shown(path)}", BundleError))
+
+
+def _inside(path: Any) -> None:
+    if not isinstance(path, str):
+        raise BundleError(f"The manifest names the file {shown(path)} in graphs or files; a file is text.")
+    if reason := outside(path):
+        raise BundleError(f"The manifest names the file {shown(path)}, which is not inside the bundle: {reason}.")
+
+
+def _findings(data: Any) -> tuple[dict[str, Any], ...]:
+    def named(each: Any) -> bool:
+        return isinstance(each, Mapping) and all(isinstance(each.get(key), str) for key in ("name", "message"))
+
+    if not isinstance(data, list | tuple) or not all(map(named, data)):
+        raise BundleError("The manifest has malformed 'findings'; they must be mappings with 'name' and 'message'.")
+    return tuple(dict(each) for each in data)
+
+
+def _build_record(data: Any) -> tuple[dict[str, Any], ...]:
+    named = all(isinstance(item, Mapping) and isinstance(item.get("stage"), str) for item in data)
+    if not isinstance(data, list | tuple) or not named:
+        raise BundleError("The manifest has a malformed 'build'; it must be a list of mappings that name a stage.")
+    return tuple(dict(item) for item in data)
+
+
+def _nonempty(value: Any) -> dict[str, Any]:
+    found = {}
+    for item in fields(value):
+        content = getattr(value, item.name)
+        if content not in ({}, [], "", 0) and not (item.name == "repeat" and content == 1):
+            found[item.name] = content
+    return found

@@ -1,0 +1,164 @@
+"""A program: in which order the graphs of a policy run, and what goes from one to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from vlatool.bundle.spec import DTYPES, PolicySpec
+from vlatool.errors import SpecError, nearest
+from vlatool.files.limits import check
+from vlatool.files.typed import axes, finite, known, mapping, shown, text
+
+DISTRIBUTIONS = ("normal", "uniform", "zeros")
+
+
+def check_step(step: ProgramStep) -> None:
+    """Refuse an entry whose words have other types, or ask for more than the limits allow.
+
+    Raises:
+        SpecError: naming the word and the graph.
+    """
+    text(step.graph, "The graph of a step", SpecError, empty=False)
+    for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
+        if not isinstance(getattr(step, word), Mapping):
+            raise SpecError(f"'{word}' of '{step.graph}' must be a mapping; got {shown(getattr(step, word))}.")
+        mapping(getattr(step, word), f"'{word}' of '{step.graph}'", SpecError)
+    for word in ("feeds", "gives", "carry"):
+        for value in getattr(step, word).values():
+            text(value, f"A value in '{word}' of '{step.graph}'", SpecError, empty=False)
+    _check_repeat(step)
+    for value, noise in step.noise.items():
+        _check_noise(value, noise)
+    for value, kept in step.keep.items():
+        _check_kept(value, kept)
+
+
+def drawn_and_kept(step: ProgramStep) -> int:
+    """Return the elements of the noise and of the kept values of an entry that was checked."""
+    return sum(axes(each["shape"], "a shape", SpecError) for each in (*step.noise.values(), *step.keep.values()))
+
+
+def _check_repeat(step: ProgramStep) -> None:
+    if isinstance(step.repeat, bool) or not isinstance(step.repeat, int) or step.repeat < 1:
+        raise SpecError(f"The program repeats '{step.graph}' {shown(step.repeat)} times; allowed: from 1.")
+    check("repeat", step.repeat, f"The step of '{step.graph}'", SpecError)
+    for value, numbers in step.schedule.items():
+        if not isinstance(numbers, list | tuple):
+            raise SpecError(f"The schedule of '{value}' must be a list of numbers; got {shown(numbers)}.")
+        if len(numbers) != step.repeat:
+            got = f"{len(numbers)} numbers, but '{step.graph}' runs {step.repeat} times"
+            raise SpecError(f"The schedule of '{value}' has {got}.")
+        for entry in numbers:
+            finite(entry, f"A number in the schedule of '{value}'", SpecError)
+            if isinstance(entry, int) and not -(2**63) <= entry < 2**63:
+                raise SpecError(f"The schedule of '{value}' has a number that no int64 holds.")
+
+
+def _check_noise(value: str, noise: Any) -> None:
+    if not isinstance(noise, Mapping):
+        raise SpecError(f"The noise '{value}' must be a mapping; got {shown(noise)}.")
+    known(noise, ("shape", "distribution"), f"The noise '{value}'", SpecError)
+    if noise.get("distribution", "normal") not in DISTRIBUTIONS or not noise.get("shape"):
+        raise SpecError(f"The noise '{value}' needs a shape and a distribution of {', '.join(DISTRIBUTIONS)}.")
+    elements = axes(noise["shape"], f"the shape of the noise '{value}'", SpecError)
+    check("elements", elements, f"The noise '{value}'", SpecError)
+
+
+def _check_kept(value: str, kept: Any) -> None:
+    if not isinstance(kept, Mapping) or not kept.get("shape"):
+        raise SpecError(f"The kept value '{value}' needs a shape.")
+    known(kept, ("shape", "dtype"), f"The kept value '{value}'", SpecError)
+    if kept.get("dtype", "float32") not in DTYPES:
+        raise SpecError(f"The kept value '{value}' has the dtype {shown(kept['dtype'])}; allowed: {', '.join(DTYPES)}.")
+    elements = axes(kept["shape"], f"the shape of the kept value '{value}'", SpecError)
+    check("elements", elements, f"The kept value '{value}'", SpecError)
+
+
+@dataclass(frozen=True)
+class ProgramStep:
+    """One entry of a program: run a graph, once or several times.
+
+    Args:
+        graph: Name of the graph.
+        feeds: Graph input name -> value name.
+        gives: Graph output name -> value name.
+        repeat: How often the graph runs.
+        carry: Given value -> the value that it replaces before the next repeat.
+        schedule: Value -> one number for each repeat, presented as an array of shape (1,).
+        noise: Value -> {shape, distribution}; drawn once before the first repeat, from the seedable generator.
+        keep: Value -> {shape, dtype}; zero after ``reset``, else what the last inference gave under that name.
+    """
+
+    graph: str
+    feeds: dict[str, str]
+    gives: dict[str, str]
+    repeat: int = 1
+    carry: dict[str, str] = field(default_factory=dict)
+    schedule: dict[str, list[float]] = field(default_factory=dict)
+    noise: dict[str, dict[str, Any]] = field(default_factory=dict)
+    keep: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_step(self)
+
+    def sources(self) -> set[str]:
+        """Values that this entry brings into being before its graph runs."""
+        return {*self.schedule, *self.noise, *self.keep}
+
+
+def program_from(data: Any) -> tuple[ProgramStep, ...]:
+    """Build a program from a list of mappings.
+
+    Raises:
+        SpecError: for anything but a list of mappings with ``graph``, ``feeds`` and ``gives``.
+    """
+    words = [item.name for item in fields(ProgramStep)]
+    if not isinstance(data, list | tuple):
+        raise SpecError(f"The program must be a list of steps; got {type(data).__name__}.")
+    check("steps", len(data), "The program", SpecError)
+    steps = []
+    for number, entry in enumerate(data):
+        if not isinstance(entry, Mapping) or not {"graph", "feeds", "gives"} <= set(entry):
+            raise SpecError(f"Step {number} of the program needs 'graph', 'feeds' and 'gives'; got {shown(entry)}.")
+        known(entry, words, f"Step {number} of the program", SpecError)
+        steps.append(ProgramStep(**entry))
+    return tuple(steps)
+
+
+def single_graph(spec: PolicySpec, graph: str = "main") -> tuple[ProgramStep, ...]:
+    """Return the program of a policy that is one graph whose inputs and outputs are the spec's."""
+    feeds = {tensor.name: tensor.name for tensor in spec.inputs}
+    gives = {tensor.name: tensor.name for tensor in spec.outputs}
+    return (ProgramStep(graph, feeds, gives),)
+
+
+def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: PolicySpec) -> None:
+    """Check that every value is there when it is needed and that every output of the spec is given.
+
+    Raises:
+        SpecError: naming the step and the value.
+    """
+    graph_names = list(graphs)
+    program = tuple(program)
+    check("steps", len(program), "The program", SpecError)
+    check("runs", sum(step.repeat for step in program), "The program", SpecError)
+    check("state_elements", sum(map(drawn_and_kept, program)), "Noise and kept values of the program", SpecError)
+    values = {tensor.name for tensor in spec.inputs}
+    for number, step in enumerate(program):
+        if step.graph not in graph_names:
+            raise SpecError(f"Step {number} runs the graph '{step.graph}'; {nearest(step.graph, graph_names)}.")
+        values |= step.sources()
+        for name in step.feeds.values():
+            if name not in values:
+                raise SpecError(
+                    f"Step {number} ({step.graph}) needs the value '{name}' before it exists; {nearest(name, values)}."
+                )
+        for given in step.carry:
+            if given not in step.gives.values():
+                raise SpecError(f"Step {number} carries '{given}', which '{step.graph}' does not give.")
+        values |= set(step.gives.values())
+    for tensor in spec.outputs:
+        if tensor.name not in values:
+            raise SpecError(f"No step of the program gives the output '{tensor.name}'; {nearest(tensor.name, values)}.")

@@ -1,0 +1,256 @@
+"""What a policy consumes and produces: names, shapes, dtypes, units, normalisation, control rate, chunk length."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from vlatool.errors import SpecError, nearest
+from vlatool.files.limits import check
+from vlatool.files.typed import finite, known, mapping, outside, shown, text, whole
+
+DTYPES = ("float32", "float16", "int64", "int32", "uint8", "bool")
+KINDS = ("tensor", "text", "discrete")
+NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
+STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
+MODES = ("", "delta", "absolute", "velocity", "relative")
+MOST_INDICES = 2**18
+"""Labels that are made up for a discrete output that names none: more than any vocabulary of tokens has."""
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """One named input or output of a policy.
+
+    Args:
+        name: The key of the observation, or of the result.
+        shape: With the batch axis in front; a string names an axis whose length is free.
+        dtype: What the graph sees: float32, float16, int64, int32, uint8 or bool.
+        kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
+            of logits over ``labels``; the action is the index of the largest).
+        unit: One unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
+        labels: A name for each element of the last axis; the indices, when a discrete output names none.
+        mode: How a controller applies an action: ``delta``, ``absolute``, ``velocity`` or ``relative``.
+        normalisation: How the runtime maps physical values to what the graph sees (outputs: and back): ``none``,
+            ``mean_std``, ``min_max`` or ``quantiles``.
+        statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
+        tokenizer: File of the tokenizer, relative to the assets (``kind: text``).
+        max_tokens: Number of ids that the tokenizer pads or cuts to (``kind: text``).
+    """
+
+    name: str
+    shape: tuple[int | str, ...]
+    dtype: str = "float32"
+    kind: str = "tensor"
+    unit: str | tuple[str, ...] = ""
+    labels: tuple[str, ...] = ()
+    mode: str = ""
+    normalisation: str = "none"
+    statistics: str = ""
+    tokenizer: str = ""
+    max_tokens: int = 0
+
+    def __post_init__(self) -> None:
+        self._check_words()
+        self._check_shape()
+        self._check_kind()
+        if self.normalisation != "none" and "#" not in self.statistics:
+            raise SpecError(
+                f"'{self.name}' is normalised by {self.normalisation}, but 'statistics' is '{self.statistics}'.",
+                "name the statistics as FILE#KEY, for example statistics.json#proprio",
+            )
+        for file in self.assets():
+            if reason := outside(file):
+                raise SpecError(
+                    f"'{self.name}' names the file {shown(file)}: {reason}.",
+                    "statistics and tokenizers lie in the policy's folder; name them relative to it",
+                )
+
+    def _check_words(self) -> None:
+        text(self.name, "The name of a tensor", SpecError, empty=False)
+        for field in ("statistics", "tokenizer"):
+            text(getattr(self, field), f"The {field} of '{self.name}'", SpecError)
+        if not isinstance(self.labels, tuple) or not isinstance(self.unit, str | tuple):
+            got = f"labels {shown(self.labels)} and unit {shown(self.unit)}"
+            raise SpecError(f"'{self.name}' has {got}; labels must be a list.")
+        for word in (*self.labels, *(self.unit if isinstance(self.unit, tuple) else (self.unit,))):
+            text(word, f"A label or unit of '{self.name}'", SpecError)
+        whole(self.max_tokens, f"The max_tokens of '{self.name}'", SpecError)
+        check("tokens", self.max_tokens, f"'{self.name}'", SpecError)
+        allowed = {"dtype": DTYPES, "kind": KINDS, "normalisation": NORMALISATIONS, "mode": MODES}
+        for field, values in allowed.items():
+            got = getattr(self, field)
+            if got not in values:
+                told = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
+                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {told}.")
+
+    def _check_shape(self) -> None:
+        for axis in self.shape:
+            if isinstance(axis, bool) or not isinstance(axis, int | str) or (isinstance(axis, int) and axis < 1):
+                raise SpecError(
+                    f"'{self.name}' has the shape {shown(self.shape)}; each axis is a whole number from 1 or a name."
+                )
+            if isinstance(axis, str):
+                text(axis, f"An axis of '{self.name}'", SpecError, empty=False)
+        check("elements", self.elements, f"'{self.name}'", SpecError)
+        width = self.width
+        for field in ("labels", "unit"):
+            value = getattr(self, field)
+            if isinstance(value, tuple) and value and len(value) != width:
+                raise SpecError(f"'{self.name}' has {len(value)} {field} for a last axis of {width}.")
+
+    def _check_kind(self) -> None:
+        if self.kind == "text" and (not self.tokenizer or self.max_tokens < 1):
+            raise SpecError(
+                f"The text input '{self.name}' needs 'tokenizer' (a file) and 'max_tokens' (from 1); "
+                f"got '{self.tokenizer}' and {self.max_tokens}."
+            )
+        if self.kind == "discrete" and not self.labels:
+            raise SpecError(
+                f"The discrete output '{self.name}' needs 'labels', one for each action.",
+                "name them, or give the last axis of 'shape' as a number: the labels are then its indices",
+            )
+
+    def assets(self) -> list[str]:
+        """Return the files, relative to the assets, that this tensor needs."""
+        file = self.statistics.partition("#")[0]
+        return [*([file] if self.statistics else []), *([self.tokenizer] if self.tokenizer else [])]
+
+    @property
+    def width(self) -> int:
+        """Length of the last axis; 0 when it is free or there is none."""
+        last = self.shape[-1] if self.shape else 0
+        return last if isinstance(last, int) else 0
+
+    @property
+    def elements(self) -> int:
+        """Number of elements with every free axis counted as 1."""
+        return math.prod(axis if isinstance(axis, int) else 1 for axis in self.shape)
+
+    def units(self) -> tuple[str, ...]:
+        """Return one unit for each element of the last axis."""
+        return self.unit if isinstance(self.unit, tuple) else (self.unit,) * self.width
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> TensorSpec:
+        """Build from a mapping as it stands in ``manifest.json`` or ``policy.yaml``.
+
+        Raises:
+            SpecError: for an unknown key or an impossible value.
+        """
+        values = _known_only(cls, data, f"tensor {shown(data.get('name', '?') if isinstance(data, Mapping) else data)}")
+        if values.get("kind") == "text":
+            values.setdefault("dtype", "int64")
+            values.setdefault("shape", [1, values.get("max_tokens", 1)])
+        for key in ("shape", "labels", "unit"):
+            if isinstance(values.get(key), list):
+                values[key] = tuple(values[key])
+        if "name" not in values or not isinstance(values.get("shape"), tuple):
+            raise SpecError(f"A tensor needs 'name' and 'shape' (a list); got {shown(values.get('shape'))}.")
+        if values.get("kind") == "discrete":
+            values.setdefault("labels", _indices(values["shape"]))
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields that differ from their defaults, lists for tuples."""
+        return _plain(self)
+
+
+def _indices(shape: tuple[Any, ...]) -> tuple[str, ...]:
+    """Labels of actions without names, such as 256 action tokens: the indices of the last axis, unless it is free."""
+    width = shape[-1] if shape else 0
+    return tuple(map(str, range(width))) if type(width) is int and 0 < width <= MOST_INDICES else ()
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """What a policy consumes and produces.
+
+    Args:
+        inputs: In the order in which the source takes them.
+        outputs: The first is the action.
+        control_hz: Rate of the control loop in Hz.
+        chunk: Actions in one inference.
+        execute: Actions that are executed before the next inference; 0 means the whole chunk.
+    """
+
+    inputs: tuple[TensorSpec, ...]
+    outputs: tuple[TensorSpec, ...]
+    control_hz: float
+    chunk: int = 1
+    execute: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.inputs or not self.outputs:
+            raise SpecError("A policy needs at least one input and one output.")
+        check("tensors", len(self.inputs) + len(self.outputs), "The spec", SpecError)
+        names = [tensor.name for tensor in (*self.inputs, *self.outputs)]
+        for name in names:
+            if names.count(name) > 1:
+                raise SpecError(
+                    f"The name '{name}' occurs {names.count(name)} times; each input and output needs its own."
+                )
+        if not 0 < finite(self.control_hz, "control_hz", SpecError) < 1e5:
+            raise SpecError(f"control_hz is {shown(self.control_hz)}; allowed: a rate in Hz above 0.")
+        whole(self.chunk, "chunk", SpecError, 1)
+        check("elements", self.chunk, "chunk", SpecError)
+        if whole(self.execute, "execute", SpecError) > self.chunk:
+            raise SpecError(f"chunk is {self.chunk!r} and execute {self.execute!r}; allowed: 1 <= execute <= chunk.")
+
+    @property
+    def action(self) -> TensorSpec:
+        """The output that a controller executes."""
+        return self.outputs[0]
+
+    @property
+    def inference_hz(self) -> float:
+        """Inferences per second that the control rate and the executed part of the chunk ask for."""
+        return self.control_hz / self.executed
+
+    @property
+    def executed(self) -> int:
+        """Actions of an inference that are executed."""
+        return self.execute or self.chunk
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PolicySpec:
+        """Build from a mapping.
+
+        Raises:
+            SpecError: for a missing or unknown key or an impossible value.
+        """
+        values = _known_only(cls, data, "spec")
+        for key in ("inputs", "outputs"):
+            listed = values.get(key)
+            if not isinstance(listed, list | tuple):
+                raise SpecError(f"The spec needs '{key}', a list of tensors; got {shown(listed)}.")
+            values[key] = tuple(TensorSpec.from_dict(item) for item in listed)
+        if "control_hz" not in values:
+            raise SpecError("The spec needs 'control_hz', the rate of the control loop in Hz.")
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a mapping that ``from_dict`` turns back into an equal spec."""
+        plain = _plain(self)
+        plain["inputs"] = [tensor.to_dict() for tensor in self.inputs]
+        plain["outputs"] = [tensor.to_dict() for tensor in self.outputs]
+        return plain
+
+
+def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
+    if not isinstance(data, Mapping):
+        raise SpecError(f"The {where} must be a mapping; got {type(data).__name__}.")
+    known(data, [field.name for field in fields(cls)], f"The {where}", SpecError)
+    return mapping(data, f"The {where}", SpecError)
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """Return the non-default fields of a dataclass, tuples as lists (required fields always)."""
+    found = {}
+    for field in fields(value):
+        item = getattr(value, field.name)
+        if item != field.default:
+            found[field.name] = list(item) if isinstance(item, tuple) else item
+    return found

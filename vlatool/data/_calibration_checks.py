@@ -1,0 +1,132 @@
+"""What about a calibration recording looks wrong although a policy can run on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.data._recording import Recording
+from vlatool.errors import nearest
+from vlatool.runtime.statistics import load_normaliser
+
+Array = NDArray[Any]
+FEW = 8
+"""Samples below which the extremes of activations are hardly seen."""
+FAR = 50.0
+"""Training deviations (or ranges) beyond which a value is no measurement of the same quantity."""
+NAMED = 6
+"""Channels that a message lists."""
+
+
+def doubts(recording: Recording, numbers: Sequence[int], spec: PolicySpec, assets: Path, wanted: int = 0) -> list[str]:
+    """Return a sentence for each thing that makes ranges of activations unreliable.
+
+    Args:
+        recording: Checked against the spec.
+        numbers: The samples that are used.
+        spec: Of the policy.
+        assets: Directory of its statistics.
+        wanted: Samples that were asked for; 0 when nobody did.
+    """
+    found = [*_of_count(recording, len(numbers), wanted), *_of_names(recording, spec)]
+    same = len(numbers) > 1 and _identical(recording, numbers)
+    if same:
+        found.append(
+            f"all {len(numbers)} calibration samples of {recording.path} are identical; "
+            "record different moments, or the ranges fit one of them alone"
+        )
+    for tensor in spec.inputs:
+        where = f"'{tensor.name}' in {recording.path}"
+        if tensor.dtype == "uint8":
+            found += _of_pixels(where, recording, tensor.name, numbers)
+            continue
+        values = recording.inputs[tensor.name][list(numbers)]
+        if tensor.kind == "text":
+            found += _of_text(where, values, numbers)
+        elif values.dtype.kind in "iuf" and np.dtype(tensor.dtype).kind == "f":
+            found += [] if same else _of_channels(where, tensor, values)
+            found += _of_distance(where, tensor, values, numbers, assets)
+            if values.dtype == np.float64:
+                found.append(f"{where} is float64; the policy takes {tensor.dtype}, so it is rounded")
+    return found
+
+
+def _of_count(recording: Recording, count: int, wanted: int) -> Iterator[str]:
+    if count < wanted:
+        yield f"{wanted} calibration samples were asked for; {recording.path} holds {count}"
+    if count < FEW:
+        yield f"ranges from {count} calibration samples are unreliable; use {FEW} or more, better 64"
+
+
+def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
+    known = [tensor.name for tensor in spec.inputs]
+    for name in recording.ignored:
+        yield f"{recording.path} has the array '{name}', which is no input of the policy and is ignored; " + nearest(
+            name, known
+        )
+
+
+def _identical(recording: Recording, numbers: Sequence[int]) -> bool:
+    return all(
+        np.array_equal(values[number], values[numbers[0]]) for values in recording.inputs.values() for number in numbers
+    )
+
+
+def _of_text(where: str, values: Array, numbers: Sequence[int]) -> Iterator[str]:
+    empty = [number for number, text in zip(numbers, values.tolist(), strict=True) if not text.strip()]
+    if empty:
+        yield (
+            f"the text {where} is empty in {len(empty)} of {len(numbers)} calibration samples; the first is sample "
+            f"{empty[0]}"
+        )
+
+
+def _of_pixels(where: str, recording: Recording, name: str, numbers: Sequence[int]) -> Iterator[str]:
+    values = recording.inputs[name]
+    highest = max(int(values[number].max(initial=0)) for number in numbers)
+    if values.ndim > 2 and highest <= 1:
+        told = "looks normalised: no pixel is above 1" if highest else "is black in every calibration sample"
+        yield f"{where} {told}; the policy takes raw pixel values from 0 to 255"
+
+
+def _of_channels(where: str, tensor: TensorSpec, values: Array) -> Iterator[str]:
+    """Find channels (entries of the last axis) that never change."""
+    if len(values) < 2 or not values.size:
+        return
+    rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values.reshape(-1, 1)
+    constant = np.flatnonzero(rows.min(0) == rows.max(0)).tolist()
+    if constant:
+        named = ", ".join(
+            f"{channel}{f' ({tensor.labels[channel]})' if tensor.labels else ''} = {float(rows[0, channel]):g}"
+            for channel in constant[:NAMED]
+        )
+        more = f" and {len(constant) - NAMED} more" if len(constant) > NAMED else ""
+        yield (
+            f"{where} never changes over the {len(values)} calibration samples in channel {named}{more}; "
+            "what depends on it is not calibrated"
+        )
+
+
+def _of_distance(where: str, tensor: TensorSpec, values: Array, numbers: Sequence[int], assets: Path) -> Iterator[str]:
+    """Find values that are far from what the policy was trained on."""
+    normaliser = load_normaliser(tensor, assets)
+    if normaliser is None or not values.size:
+        return
+    distances = np.abs((values.astype(np.float64) - normaliser.offset) / normaliser.scale).reshape(
+        len(values), -1, values.shape[-1]
+    )
+    if not (distances > FAR).any():
+        return
+    far = np.flatnonzero((distances > FAR).any(axis=(1, 2)))
+    worst, _, channel = np.unravel_index(int(distances.argmax()), distances.shape)
+    unit = "standard deviations from the training mean" if tensor.normalisation == "mean_std" else (
+        "half ranges from the middle of the training range")  # fmt: skip
+    yield (
+        f"{where} is {float(distances.max()):.3g} {unit} in channel {int(channel)} of sample {numbers[int(worst)]} "
+        f"(above {FAR:g} in {len(far)} of {len(values)} calibration samples); look at units, statistics and names"
+    )

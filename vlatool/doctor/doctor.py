@@ -1,0 +1,326 @@
+"""What is in order on this machine, what is missing, and the command that mends it.
+
+Every check takes the root of the file system, or what was found, and returns ``Check`` values; nothing is changed.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any, Literal
+
+from vlatool import registry
+from vlatool.errors import MissingExtra, VlatoolError, require
+from vlatool.machine import host
+from vlatool.runtime.arithmetic import EXACT
+from vlatool.runtime.policy import DEFAULT_ENGINE
+from vlatool.telemetry.rapl import UDEV_RULE
+
+Status = Literal["ok", "warn", "missing"]
+
+EXTRAS: Mapping[str, tuple[str, ...]] = {
+    "ort": ("onnxruntime",),
+    "build": ("torch", "onnx", "onnxscript", "onnx-ir", "safetensors"),
+    "openvino": ("openvino",),
+    "sim": ("gymnasium", "minigrid"),
+    "metaworld": ("metaworld", "mujoco"),
+    "data": ("h5py", "pyarrow", "av"),
+    "serve": ("websockets", "msgpack"),
+    "search": ("optuna",),
+    "text": ("tokenizers",),
+    "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
+}
+"""Extra -> the distributions that it brings, as in ``pyproject.toml``."""
+SUBSTITUTES = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-openvino")}
+IGNORED_PROVIDERS = ("AzureExecutionProvider",)
+"""ONNX Runtime lists it beside the processor in every build; it runs nothing on this machine."""
+PYTHON = (3, 10)
+FREE_GB = 5.0
+"""Below this a build (export, several candidates, reports) of a 0.5 GB policy runs out of disk."""
+MEMORY_GB = 2.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding.
+
+    Args:
+        name: What was looked at.
+        status: ``ok``, ``warn`` (works, but) or ``missing``.
+        finding: What was found, in words.
+        fix: What to do; empty when nothing is to be done.
+    """
+
+    name: str
+    status: Status
+    finding: str
+    fix: str = ""
+
+
+def diagnose(root: Path = host.ROOT) -> list[Check]:
+    """Look at Python, engines, extras, instruction set, telemetry, clocks, cores, memory and disk.
+
+    Example:
+        >>> [check.name for check in diagnose()][0]
+        'python'
+    """
+    installed = host.versions({*chain(*EXTRAS.values(), *SUBSTITUTES.values())})
+    return [
+        python_version(),
+        *engines(installed, host.board(root), providers),
+        *arithmetic(),
+        *extras(installed),
+        instruction_set(host.isa(root)),
+        *confined(host.onednn_max_cpu_isa()),
+        *telemetry(root),
+        clocks(root),
+        cores(root),
+        memory(root),
+        disk(root),
+    ]
+
+
+def python_version(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
+    """Python is new enough."""
+    said = ".".join(str(part) for part in version)
+    if version < PYTHON:
+        wanted = ".".join(str(part) for part in PYTHON)
+        return Check("python", "missing", f"Python {said}; vlatool needs {wanted}", f"install Python {wanted} or later")
+    return Check("python", "ok", f"Python {said}")
+
+
+def providers() -> list[str]:
+    """Execution providers of the installed ONNX Runtime, without those that run nothing here.
+
+    Raises:
+        MissingExtra: when onnxruntime cannot be imported.
+    """
+    found = require("onnxruntime", "ort").get_available_providers()
+    return [str(name) for name in found if name not in IGNORED_PROVIDERS]
+
+
+def engines(installed: Mapping[str, str], board: str | None, ask: Callable[[], list[str]]) -> Iterator[Check]:
+    """The inference libraries with their version and, for ONNX Runtime, what they run on."""
+    runtime = _present("onnxruntime", installed)
+    if runtime is None:
+        yield Check("engine onnxruntime", "missing", "not installed", "pip install 'vlatool[ort]'")
+    else:
+        yield _onnxruntime(f"{runtime} {installed[runtime]}", board, ask)
+    if version := installed.get("openvino"):
+        yield Check("engine openvino", "ok", f"openvino {version}")
+    else:
+        fix = "" if board and "jetson" in board.lower() else "pip install 'vlatool[openvino]' (fastest on Intel)"
+        yield Check("engine openvino", "missing", "not installed", fix)
+
+
+def _onnxruntime(title: str, board: str | None, ask: Callable[[], list[str]]) -> Check:
+    try:
+        found = ask()
+    except MissingExtra as error:
+        return Check("engine onnxruntime", "warn", f"{title} is installed, but cannot be imported", error.fix)
+    short = [name.removesuffix("ExecutionProvider") for name in found]
+    finding = f"{title}: {', '.join(short) or 'no provider'}"
+    if board and "jetson" in board.lower() and not {"CUDA", "Tensorrt"} & {*short}:
+        fix = "install the onnxruntime-gpu wheel of NVIDIA's Jetson index for your JetPack; the plain wheel has no GPU"
+        return Check("engine onnxruntime", "warn", f"{finding}; this board's GPU stays idle", fix)
+    return Check("engine onnxruntime", "ok", finding)
+
+
+def arithmetic() -> Iterator[Check]:
+    """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
+    for name in registry.names("engines"):
+        try:
+            engine: Any = registry.load("engines", name)
+            found = str(engine.arithmetic())
+        except VlatoolError:
+            continue
+        title = f"int8 {name}"
+        if found == EXACT:
+            yield Check(title, "ok", "products of uint8 and int8 are exact")
+        elif name == DEFAULT_ENGINE:
+            yield Check(title, "warn", f"products of uint8 and int8 are {found}", "measure int8 against float32 here")
+        else:
+            fix = (
+                "vlatool quantize static-int8 SOURCE -o BUNDLE --layout ort: ONNX Runtime is told to be exact here; or "
+            )
+            fix += f"--layout {name} --reduce-range"
+            yield Check(title, "warn", f"products of uint8 and int8 are {found}", fix)
+
+
+def extras(installed: Mapping[str, str]) -> Iterator[Check]:
+    """Which optional parts of vlatool can be used."""
+    for extra, packages in EXTRAS.items():
+        absent = [name for name in packages if _present(name, installed) is None]
+        if absent:
+            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", f"pip install 'vlatool[{extra}]'")
+        else:
+            said = ", ".join(f"{name} {installed[_present(name, installed) or name]}" for name in packages)
+            yield Check(f"extra {extra}", "ok", said)
+
+
+def _present(name: str, installed: Mapping[str, str]) -> str | None:
+    """The distribution that provides ``name``, or None."""
+    return next((found for found in (name, *SUBSTITUTES.get(name, ())) if found in installed), None)
+
+
+def instruction_set(features: Sequence[str] | None) -> Check:
+    """Whether the processor multiplies int8 natively, and what that means."""
+    name = "int8"
+    if features is None:
+        return Check(name, "warn", "the processor's features cannot be read", "measure int8 against float32 here")
+    for wanted, meaning in (
+        ("amx_int8", "AMX: int8 is computed in tiles, many times faster than float32; use uint8 activations"),
+        ("avx512_vnni", "AVX-512 VNNI: int8 is up to 4 times as fast as float32; use uint8 activations"),
+        ("avx_vnni", "AVX-VNNI: int8 is up to 4 times as fast as float32; use uint8 activations"),
+        ("i8mm", "i8mm: int8 matrix instructions, up to 8 times float32; use int8 activations"),
+        ("asimddp", "dot product (asimddp): int8 is up to 4 times as fast as float32; use int8 activations"),
+    ):
+        if wanted in features:
+            return Check(name, "ok", meaning)
+    if "avx2" in features:
+        finding = (
+            "AVX2 without VNNI: int8 is at best twice as fast as float32, and 8-bit weights saturate in OpenVINO; "
+        )
+        finding += "ONNX Runtime is told to be exact, which is slower"
+        fix = "quantize with --layout ort, or with --reduce-range, and measure it; or stay with float32"
+        return Check(name, "warn", finding, fix)
+    finding = "no int8 dot product: int8 saves memory here, but may be slower than float32"
+    return Check(name, "warn", finding, "measure before you ship int8")
+
+
+def confined(isa: str | None) -> Iterator[Check]:
+    """Whether a variable keeps OpenVINO from instructions that the processor has."""
+    if isa is not None:
+        finding = (
+            f"{host.MAX_CPU_ISA}={isa} confines OpenVINO to older instructions: it is slower and may round otherwise"
+        )
+        yield Check("oneDNN", "warn", finding, f"unset {host.MAX_CPU_ISA}, unless you mean to try another processor")
+
+
+def telemetry(root: Path = host.ROOT) -> Iterator[Check]:
+    """Where power and temperature can be read."""
+    found = [*_rapl(root), *_ina3221(root), *_vcgencmd(root)]
+    if not found:
+        finding = "no RAPL, INA3221 or vcgencmd: power is reported as unmeasured"
+        found = [Check("power", "missing", finding, "measure at the wall, or on the board itself")]
+    yield from found
+    zones = [
+        host.read_text(root, f"{zone.relative_to(root)}/type")
+        for zone in _glob(root, "sys/class/thermal", "thermal_zone*")
+    ]
+    if zones:
+        yield Check("temperature", "ok", f"{len(zones)} thermal zones: {', '.join(dict.fromkeys(filter(None, zones)))}")
+    else:
+        yield Check(
+            "temperature", "missing", "no thermal zone: throttling cannot be seen", "measure on the board itself"
+        )
+
+
+def _glob(root: Path, folder: str, pattern: str) -> list[Path]:
+    return sorted((root / folder).glob(pattern))
+
+
+def _rapl(root: Path) -> Iterator[Check]:
+    counters = _glob(root, "sys/class/powercap", "intel-rapl:*/energy_uj")
+    if not counters:
+        return
+    if any(_readable(counter) for counter in counters):
+        yield Check(
+            "power RAPL", "ok", "the energy counter of the processor package can be read; it leaves out the board"
+        )
+    else:
+        fix = f"as root, write into a udev rule, with your group for GROUP: {UDEV_RULE}"
+        yield Check("power RAPL", "warn", "the energy counter is there, but only root may read it", fix)
+
+
+def _readable(path: Path) -> bool:
+    try:
+        return bool(path.read_bytes())
+    except OSError:
+        return False
+
+
+def _ina3221(root: Path) -> Iterator[Check]:
+    for monitor in _glob(root, "sys/class/hwmon", "hwmon*"):
+        place = monitor.relative_to(root).as_posix()
+        if host.read_text(root, f"{place}/name") == "ina3221":
+            labels = [host.read_text(root, f"{place}/in{channel}_label") for channel in (1, 2, 3)]
+            rails = [label for label in labels if label and label != "NC"]
+            whole = "VDD_IN is the whole module" if "VDD_IN" in rails else "no rail is the whole module"
+            yield Check("power INA3221", "ok", f"rails {', '.join(rails) or 'without label'}; {whole}")
+
+
+def _vcgencmd(root: Path) -> Iterator[Check]:
+    if not any((root / place / "vcgencmd").exists() for place in ("usr/bin", "opt/vc/bin")):
+        return
+    if (root / "dev/vcio").exists() and os.access(root / "dev/vcio", os.R_OK | os.W_OK):
+        yield Check("power vcgencmd", "ok", "throttling and supply voltage can be read")
+    else:
+        fix = "sudo usermod -aG video $USER, then log in again"
+        yield Check("power vcgencmd", "warn", "vcgencmd is there, but its device cannot be opened", fix)
+
+
+def clocks(root: Path = host.ROOT) -> Check:
+    """Whether the clocks are held, so that two runs compare."""
+    found = host.frequency(root)
+    governor, model = found["governor"], host.board(root) or ""
+    if governor is None:
+        finding = "no frequency policy is visible (a virtual machine or container); clocks cannot be checked"
+        return Check("clocks", "warn", finding, "repeat measurements and interleave what you compare")
+    if governor == "performance":
+        return Check("clocks", "ok", "governor performance")
+    fix = "sudo cpupower frequency-set -g performance"
+    if "jetson" in model.lower():
+        fix = "sudo nvpmodel -m MODE && sudo jetson_clocks; write the mode beside the result"
+    elif "raspberry" in model.lower():
+        fix = "echo performance | sudo tee /sys/devices/system/cpu/cpufreq/policy*/scaling_governor"
+    return Check("clocks", "warn", f"governor {governor}: clocks follow the load, latency varies with them", fix)
+
+
+def cores(root: Path = host.ROOT) -> Check:
+    """How many cores this process gets."""
+    usable, online, quota = host.usable_cores(root), host.online_cores(root), host.cpu_quota(root)
+    if usable is None:
+        return Check("cores", "warn", "the number of usable cores cannot be read")
+    finding = f"{usable} of {online} logical cores" if online else f"{usable} logical cores"
+    if quota is not None and quota < usable:
+        fix = "raise the container's CPU limit, or run with that many threads"
+        return Check("cores", "warn", f"{finding}, limited to {quota:g} by a control group", fix)
+    if online and usable < online:
+        return Check("cores", "warn", f"{finding}: an affinity mask keeps this process off the others")
+    return Check("cores", "ok", finding)
+
+
+def memory(root: Path = host.ROOT) -> Check:
+    """How much memory this process may take."""
+    found = host.memory(root)
+    available, limit = found["memory_available_mb"], found["memory_limit_mb"]
+    known = [value for value in (available, limit) if value is not None]
+    if not known:
+        return Check("memory", "warn", "the amount of memory cannot be read")
+    finding = " and ".join(
+        text
+        for value, text in (
+            (available, f"{(available or 0) / 1e3:.1f} GB available"),
+            (limit, f"a control group's limit of {(limit or 0) / 1e3:.1f} GB"),
+        )
+        if value is not None
+    )
+    if min(known) < MEMORY_GB * 1e3:
+        return Check(
+            "memory", "warn", finding, "close other programs (a desktop takes about 0.5 GB), or add swap to build"
+        )
+    return Check("memory", "ok", finding)
+
+
+def disk(root: Path = host.ROOT, usage: Callable[[Path], Any] = shutil.disk_usage) -> Check:
+    """How much disk is free in the current directory (below another root: there)."""
+    free_gb = usage(Path.cwd() if root == host.ROOT else root).free / 1e9
+    if free_gb < FREE_GB:
+        return Check("disk", "warn", f"{free_gb:.1f} GB free", f"free {FREE_GB:g} GB, or write the output elsewhere")
+    return Check("disk", "ok", f"{free_gb:.1f} GB free")

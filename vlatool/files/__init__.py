@@ -1,0 +1,1 @@
+"""Files and directories: read with limits, written whole, never somebody else's."""

@@ -1,0 +1,275 @@
+"""What vlatool wrote into a directory, file by file: nothing else is ever replaced or removed.
+
+Each directory that ``vlatool.files.writing`` makes holds ``.written-by-vlatool.json``: the name and the SHA-256 of
+every file that was written. A directory without it is taken for a bundle when its manifest lists all the rest, with
+these hashes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import OutputError
+
+LEDGER = ".written-by-vlatool.json"
+MANIFEST = "manifest.json"
+SCHEMA = 1
+LARGEST = 1 << 28
+"""Bytes of the largest list or manifest that is read."""
+SIDECAR = 4096
+"""Bytes of the largest file beside a manifest that may hold the manifest's hash."""
+CHANGED = "has been changed since vlatool wrote it"
+NOT_OURS = "was not written by vlatool"
+
+Seen = tuple[int, int, int, int, int]
+"""Device, inode, size, and times of the last change of a file and of its inode, in nanoseconds."""
+_HASHES: dict[Seen, str] = {}
+"""SHA-256 of files that were read in this process."""
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Files that were written into a directory (name -> SHA-256), and its folders."""
+
+    files: dict[str, str]
+    folders: frozenset[str]
+
+    @classmethod
+    def of(cls, files: dict[str, str], folders: Iterable[str] = ()) -> Listing:
+        """Return the list of files, with every folder that they lie in."""
+        above = {str(parent) for name in files for parent in Path(name).parents}
+        return cls(files, frozenset({*above, *folders} - {"."}))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file or folder below a directory: its name there, and why it is none that vlatool wrote (empty if it is)."""
+
+    name: str
+    folder: bool = False
+    foreign: str = ""
+
+
+def note(directory: Path) -> None:
+    """Write the list of all files below a directory into it.
+
+    Raises:
+        OSError: when a file cannot be read, or the list not be written.
+    """
+    known = _recorded(directory)
+    files, folders = {}, []
+    for path in sorted(directory.rglob("*")):
+        name, found = path.relative_to(directory).as_posix(), path.lstat()
+        if stat.S_ISDIR(found.st_mode):
+            folders.append(name)
+        elif stat.S_ISREG(found.st_mode) and name != LEDGER:
+            digest, size = known.get(name, ("", -1))
+            files[name] = digest if found.st_size == size else hash_once(path)
+    _write(directory, Listing.of(files, folders))
+
+
+def note_file(path: Path) -> None:
+    """Add a file that vlatool wrote later to the list of the directory that it lies in, when there is one."""
+    folder = path.parent
+    listing = _read_ledger(folder)
+    if listing is not None:
+        _write(folder, Listing.of({**listing.files, path.name: hash_once(path)}, listing.folders))
+
+
+def refuse_foreign(directory: Path) -> None:
+    """Look whether vlatool wrote every file below a directory, and nobody changed any.
+
+    Raises:
+        OutputError: naming the first file that is in the way.
+    """
+    listing = read_listing(directory)
+    if listing is None:
+        first = min((entry.name for entry in os.scandir(directory)), default=None)
+        if first is not None:
+            raise OutputError(
+                f"{directory} was not written by vlatool (it holds {first}), so --force does not replace it.", REMOVE
+            )
+        return
+    for entry in walk(directory, listing):
+        if entry.foreign:
+            raise OutputError(f"{directory}/{entry.name} {entry.foreign}, so --force does not replace it.", REMOVE)
+
+
+REMOVE = "choose another output, or move away what you want to keep and remove the rest yourself"
+
+
+def prune(directory: Path, *, changed: bool = False) -> bool:
+    """Remove the files of a directory that vlatool wrote, one by one, and the folders that are empty then.
+
+    Args:
+        directory: A directory that was moved aside.
+        changed: Also remove files that vlatool wrote and that hold other bytes now.
+
+    Returns:
+        Whether all of it is gone.
+    """
+    listing = read_listing(directory)
+    entries = [] if listing is None else list(walk(directory, listing))
+    if not changed and any(entry.foreign for entry in entries):
+        return False
+    files = [each.name for each in entries if not each.folder and each.foreign in ("", CHANGED)]
+    for name in sorted(files, key=lambda each: (each in (MANIFEST, LEDGER), each == LEDGER)):
+        with contextlib.suppress(OSError):
+            os.unlink(directory / name)
+    for entry in entries:
+        if entry.folder and not entry.foreign:
+            with contextlib.suppress(OSError):
+                os.rmdir(directory / entry.name)
+    with contextlib.suppress(OSError):
+        os.rmdir(directory)
+    return not os.path.lexists(directory)
+
+
+def walk(directory: Path, listing: Listing, below: str = "") -> Iterator[Entry]:
+    """Yield every file and folder below a directory, a folder after what it holds; what is foreign is not entered."""
+    device = os.lstat(directory).st_dev
+    try:
+        with os.scandir(directory / below) as found:
+            entries = sorted(found, key=lambda entry: entry.name)
+    except OSError as error:
+        yield Entry(below or ".", True, f"cannot be read ({error.strerror})")
+        return
+    for entry in entries:
+        name = below + entry.name
+        status = entry.stat(follow_symlinks=False)
+        if not stat.S_ISDIR(status.st_mode):
+            yield Entry(name, False, _foreign_file(directory / name, name, status.st_mode, listing))
+        elif name not in listing.folders or status.st_dev != device:
+            yield Entry(name, True, NOT_OURS if status.st_dev == device else "is another file system")
+        else:
+            yield from walk(directory, listing, name + "/")
+            yield Entry(name, True)
+
+
+def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
+    """Say why a file is none that vlatool wrote, empty when it is."""
+    if not stat.S_ISREG(mode):
+        return "is a link" if stat.S_ISLNK(mode) else "is no regular file"
+    if name == LEDGER:
+        return "" if _read_ledger(path.parent) == listing else CHANGED
+    if name not in listing.files:
+        return NOT_OURS
+    try:
+        return "" if hash_once(path) == listing.files[name] else CHANGED
+    except OSError as error:
+        return f"cannot be read ({error.strerror})"
+
+
+def hash_once(path: Path) -> str:
+    """Return the SHA-256 of a file as hex; it is not read again in this process while it is the same file.
+
+    Raises:
+        OSError: when it cannot be read, or is a link.
+    """
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:
+        seen = _seen(os.fstat(stream.fileno()))
+        if seen not in _HASHES:
+            digest = hashlib.sha256()
+            while block := stream.read(1 << 20):
+                digest.update(block)
+            if seen != _seen(os.fstat(stream.fileno())):
+                return digest.hexdigest()
+            _HASHES[seen] = digest.hexdigest()
+        return _HASHES[seen]
+
+
+def note_seen(path: Path, sha256: str) -> None:
+    """Note the hash of a file that was just hashed and then renamed or linked, which changes the times of its inode."""
+    _HASHES[_seen(os.lstat(path))] = sha256
+
+
+def _seen(status: os.stat_result) -> Seen:
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def read_listing(directory: Path) -> Listing | None:
+    """Return what vlatool wrote into a directory, None when it holds nothing that says so."""
+    return _read_ledger(directory) or _bundle_listing(directory)
+
+
+def _read_ledger(directory: Path) -> Listing | None:
+    data, content = _read_json(directory / LEDGER)
+    files, folders = data.get("files"), data.get("folders", [])
+    if data.get("schema") != SCHEMA or not isinstance(files, dict) or not isinstance(folders, list):
+        return None
+    if not all(isinstance(each, str) for each in (*files.values(), *folders)):
+        return None
+    listing = Listing.of(files, folders)
+    return listing if content == _told(listing) else None
+
+
+def _bundle_listing(directory: Path) -> Listing | None:
+    """Return the files of a bundle without a list: the manifest's, the manifest, and a file that holds its hash."""
+    data, content = _read_json(directory / MANIFEST)
+    files = _records(data)
+    if not files or not {"schema", "name", "spec"} <= set(data):
+        return None
+    if content != (json.dumps(data, indent=1, ensure_ascii=False) + "\n").encode():
+        return None
+    digest = hashlib.sha256(content).hexdigest()
+    listed = {name: known for name, (known, _) in files.items()} | {MANIFEST: digest}
+    for entry in os.scandir(directory):
+        if entry.name not in listed and entry.is_file(follow_symlinks=False) and entry.stat().st_size <= SIDECAR:
+            with contextlib.suppress(OSError):
+                if Path(entry.path).read_bytes().split()[:1] == [digest.encode()]:
+                    listed[entry.name] = hash_once(Path(entry.path))
+    return Listing.of(listed)
+
+
+def _recorded(directory: Path) -> dict[str, tuple[str, int]]:
+    """Return name -> (SHA-256, bytes) of the files that a manifest in the directory records."""
+    return _records(_read_json(directory / MANIFEST)[0])
+
+
+def _records(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
+    files = manifest.get("files")
+    found = {}
+    for name, record in files.items() if isinstance(files, dict) else ():
+        match record:
+            case {"sha256": str(digest), "bytes": int(size)}:
+                found[name] = (digest, size)
+            case _:
+                return {}
+    return found
+
+
+def _read_json(path: Path) -> tuple[dict[str, Any], bytes]:
+    """Return the mapping of a JSON file and its bytes; nothing when there is none."""
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as stream:
+            content = stream.read(LARGEST) if stat.S_ISREG(os.fstat(stream.fileno()).st_mode) else b""
+        data = json.loads(content)
+    except (OSError, ValueError, RecursionError):
+        return {}, b""
+    return (data, content) if isinstance(data, dict) else ({}, b"")
+
+
+def _told(listing: Listing) -> bytes:
+    """Return the one way in which a list is written."""
+    told = {
+        "vlatool": "The files that vlatool wrote here, by SHA-256. --force replaces this directory only while it holds "
+        "no other file and no file that was changed.",
+        "schema": SCHEMA,
+        "files": listing.files,
+        "folders": sorted(listing.folders),
+    }
+    return (json.dumps(told, indent=1) + "\n").encode()
+
+
+def _write(directory: Path, listing: Listing) -> None:
+    draft = directory / f"{LEDGER}.{os.getpid()}.part"
+    draft.write_bytes(_told(listing))
+    os.replace(draft, directory / LEDGER)

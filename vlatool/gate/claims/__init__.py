@@ -1,0 +1,1 @@
+"""What a gate examines: one file for each claim, found by its name."""

@@ -1,0 +1,135 @@
+"""The candidate is not worse than the baseline on the same recorded observations, or in the same episodes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vlatool.accuracy.credibility import DECIDE, credibility
+from vlatool.accuracy.losses import drop, losses
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import EVALUATION, read_recording
+from vlatool.errors import DataError
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.evaluate.recorded import alone, run_recorded
+from vlatool.gate.config import AccuracyClaim
+from vlatool.gate.found import CONFIDENCE, Found, worst
+from vlatool.report import Measurement, Row
+from vlatool.stage.base import Context
+from vlatool.stats.intervals import paired_drop
+
+MOST_SAMPLES = 100_000
+
+
+@dataclass(frozen=True)
+class _Drop:
+    name: str
+    words: str
+    value: float
+    low: float
+    high: float
+    samples: int
+    baseline: tuple[Measurement, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def verdict(self, allowed: float) -> str:
+        return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
+
+    def told(self, allowed: float) -> str:
+        ends = " to ".join(f"{end:+.2%}" if math.isfinite(end) else "unbounded" for end in (self.low, self.high))
+        words = f"{self.words} {self.value:+.2%} ({ends}, {self.samples} of them; allowed: {allowed:+.2%})"
+        gap = abs(allowed - self.value)
+        if self.verdict(allowed) != "inconclusive":
+            return words
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            return f"{words}, of one episode alone, which says nothing of others"
+        if gap:  # an interval narrows with the root of the number
+            reach = (self.high - self.value) if self.value < allowed else (self.value - self.low)
+            words += f", about {max(self.samples + 1, math.ceil(self.samples * (reach / gap) ** 2)):,} would decide"
+        return words
+
+
+def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = "") -> Found:
+    """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
+
+    Args:
+        candidate, baseline: Each is run with its own statistics and vocabulary, and judged by its physical actions.
+        claim: What is claimed.
+        context: Progress and workers.
+        engine: Of the runtime, that of the other claims; the one that each bundle was made for when empty.
+
+    Raises:
+        DataError: when there is neither.
+    """
+    drops: list[_Drop] = []
+    if (data := data_of(baseline, claim)) is not None:
+        drops.append(_recorded(candidate, baseline, data, context, engine))
+    if claim.episodes:
+        drops.append(_closed_loop(candidate, baseline, claim, context, engine))
+    said = [each.told(claim.max_drop) for each in drops]
+    measured = tuple(
+        Measurement(each.name, each.value, "1", samples=each.samples, low=finite(each.low), high=finite(each.high),
+                    confidence=CONFIDENCE, note=each.words)
+        for each in drops
+    )  # fmt: skip
+    baselines = tuple(found for each in drops for found in each.baseline if found.name in DECIDE)
+    trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
+    verdict = "inconclusive" if trust.fails else worst(each.verdict(claim.max_drop) for each in drops)
+    unjudged = [warning for each in drops for warning in each.warnings]
+    told = [sentence.rstrip(".") for sentence in trust.sentences]
+    return Found("accuracy", verdict, "; ".join([*told, *said, *trust.warnings, *unjudged]), measured, baselines)
+
+
+def finite(bound: float) -> float | None:
+    """Return a bound of an interval; None where there is none."""
+    return bound if math.isfinite(bound) else None
+
+
+def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
+    """Return the recorded observations that the claim is examined on, None for the closed loop alone.
+
+    They are the gate's or the baseline's, never the candidate's: it would choose what it is judged on.
+
+    Raises:
+        DataError: when there are none and no episodes are asked for.
+    """
+    own = baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None
+    if (found := claim.data or own) is None and not claim.episodes:
+        raise DataError(
+            f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the candidate "
+            "do not count) and no episodes are asked for.",
+            "name recorded data (accuracy: data) or episodes in the gate, or set accuracy: null",
+        )
+    return found
+
+
+def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str) -> _Drop:
+    stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine)
+    stage.check(candidate, None)
+    rows = stage.run(candidate, context).rows
+    before, after = (row.raw["success"] for row in rows)
+    lost = sum(one > two for one, two in zip(before, after, strict=True))
+    won = sum(one < two for one, two in zip(before, after, strict=True))
+    value, low, high = paired_drop(lost, won, len(before), CONFIDENCE)
+    return _Drop("success_drop", "more failed episodes:", value, low, high, len(before), rows[0].measurements)
+
+
+def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context, engine: str) -> _Drop:
+    recording = read_recording(data, baseline.manifest.spec)
+    indices = recording.spread(MOST_SAMPLES)
+    action = baseline.manifest.spec.action
+    mine, theirs = (run_recorded(bundle, recording, indices, engine, context) for bundle in (candidate, baseline))
+    episodes = None if recording.episodes is None else recording.episodes[indices]
+    expert = None if recording.actions is None else recording.actions[indices]
+    baselines = tuple(alone(action, theirs, expert, episodes))
+    if expert is None:  # nobody says what is right: the baseline's own actions are
+        off, before = losses(action, mine, theirs), np.zeros(len(indices))
+        words = "distance from the baseline's actions:"
+    else:
+        off, before = losses(action, mine, expert), losses(action, theirs, expert)
+        words = "more distance from the expert's actions than the baseline has:"
+    lost = drop(off, before, episodes, CONFIDENCE, action.kind == "discrete")
+    return _Drop("recorded_drop", words, *lost, len(indices), baselines, recording.unjudged)

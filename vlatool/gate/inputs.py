@@ -1,0 +1,74 @@
+"""What a gate calls both bundles with: drawn anew each time, from the baseline's recordings and the gate's."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import EVALUATION, Drawer, Drawn, Recording, calibration_recording, read_recording, save_drawn
+
+TIMING, AGREEMENT, MEMORY = range(3)
+"""Purposes, each of which draws observations of its own."""
+LARGEST = 128_000_000
+"""Bytes of the observations of one process; fewer are drawn where each is large."""
+LEAST = 8
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Observations for the processes of a gate; nothing of them is the candidate's.
+
+    Args:
+        baseline: Whose spec, vocabulary, statistics and recordings are drawn from.
+        data: Further recorded observations, that the gate file names.
+        seed: Of all draws; the observations of each process are its own.
+    """
+
+    baseline: Bundle
+    data: Path | None
+    seed: int
+
+    @cached_property
+    def recordings(self) -> tuple[Recording, ...]:
+        """All recordings that are drawn from.
+
+        Raises:
+            DataError: when one cannot be read or does not fit the spec.
+        """
+        spec = self.baseline.manifest.spec
+        own = self.baseline.path / EVALUATION if EVALUATION in self.baseline.manifest.files else None
+        found = [read_recording(path, spec) for path in (self.data, own) if path is not None]
+        calibration = calibration_recording(self.baseline)
+        return (*found, *([calibration] if calibration is not None else []))
+
+    @cached_property
+    def _drawer(self) -> Drawer:
+        return Drawer(self.baseline, self.recordings)
+
+    def draw(self, count: int, purpose: int, number: int = 0) -> list[Drawn]:
+        """Return observations for a process; the same for the same seed, purpose and number."""
+        random = np.random.default_rng([self.seed, purpose, number])
+        first = self._drawer.draw(min(count, LEAST), random)
+        each = max(1, *(sum(np.asarray(value).nbytes for value in one.observation.values()) for one in first))
+        return first + self._drawer.draw(max(0, min(count, LARGEST // each) - len(first)), random)
+
+    @contextlib.contextmanager
+    def file(self, count: int, purpose: int, number: int = 0) -> Iterator[Path]:
+        """Yield a file of observations for a process, and remove it in the end."""
+        with tempfile.TemporaryDirectory(prefix="vlatool-gate-") as folder:
+            path = Path(folder) / "observations.npz"
+            save_drawn(path, self.draw(count, purpose, number))
+            yield path
+
+    def told(self) -> str:
+        """Return in words what the observations are drawn from, and how to draw them again."""
+        count = sum(map(len, self.recordings))
+        source = f"from {count} recorded ones and the vocabulary" if count else "from the spec alone: none is recorded"
+        return f"observations are drawn {source} with the seed {self.seed}; --seed {self.seed} draws them again"

@@ -1,0 +1,138 @@
+"""Hold a candidate against a baseline: every claim of a gate, measured anew with both side by side."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import median
+from typing import Any
+
+from vlatool.accuracy.credibility import FAILS
+from vlatool.bundle.bundle import Bundle, hash_file
+from vlatool.gate.claims import accuracy, answers, deadline, growth, latency
+from vlatool.gate.config import Gate, LatencyClaim
+from vlatool.gate.found import Found, worst
+from vlatool.gate.inputs import AGREEMENT, Inputs
+from vlatool.gate.same import check
+from vlatool.gate.timed import Timed
+from vlatool.machine.host import before_run
+from vlatool.measurement.agreement import Agreement, measure_agreement
+from vlatool.measurement.pairs import Job
+from vlatool.measurement.validity import busy, throttled, validity
+from vlatool.report import Measurement, Report, Row
+from vlatool.runtime.policy import refuse_findings
+from vlatool.stage.base import Context
+from vlatool.telemetry import Recorder, open_all
+
+KIND = "gate"
+PERIOD_S = 1.0
+"""Seconds between two looks at the board."""
+
+
+def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, seed: int | None = None) -> Report:
+    """Examine every claim of a gate; what is cheap first.
+
+    Args:
+        candidate, baseline: Bundles with graphs, of one spec.
+        gate: What is claimed.
+        context: Progress and workers.
+        seed: Of everything that is drawn: observations, noise, the order in which bundles are loaded and called. Fresh
+            entropy when None, so that nobody can know it before; the report says it.
+
+    Raises:
+        BundleError: when a bundle has no graph, the two have other inputs or outputs, or a file was changed.
+        DataError: when accuracy is claimed and there is nothing to measure it on.
+        GraphError: when a bundle cannot be run, hangs, or computes another golden action than its own.
+    """
+    check(candidate, baseline, gate)
+    for bundle in (candidate, baseline):
+        refuse_findings(bundle, gate.accept)
+    host = before_run()
+    how = gate.latency or LatencyClaim()
+    seed = secrets.randbits(32) if seed is None else seed
+    inputs = Inputs(baseline, gate.accuracy.data if gate.accuracy else None, seed)
+    job = Job(
+        str(baseline.path), str(candidate.path), how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed
+    )
+    timed = Timed(job, context, how.timeout, inputs)
+    agreement = _agreement(timed, gate, inputs)
+    found: list[Found] = []
+    if gate.size:
+        found.append(growth.examine_size(candidate, baseline, gate.size))
+    if gate.memory:
+        found.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
+    if gate.accuracy:
+        found.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine))
+    with Recorder(open_all(), PERIOD_S) as board:
+        if gate.latency:
+            found += latency.examine_all(timed, gate.latency)
+        if gate.deadline:
+            found.append(deadline.examine(timed, gate.deadline))
+    if gate.answers:
+        found.append(answers.examine(agreement, timed, gate.answers))
+    seen = (*throttled(board.recorded.throttling), *(replace(each, effect="note") for each in busy(host)))
+    name = candidate.manifest.name
+    row = _row("candidate", candidate, timed, found)
+    row = replace(row, details={**row.details, "measured with": _measured_with(gate, inputs, agreement)})
+    rows = (_row("baseline", baseline, timed, found), row)
+    return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found),
+                  (*_summary(name, found), f"{inputs.told()}."), rows,
+                  command=context.command, environment=host, validity=validity(seen), findings=seen)  # fmt: skip
+
+
+def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
+    """Load both bundles as a robot does, golden action and all, and ask both where answers are claimed."""
+    claim = gate.answers
+    timed.context.tell("both bundles, on observations that are not recorded", None)
+    job = replace(timed.job, pairs=claim.observations if claim else 0, seconds=claim.seconds if claim else 0.0)
+    if claim is None:
+        return measure_agreement(job, timed.timeout)
+    with inputs.file(claim.observations, AGREEMENT) as path:
+        return measure_agreement(replace(job, observations=str(path)), timed.timeout)
+
+
+def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dict[str, Any]]:
+    """Return what a reader needs to judge, or repeat, the gate: a row for each thing."""
+    how = gate.latency or LatencyClaim()
+    found: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
+    found |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
+    found |= {
+        f"recording {path.path.name}": f"sha256:{hash_file(path.path)}"
+        for path in inputs.recordings
+        if path.path.is_file()
+    }
+    if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.is_file():
+        found["evaluation data"] = f"sha256:{hash_file(data)}"
+    return [{"what": what, "value": value} for what, value in found.items()]
+
+
+def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row:
+    calls = timed.calls(name)
+    measured = [Measurement("latency_p50", median(calls), "ms", samples=len(calls))] if calls else []
+    raw = {"latency_ms": calls} if calls else {}
+    reason = f"{bundle.manifest.name}, {bundle.hash[:19]}"
+    if name == "baseline":
+        measured += [each for claim in found for each in claim.baseline]
+        return Row(name, "baseline", reason, tuple(measured), raw)
+    measured += [each for claim in found for each in claim.measurements]
+    if calls:
+        raw["log_ratio"] = [pairs.log_ratio for pairs in timed.pairs]
+        raw["log_mean_ratio"] = [pairs.mean_log_ratio for pairs in timed.pairs]
+    claims = [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]
+    return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
+
+
+def _summary(name: str, found: Sequence[Found]) -> tuple[str, ...]:
+    """Return the result, then every claim in a sentence, those that failed first."""
+    order = ("fail", "inconclusive", "pass")
+    named = {verdict: ", ".join(each.claim for each in found if each.verdict == verdict) for verdict in order}
+    first = {
+        "pass": f"{name} keeps to every claim: {named['pass']}.",
+        "fail": f"{name} does not keep to: {named['fail']}.",
+        "inconclusive": f"The samples cannot decide about {named['inconclusive']} of {name}.",
+    }[worst(each.verdict for each in found)]
+    if any(each.sentence.startswith(FAILS) for each in found) and not named["fail"]:
+        first = f"Nothing is said about {name}, for the baseline is no reference: it does not do its task."
+    said = sorted(found, key=lambda each: order.index(each.verdict))
+    return (first, *(f"{each.claim}: {each.verdict}: {each.sentence}." for each in said))

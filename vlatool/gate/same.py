@@ -1,0 +1,86 @@
+"""Whether two bundles are versions of one policy: only those can be held against each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vlatool import registry
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.manifest import Manifest
+from vlatool.bundle.spec import TensorSpec
+from vlatool.errors import BundleError, nearest
+from vlatool.gate.claims import accuracy
+from vlatool.gate.config import Gate
+
+MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode")
+"""What a robot relies on; files of statistics and tokenizers may differ."""
+RATE = ("control_hz", "chunk", "execute")
+
+
+def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
+    """Say before anything is measured why it cannot be.
+
+    Raises:
+        BundleError: when a bundle has no graph or lacks the baseline's golden action, or the two have other inputs or
+            outputs, another rate, or keep, draw or repeat something else.
+        DataError: when accuracy is claimed and there is nothing to measure it on.
+    """
+    for bundle in (candidate, baseline):
+        if not bundle.manifest.graphs:
+            raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+        engine, known = bundle.manifest.engine, registry.names("engines")
+        if engine and engine not in known:
+            raise BundleError(f"{bundle.path} is made for the engine '{engine}'; {nearest(engine, known)}.")
+    mine, theirs = candidate.manifest, baseline.manifest
+    if differs := _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs):
+        raise BundleError(f"{candidate.path} and {baseline.path} are no versions of one policy: {differs}.")
+    if theirs.golden and not mine.golden:
+        raise BundleError(f"{candidate.path} has no golden action, which the baseline has.", "make the bundle again")
+    if gate.accuracy:
+        accuracy.data_of(baseline, gate.accuracy)
+
+
+def _tensors(mine: Manifest, theirs: Manifest) -> str:
+    for kind in ("inputs", "outputs"):
+        one, two = ({each.name: each for each in getattr(each.spec, kind)} for each in (mine, theirs))
+        for name in {**two, **one}:
+            if differs := _differs(one.get(name), two.get(name)):
+                return f"{kind[:-1]} {name}: {differs}"
+    return _told("the action", mine.spec.action.name, theirs.spec.action.name)
+
+
+def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
+    """Return in words how an input or output of the candidate differs from the baseline's; nothing when it does not."""
+    if mine is None or theirs is None:
+        return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
+    pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
+    return "; ".join(said for name, one, two in pairs if (said := _told(name, one, two)))
+
+
+def _rates(mine: Manifest, theirs: Manifest) -> str:
+    pairs = [(name, getattr(mine.spec, name), getattr(theirs.spec, name)) for name in RATE]
+    return "; ".join(said for name, one, two in pairs if (said := _told(name, one, two)))
+
+
+def _program(mine: Manifest, theirs: Manifest) -> str:
+    """Return what the candidate keeps between inferences, draws, or repeats otherwise than the baseline.
+
+    How a program is cut into graphs is each bundle's own business.
+    """
+    parts: list[tuple[str, Any, Any]] = [
+        (word, _of_all(mine, word), _of_all(theirs, word)) for word in ("keep", "noise", "schedule")
+    ]
+    one, two = (max(step.repeat for step in each.program) for each in (mine, theirs))
+    parts.append(("repeat", one, two))
+    return "; ".join(said for word, one, two in parts if (said := _told(f"the program's {word}", one, two)))
+
+
+def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:
+    return {name: value for step in manifest.program for name, value in getattr(step, word).items()}
+
+
+def _told(name: str, mine: Any, theirs: Any) -> str:
+    if mine == theirs:
+        return ""
+    one, two = (list(each) if isinstance(each, tuple) else each for each in (mine, theirs))
+    return f"{name} {one!r} in the candidate, {two!r} in the baseline"

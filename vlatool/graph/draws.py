@@ -1,0 +1,109 @@
+"""Random numbers inside a graph: neither a seed nor a comparison with torch reaches them."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import GraphError
+from vlatool.graph.shapes import nodes_inside
+
+DRAWING = {
+    "RandomNormal": "normal", "RandomNormalLike": "normal", "RandomUniform": "uniform", "RandomUniformLike": "uniform",
+    "Bernoulli": "uniform", "Multinomial": "uniform",
+}  # fmt: skip
+"""ONNX operator that draws -> what a program would draw in its place."""
+GUIDE = 'see "Noise" in docs/guides/your-own-policy.md'
+
+
+def refuse_draws(model: Any, graph: str) -> None:
+    """Refuse a graph that draws its own random numbers.
+
+    Args:
+        model: An ``onnx_ir.Model``.
+        graph: Its name in the program.
+
+    Raises:
+        GraphError: saying how often and where it draws, and how to declare the noise instead.
+    """
+    found = [node for node in model.graph.all_nodes() if node.op_type in DRAWING]
+    if not found:
+        return
+    scopes = dict.fromkeys(scope for node in found if (scope := _scope(node)))
+    where = f" in {', '.join(list(scopes)[:3])}" if scopes else ""
+    drawn = [
+        tuple(axis for axis in node.outputs[0].shape if isinstance(axis, int)) if node.outputs[0].shape else ()
+        for node in found
+    ]
+    index = "; forward() takes noise[i] in turn i" if len(found) > 1 else ""
+    raise GraphError(
+        f"forward() of '{graph}' draws random numbers, {_times(found)} an inference{where}: a graph that draws its own "
+        "can neither be compared with torch nor repeated from a seed.",
+        "let forward() take them as an input, and declare that in the program of policy.yaml: "
+        f"{_declared(found, drawn)}{index}; {GUIDE}",
+    )
+
+
+def refuse_drawing_file(model: Any, path: Path) -> None:
+    """Refuse an ONNX file of the user that draws its own random numbers, be it in a branch, a loop or a function.
+
+    Args:
+        model: An ``onnx.ModelProto``.
+        path: The file.
+
+    Raises:
+        GraphError: naming the operators, and how to declare the noise instead.
+    """
+    shapes = {each.name: _static(each) for each in (*model.graph.value_info, *model.graph.output)}
+    nodes = [*_nodes(model.graph.node), *(node for each in model.functions for node in _nodes(each.node))]
+    found = [node for node in nodes if node.op_type in DRAWING and node.domain in ("", "ai.onnx")]
+    if not found:
+        return
+    operators = ", ".join(dict.fromkeys(node.op_type for node in found))
+    index = "; each of them takes its part of the noise" if len(found) > 1 else ""
+    raise GraphError(
+        f"{path} draws random numbers, {_times(found)} an inference ({operators}): a graph that draws its own can "
+        "neither be repeated from a seed nor be verified on another machine.",
+        "export the file with an input in the place of the draws, and declare that in the policy.yaml beside it: "
+        "program: [{graph: main, gives: {...}, "
+        f"{_declared(found, [shapes.get(node.output[0], ()) for node in found])}}}]{index}; {GUIDE}",
+    )
+
+
+def _nodes(nodes: Sequence[Any]) -> Iterator[Any]:
+    """Yield nodes and those of the graphs inside of them."""
+    for node in nodes:
+        yield node
+        yield from nodes_inside(node)
+
+
+def _static(value: Any) -> tuple[int, ...]:
+    return tuple(axis.dim_value for axis in value.type.tensor_type.shape.dim if axis.dim_value > 0)
+
+
+def _times(nodes: Sequence[Any]) -> str:
+    return f"{len(nodes)} times" if len(nodes) > 1 else "once"
+
+
+def _declared(nodes: Sequence[Any], drawn: Sequence[tuple[int, ...]]) -> str:
+    """Return how the program of a policy draws what these nodes do; ``drawn``: the shape of each."""
+    distribution = DRAWING[nodes[0].op_type]
+    span = " (on [-1, 1))" if distribution == "uniform" else ""
+    noise = f"{{shape: {_shape(drawn)}, distribution: {distribution}}}"
+    return f"feeds: {{..., noise: noise}}, noise: {{noise: {noise}}}{span}"
+
+
+def _shape(shapes: Sequence[tuple[int, ...]]) -> str:
+    """Return the shape of all draws as one array; of the largest, where they differ or are not known."""
+    largest = max(shapes, key=len)
+    axes = [len(shapes), *largest] if len(shapes) > 1 else [*largest]
+    return str(axes) if largest else "[...]"
+
+
+def _scope(node: Any) -> str:
+    """Return the torch module that a node comes from; empty for the policy itself."""
+    scopes = node.metadata_props.get("pkg.torch.onnx.name_scopes", "")
+    found = ast.literal_eval(scopes) if scopes.startswith("[") else []
+    return str(found[-2]) if len(found) > 1 else ""

@@ -1,0 +1,81 @@
+"""Names in a graph: what a node reads, and a name of its own for every node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+
+def reads(node: Any) -> Iterator[str]:
+    """Yield the values that a node reads, with those that the graphs inside it (If, Loop, Scan) take from outside."""
+    yield from (name for name in node.input if name)
+    for item in node.attribute:
+        for graph in (item.g, *item.graphs) if item.HasField("g") or item.graphs else ():
+            inside = {value.name for value in graph.input} | {tensor.name for tensor in graph.initializer}
+            inside.update(name for inner in graph.node for name in inner.output)
+            inside.discard("")
+            yield from (name for inner in graph.node for name in reads(inner) if name not in inside)
+            yield from (value.name for value in graph.output if value.name not in inside)
+
+
+def read_names(nodes: Iterable[Any]) -> set[str]:
+    """Return all values that nodes read."""
+    return {name for node in nodes for name in reads(node)}
+
+
+def varying(model: Any) -> set[str]:
+    """Return the values that depend on an input of a graph, or on chance; all others are computed once, or could be."""
+    constants = {tensor.name for tensor in model.graph.initializer}
+    found = {value.name for value in model.graph.input} - constants
+    for node in model.graph.node:
+        if node.op_type.startswith("Random") or any(name in found for name in reads(node)):
+            found.update(name for name in node.output if name)
+    return found
+
+
+def name_nodes(model: Any) -> None:
+    """Give every node without a name, or with one that came before, a name of its own, in place.
+
+    Layers are chosen and rewritten by the names of their nodes; some exporters leave them empty or repeat them.
+    """
+    taken = {node.name for node in model.graph.node}
+    seen = {""}
+    for number, node in enumerate(model.graph.node):
+        if node.name in seen:
+            node.name = free_name(node.name or node.op_type, number, taken)
+        seen.add(node.name)
+
+
+def part_outputs(model: Any) -> None:
+    """Put an Identity between a constant and an output of the graph that it is, in place: methods change constants."""
+    outputs = {value.name for value in model.graph.output}
+    given = [tensor for tensor in model.graph.initializer if tensor.name in outputs]
+    taken = {tensor.name for tensor in model.graph.initializer} | {
+        name for node in model.graph.node for name in node.output
+    }
+    for tensor in given:
+        name, copy = tensor.name, free_name(tensor.name, 0, taken)
+        for node in model.graph.node:
+            for place, read in enumerate(node.input):
+                if read == name:
+                    node.input[place] = copy
+        tensor.name = copy
+        node = model.graph.node.add()
+        node.op_type, node.name = "Identity", f"{copy}/Identity"
+        node.input.append(copy)
+        node.output.append(name)
+        first = model.graph.node.pop()
+        model.graph.node.insert(0, first)
+
+
+def free_name(wanted: str, number: int, taken: set[str]) -> str:
+    """Return a name for the node with that place in a graph which is none of those that are taken, and take it."""
+    name = f"{wanted}_{number}"
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
+
+
+FOLDED = "vlatool.folded"
+"""Key of a node's metadata: the module that was folded into it."""

@@ -1,0 +1,26 @@
+"""Share of a graph's multiply-accumulates by the precision that they are computed in, or that their weights have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+
+def precision_shares(path: Path) -> dict[str, float]:
+    """Return precision -> share of the multiply-accumulates (rounded to 0.001, the largest first).
+
+    Layers whose weights alone are quantized are told by those, ``int4 weights``, in whatever form they are stored.
+    """
+    from vlatool.graph.workload import graph_workload
+
+    macs = graph_workload(path, told=_told).macs
+    total = sum(macs.values()) or 1
+    shares = {name: round(count / total, 3) for name, count in macs.items() if count}
+    return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+def _told(node: Any, tensors: Any) -> str:
+    from vlatool.graph.macs import precision_of, weights_alone
+
+    alone = weights_alone(node, tensors)
+    return f"{alone} weights" if alone else precision_of(node, tensors)

@@ -1,0 +1,115 @@
+"""A workload as a file: in the cache, or beside a policy that carries it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import OutputError
+from vlatool.files.edited import whole_file
+from vlatool.graph.workload import GraphWorkload, Workload
+from vlatool.machine.version import VERSION
+
+LAYOUT = 4
+"""Version of the file."""
+COUNTS = ("layers", "weights", "read_again", "activations", "weight_bytes", "activation_bytes", "peak_bytes")
+
+
+def digest(bundle: Bundle) -> str:
+    """Return what a count of a source depends on, as SHA-256: code, weights, arguments, spec, program and parts.
+
+    vlatool's own samples are known by its version.
+    """
+    manifest = bundle.manifest.to_dict()
+    depends = {key: manifest.get(key) for key in ("source", "spec", "program", "parts")}
+    text = json.dumps({**depends, "vlatool": VERSION}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_workload(file: Path, of: str = "") -> Workload | None:
+    """Return the workload of a file; None when there is none, it is damaged, or it is of something else.
+
+    Args:
+        file: The file.
+        of: ``digest`` that it must have.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    if not isinstance(data, dict) or data.get("digest", "") != of:
+        return None
+    return from_values(data)
+
+
+def is_workload(file: Path) -> bool:
+    """Say whether a file is one of this package's, of an earlier layout too, which nobody reads any more."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    if not isinstance(data, dict) or not isinstance(data.get("layout"), int):
+        return False
+    return from_values(data) is not None if data["layout"] >= LAYOUT else isinstance(data.get("graphs"), dict)
+
+
+def from_values(data: Any) -> Workload | None:
+    """Return the workload of what ``to_values`` gave; None when it is something else."""
+    if not isinstance(data, dict) or data.get("layout") != LAYOUT:
+        return None
+    graphs = {}
+    try:
+        for name, fields in data["graphs"].items():
+            fields["traits"], fields["unknown"] = frozenset(fields["traits"]), tuple(fields["unknown"])
+            fields["parts"] = {part: tuple(numbers) for part, numbers in fields["parts"].items()}
+            counts = [fields[key] for key in COUNTS] + list(fields["macs"].values())
+            counts += [number for part in fields["parts"].values() for number in part]
+            fours = all(len(part) == 4 for part in fields["parts"].values())
+            if not fours or not all(isinstance(each, int) and each >= 0 for each in counts):
+                return None
+            graphs[name] = GraphWorkload(**fields)
+        return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+
+
+def refuse_other(file: Path) -> None:
+    """Refuse a file that ``write_workload`` did not write.
+
+    Raises:
+        OutputError: when there is one.
+    """
+    if not os.path.lexists(file):
+        return
+    try:
+        data = {} if file.is_symlink() else json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        data = {}
+    if not isinstance(data, dict) or set(data) != {"layout", "digest", "graphs", "runs"}:
+        raise OutputError(f"{file} is none that vlatool wrote.", "move it away yourself")
+
+
+def write_workload(file: Path, found: Workload, of: str = "") -> None:
+    """Write a workload as ``read_workload`` reads it.
+
+    Raises:
+        OSError: when the file cannot be written.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(file) as draft:
+        data = {**to_values(found), "digest": of}
+        draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def to_values(found: Workload) -> dict[str, Any]:
+    """Return a workload as JSON values."""
+    graphs: dict[str, Any] = {}
+    for name, graph in found.graphs.items():
+        fields = dataclasses.asdict(graph)
+        graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
+    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)}

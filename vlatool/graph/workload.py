@@ -1,0 +1,294 @@
+"""Count what one inference of a bundle has to compute and move, from its ONNX graphs alone.
+
+A multiply-accumulate (MAC) is one multiplication and one addition; biases, activations and normalisations are not
+counted, as in the published tables that the predictions rest on.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import GraphError, require
+from vlatool.graph.macs import COMPUTE, CONVOLUTIONS, INTEGER_OPS, WEIGHT_AT, node_macs, precision_of
+from vlatool.graph.shapes import Tensors, open_graph
+
+DEPTHWISE = 121
+"""Products for each number that a depthwise convolution writes, at most (11 x 11)."""
+ONE_ROW = 2
+"""Times that a weight is used, at most, in a product of one row."""
+TRAITS = ("depthwise", "attention", "grouped", "branches", "dense")
+"""Depthwise convolutions; products of activations (attention); grouped convolutions; concatenated branches; most
+weights in matrix products of one row (the dense head of an early network, or the decoding of a language model)."""
+
+
+@dataclass(frozen=True)
+class GraphWorkload:
+    """What one run of a graph computes and moves.
+
+    Args:
+        macs: Precision (``float32``, ``int8``, ``int4`` ...) -> multiply-accumulates.
+        layers: Compute layers (matrix products and convolutions).
+        weights: Numbers in the weights of the compute layers, each weight once, however they are stored.
+        activations: Numbers that the compute layers write.
+        traits: What the published latencies of its kind depend on, of ``TRAITS``.
+        weight_bytes: Bytes of all initializers as they are stored.
+        activation_bytes: Bytes that the compute layers write.
+        peak_bytes: The most bytes of tensors, weights apart, that are alive at one node.
+        integer_ops: Whether int8 is computed by integer operators (MatMulInteger and its kin) and not in QDQ form.
+        unknown: Compute layers that cannot be counted, because their shapes are not static.
+        parts: Part of the policy (vision, language ...; empty: none) -> multiply-accumulates, reads of weights,
+            activations and layers of its compute layers, but for those that are unknown.
+        read_again: Numbers that are read from a weight after the first time, as in the turns of a loop.
+    """
+
+    macs: Mapping[str, int] = field(default_factory=dict)
+    layers: int = 0
+    weights: int = 0
+    activations: int = 0
+    traits: frozenset[str] = frozenset()
+    weight_bytes: int = 0
+    activation_bytes: int = 0
+    peak_bytes: int = 0
+    integer_ops: bool = False
+    unknown: tuple[str, ...] = ()
+    parts: Mapping[str, tuple[int, int, int, int]] = field(default_factory=dict)
+    read_again: int = 0
+
+    @property
+    def reads(self) -> int:
+        """Numbers that one run reads from weights."""
+        return self.weights + self.read_again
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What one inference of a policy computes and moves.
+
+    Args:
+        graphs: Graph name -> one run of it.
+        runs: Graph name -> runs in one inference, by the program.
+    """
+
+    graphs: Mapping[str, GraphWorkload]
+    runs: Mapping[str, int]
+
+    @property
+    def macs(self) -> dict[str, int]:
+        """Precision -> multiply-accumulates of one inference."""
+        total: Counter[str] = Counter()
+        for name, graph in self.graphs.items():
+            total.update({precision: count * self.runs.get(name, 0) for precision, count in graph.macs.items()})
+        return dict(total)
+
+    @property
+    def layers(self) -> int:
+        """Compute layers of one inference, repeats counted."""
+        return sum(graph.layers * self.runs.get(name, 0) for name, graph in self.graphs.items())
+
+    @property
+    def weight_bytes(self) -> int:
+        """Bytes of the weights of all graphs, each once."""
+        return sum(graph.weight_bytes for graph in self.graphs.values())
+
+    @property
+    def peak_bytes(self) -> int:
+        """Bytes of live tensors, each open graph keeping its own."""
+        return sum(graph.peak_bytes for graph in self.graphs.values())
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Layers that cannot be counted, as ``graph/layer``."""
+        return tuple(f"{name}/{layer}" for name, graph in self.graphs.items() for layer in graph.unknown)
+
+
+def workload(bundle: Bundle) -> Workload:
+    """Count the work of one inference of a bundle.
+
+    Raises:
+        GraphError: when a graph cannot be read.
+        MissingExtra: when onnx is not installed.
+    """
+    runs: Counter[str] = Counter()
+    for step in bundle.manifest.program:
+        runs[step.graph] += step.repeat
+    parts = bundle.manifest.parts
+    graphs = {name: graph_workload(bundle.path / graph.file, parts) for name, graph in bundle.manifest.graphs.items()}
+    return Workload(graphs, dict(runs) or dict.fromkeys(graphs, 1))
+
+
+def graph_workload(
+    path: Path, parts: Mapping[str, Sequence[str]] | None = None, told: Callable[[Any, Tensors], str] = precision_of
+) -> GraphWorkload:
+    """Count the work of one run of an ONNX file; a free first axis counts as 1.
+
+    Args:
+        path: The file.
+        parts: Part of the policy -> globs of module names, to count each by itself.
+        told: What the multiply-accumulates of a layer are counted as.
+
+    Raises:
+        GraphError: when the file cannot be read.
+        MissingExtra: when onnx is not installed.
+    """
+    onnx = require("onnx", "build")
+    try:
+        tensors = open_graph(onnx, path)
+    except Exception as error:  # the seam: every exception type of onnx and protobuf becomes ours
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
+    return _count(tensors, parts or {}, told)
+
+
+def part_named(name: str, parts: Mapping[str, Sequence[str]]) -> str:
+    """Return the first part that a module, or a node named after one (``head/MatMul``), belongs to; empty for none."""
+    names = (name, name.rpartition("/")[0] or name)
+    return next((part for part, globs in parts.items() if _matches(names, globs)), "")
+
+
+def _matches(names: Iterable[str], globs: Iterable[str]) -> bool:
+    return any(fnmatch.fnmatchcase(name, glob) for name in names for glob in globs)
+
+
+def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]], told: Callable[[Any, Tensors], str]) -> GraphWorkload:
+    macs: Counter[str] = Counter()
+    tally = Tally()
+    activation_bytes = 0
+    unknown = [*tensors.hidden(COMPUTE)]
+    for node in tensors.nodes:
+        tally.concat(node.op_type == "Concat")
+        if node.op_type not in COMPUTE:
+            continue
+        count = node_macs(node, tensors)
+        written = [tensors.bytes_of(name) for name in node.output if name]
+        if count is None or written[0] is None:
+            tally.layers += 1
+            unknown.append(node.name or node.output[0])
+            continue
+        macs[told(node, tensors)] += count
+        activation_bytes += sum(size or 0 for size in written)
+        part = part_named(node.name, parts)
+        written_numbers = math.prod(tensors.shape(node.output[0]) or ())
+        weights, groups = _operands(node, tensors)
+        tally.layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors))
+    integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
+    return GraphWorkload(
+        dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
+        activation_bytes, tensors.peak_bytes(), integer, tuple(unknown), tally.parts(), tally.read_again,
+    )  # fmt: skip
+
+
+def _operands(node: Any, tensors: Tensors) -> tuple[int, int]:
+    """Return the numbers in a layer's weight (0 for a product of activations) and the groups of a convolution."""
+    if node.op_type == "MatMulNBits":
+        return int(tensors.attribute(node, "K", 0)) * int(tensors.attribute(node, "N", 0)), 1
+    second = node.input[WEIGHT_AT.get(node.op_type, 1)] if len(node.input) > WEIGHT_AT.get(node.op_type, 1) else ""
+    shape = tensors.shape(second) or ()
+    groups = int(tensors.attribute(node, "group", 1)) if node.op_type in CONVOLUTIONS else 1
+    return (math.prod(shape) if tensors.is_constant(second) else 0), groups
+
+
+def _weight_of(node: Any, tensors: Tensors) -> str:
+    """Return the name of the tensor that is stored for a layer's weight."""
+    place = WEIGHT_AT.get(node.op_type, 1)
+    return tensors.root(node.input[place]) if len(node.input) > place else ""
+
+
+@dataclass
+class Tally:
+    """Sums over the compute layers of a graph, however they were found."""
+
+    layers: int = 0
+    weights: int = 0
+    read_again: int = 0
+    activations: int = 0
+    _concats: int = 0
+    _macs: int = 0
+    _depthwise: int = 0
+    _grouped: int = 0
+    _products: int = 0
+    _rows: int = 0
+    _parts: dict[str, tuple[int, int, int, int]] = field(default_factory=dict)
+    _seen: set[Hashable] = field(default_factory=set)
+
+    def layer(
+        self, macs: int, written: int, weights: int, groups: int = 1, part: str = "", weight: Hashable = ""
+    ) -> None:
+        """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights, groups and part.
+
+        Args:
+            weight: What tells its weight from others; a weight that was seen before is read again, not stored again.
+                Empty: a weight of its own.
+        """
+        before = self._parts.get(part, (0, 0, 0, 0))
+        added = zip(before, (macs, weights, written, 1), strict=True)
+        self._parts[part] = tuple(old + new for old, new in added)  # type: ignore[assignment]
+        self.layers += 1
+        self.weights += 0 if weight in self._seen else weights
+        self.read_again += weights if weight in self._seen else 0
+        self._seen.update([weight] if weight else [])
+        self.activations += written
+        self._macs += macs
+        self._depthwise += groups > 1 and macs <= DEPTHWISE * written
+        self._grouped += macs if groups > 1 and macs > DEPTHWISE * written else 0
+        self._products += macs if not weights else 0
+        self._rows += weights if macs <= ONE_ROW * weights else 0
+
+    def concat(self, found: bool) -> None:
+        """Take in a node that may be a concatenation."""
+        self._concats += found
+
+    def parts(self) -> dict[str, tuple[int, int, int, int]]:
+        """Return the sums of each part; nothing when all layers are of none."""
+        return dict(self._parts) if set(self._parts) - {""} else {}
+
+    def traits(self) -> frozenset[str]:
+        """Return which of ``TRAITS`` the graph has."""
+        layers, macs, weights = max(1, self.layers), max(1, self._macs), max(1, self.weights + self.read_again)
+        has = (
+            self._depthwise >= 0.15 * layers, self._products >= 0.005 * macs, self._grouped >= 0.2 * macs,
+            self._concats >= 0.1 * layers, self._rows >= 0.6 * weights,
+        )  # fmt: skip
+        return frozenset(trait for trait, present in zip(TRAITS, has, strict=True) if present)
+
+
+WORK = "workload"
+"""Table of a benchmark's row: what one inference computes."""
+
+
+def whole_work(load: Workload) -> dict[str, Any]:
+    """Return the work of one inference as one record: sums over its graphs and their repeats."""
+    sums = {"macs": 0.0, "weights": 0.0, "activations": 0.0, "layers": 0.0}
+    traits: set[str] = set()
+    precision = "float32"
+    most = -1.0
+    for name, runs in load.runs.items():
+        graph = load.graphs[name]
+        macs = float(sum(graph.macs.values())) * runs
+        sums["macs"] += macs
+        sums["weights"] += graph.reads * runs
+        sums["activations"] += graph.activations * runs
+        sums["layers"] += graph.layers * runs
+        traits |= graph.traits
+        if macs > most:
+            most, precision = macs, stored_precision(graph)
+    return {**sums, "traits": sorted(traits), "precision": precision}
+
+
+def stored_precision(graph: GraphWorkload) -> str:
+    """Return the precision that most of a graph's multiply-accumulates have."""
+    most = max(graph.macs, key=lambda name: graph.macs[name], default="float32")
+    return {"int4": "w4", "uint8": "int8", "float4": "float8"}.get(most, most if most in PRECISIONS else "float32")
+
+
+PRECISIONS = {
+    "float32": (4.0, 4.0), "float16": (2.0, 2.0), "bfloat16": (2.0, 2.0), "float8": (1.0, 1.0), "int8": (1.0, 1.0),
+    "w8": (1.0, 2.0), "w4": (0.5625, 2.0),
+}  # fmt: skip
+"""Precision -> bytes of a weight and of an activation; w4 counts a 16-bit scale for each 32 weights."""

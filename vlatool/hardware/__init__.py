@@ -1,0 +1,1 @@
+"""Boards and robots: hardware profiles and platforms."""

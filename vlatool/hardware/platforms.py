@@ -1,0 +1,68 @@
+"""Robot platforms: what a robot of a kind usually has and allows, as a starting point for ``hwselect``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import ConfigDict, Field, ValidationError
+
+from vlatool.errors import ProfileError, nearest
+from vlatool.files.numbers import Numeric
+from vlatool.files.yaml import read_yaml
+from vlatool.hardware.profile import SUFFIXES, Kind
+
+
+class Platform(Numeric):
+    """A kind of robot.
+
+    Args:
+        control_hz: Rate of the actions.
+        compute_watts: What the battery and the cooling leave for the computer.
+        battery_wh: None for a robot on mains power.
+        sensors: With their rates.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    title: str
+    control_hz: float = Field(gt=0)
+    compute_watts: float = Field(gt=0)
+    battery_wh: float | None = Field(None, gt=0)
+    sensors: tuple[str, ...] = Field(min_length=1)
+    note: str = ""
+    kind: Kind
+    source: str
+
+
+def platform_names() -> list[str]:
+    """List the platforms that are shipped."""
+    return sorted(path.stem for path in _folder().glob("*.yaml"))
+
+
+def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
+    """Read a platform by name, or from a YAML file of the user.
+
+    Raises:
+        ProfileError: when there is none, or it is malformed.
+
+    Example:
+        >>> load_platform("quadcopter").compute_watts
+        15.0
+    """
+    wanted = os.fspath(name_or_path)
+    own = wanted.endswith(SUFFIXES) or os.sep in wanted
+    path = Path(wanted) if own else _folder() / f"{wanted}.yaml"
+    if not own and wanted not in platform_names():
+        raise ProfileError(f"There is no platform '{wanted}'; {nearest(wanted, platform_names())}.")
+    try:
+        return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ProfileError(f"The platform {path} is malformed: {where}: {first['msg']}.") from error
+
+
+def _folder() -> Path:
+    return Path(__file__).with_name("data") / "platforms"

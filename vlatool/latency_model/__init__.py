@@ -1,0 +1,1 @@
+"""The latency model: published latencies, features, the Gaussian process, its fit and score."""

@@ -1,0 +1,166 @@
+"""What the latency model knows of a question: the work, what computes it, and in which precision."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.graph.workload import PRECISIONS, TRAITS
+from vlatool.latency_model.gaussian_process import KEYS, Rows
+
+Array = NDArray[Any]
+
+ALIKE = {"bfloat16": "float16", "float8": "int8"}
+"""Precision -> the one whose published latencies speak for it."""
+CENTRE = np.array([0.6, 1.8, 2.0, 4.0])
+SPREAD = np.array([1.8, 0.6, 1.0, 0.6])
+DEVICE_CENTRE = np.array([0.3, 4.3, 0.6, 2.0])
+DEVICE_SPREAD = np.array([2.5, 1.1, 0.5, 0.9])
+LAYER_MS = 0.03
+"""Milliseconds for a layer at 1 GHz, before the fit's factor."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """One graph, once.
+
+    Args:
+        macs: Multiply-accumulates.
+        weights: Numbers that it reads from weights, as often as it reads them.
+        activations: Numbers that its compute layers write.
+        layers: Compute layers.
+        traits: Of ``TRAITS``.
+        name: What it is called where it was published; unique for a user's own graph.
+    """
+
+    macs: float
+    weights: float
+    activations: float
+    layers: float
+    traits: frozenset[str] = frozenset()
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What computes.
+
+    Args:
+        device: Name of the board or processor; two places with one name share what is known of it.
+        unit: ``cpu``, ``gpu``, ``igpu`` or ``npu``.
+        cores: Cores (threads) that take part.
+        clock_ghz: Of them.
+        peaks: Precision -> 10^12 operations per second, dense; at least one.
+        bandwidth_gb_s: Of the memory.
+        setting: What else a measurement was taken with: power mode, threads, version.
+        isa: Instruction set features of its cores, in words, as profiles have them: places with the same ones speak
+            for each other.
+    """
+
+    device: str
+    unit: str
+    cores: float
+    clock_ghz: float
+    peaks: Mapping[str, float] = field(hash=False)
+    bandwidth_gb_s: float
+    setting: str = ""
+    isa: str = ""
+
+    def peak(self, precision: str) -> float:
+        """Return the peak that a precision computes at: that of float16, or float32, for weights alone in few bits."""
+        wanted = {"w4": "float16", "w8": "float16"}.get(precision, precision)
+        chain = (wanted, ALIKE.get(wanted, wanted), "float16" if wanted in ALIKE else "float32", "float32")
+        return next((self.peaks[name] for name in chain if name in self.peaks), max(self.peaks.values()))
+
+
+@dataclass(frozen=True)
+class Question:
+    """How long this work takes there.
+
+    Args:
+        runtime: Inference library, as ``_points`` names it.
+        precision: A key of ``PRECISIONS``.
+    """
+
+    work: Work
+    place: Place
+    runtime: str
+    precision: str
+
+
+@dataclass(frozen=True)
+class Shares:
+    """What is reached of the peaks before anything is known (0-1), and a factor on ``LAYER_MS``.
+
+    Weights are read in one stream, activations are written and read in pieces: each has a share of the bandwidth.
+    """
+
+    compute: float = 0.3
+    activations: float = 0.27
+    weights: float = 0.55
+    layers: float = 1.0
+
+
+def roofline_ms(question: Question, shares: Shares) -> float:
+    """Return compute, memory and layers in ms, added up."""
+    return sum(roofline_parts(question, shares).values())
+
+
+def roofline_parts(question: Question, shares: Shares) -> dict[str, float]:
+    """Return ``compute``, ``memory`` and ``overhead`` in ms (Williams, Waterman, Patterson, CACM 2009)."""
+    work, place = question.work, question.place
+    weight, activation = PRECISIONS[question.precision]
+    moved = work.weights * weight / shares.weights + work.activations * activation / shares.activations
+    return {
+        "compute": 2e3 * work.macs / (place.peak(question.precision) * 1e12 * shares.compute),
+        "memory": 1e3 * moved / (place.bandwidth_gb_s * 1e9),
+        "overhead": work.layers / place.clock_ghz * LAYER_MS * shares.layers,
+    }
+
+
+def rows_of(questions: Iterable[Question], shares: Shares) -> Rows:
+    """Return the rows of the process for some questions."""
+    asked = list(questions)
+    keys = [_keys(question) for question in asked]
+    return Rows(
+        {name: np.array([each[name] for each in keys], np.int64) for name in KEYS},
+        np.array([_model(question.work) for question in asked]).reshape(-1, 4),
+        np.array([[trait in question.work.traits for trait in TRAITS] for question in asked], float).reshape(-1, 5),
+        np.array([_device(question) for question in asked]).reshape(-1, 4),
+        np.log([roofline_ms(question, shares) for question in asked]),
+    )
+
+
+def _model(work: Work) -> Array:
+    macs = math.log(max(work.macs, 1) / 1e9)
+    others = (work.activations / 1e6, work.weights / 1e6, work.layers)
+    activations, weights, layers = (math.log(max(value, 1e-6)) for value in others)
+    return np.asarray((np.array([macs, activations - macs, weights - macs, layers - 0.3 * macs]) - CENTRE) / SPREAD)
+
+
+def _device(question: Question) -> Array:
+    place = question.place
+    values = (place.peak(question.precision), place.bandwidth_gb_s, place.clock_ghz, place.cores)
+    return np.asarray((np.log(values) - DEVICE_CENTRE) / DEVICE_SPREAD)
+
+
+def _keys(question: Question) -> dict[str, int]:
+    place, runtime = question.place, question.runtime
+    precision = ALIKE.get(question.precision, question.precision)
+    work = question.work
+    own = f"own {work.macs} {work.weights} {work.activations} {work.layers} {sorted(work.traits)}"
+    name = f"{work.name} {work.macs:.3g}" if work.name else own
+    unit = f"{place.device}/{place.unit}"
+    core = f"{place.unit}/{' '.join(sorted(place.isa.split()))}" if place.isa else unit
+    names = (
+        place.unit, core, unit, runtime, f"{runtime} {precision}", f"{core} {runtime} {precision}", f"{unit} {runtime}",
+        f"{unit} {runtime} {precision}", f"{unit} {runtime} {precision} {place.setting}", name,
+        f"{name} {runtime} {precision}",
+    )  # fmt: skip
+    return {key: zlib.crc32(text.encode()) for key, text in zip(KEYS, names, strict=True)}

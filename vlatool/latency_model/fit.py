@@ -1,0 +1,305 @@
+"""Fit the latency model: scales by leaving models and devices out whole, intervals by conformal scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import time
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import DataError, OutputError
+from vlatool.latency_model.features import Shares, rows_of
+from vlatool.latency_model.folds import UNITS, Folds, Sample
+from vlatool.latency_model.gaussian_process import Scales
+from vlatool.latency_model.model import DATA, LEVEL, Known, LatencyModel, read_model, write
+from vlatool.latency_model.published import Point, merged, read_points
+
+Array = NDArray[Any]
+TAIL = 0.3
+"""What the 90th percentile counts beside the median."""
+DEVICES = 0.6
+"""What an unseen device counts beside an unseen model."""
+CALIBRATED, QUICK = 0.6, 6
+"""What a device counts of which one model is known; how many of its models are tried in the search for scales."""
+STEP, LEAST_STEP = 0.5, 0.04
+"""Of the search for scales, in their logarithm: the first, and what is too small to try."""
+MOST = 32
+"""Figures of one device, runtime and precision that the search for scales looks at."""
+
+
+def loss(error: Array) -> float:
+    """Return median and 90th percentile of the relative error, weighed."""
+    if not len(error):
+        return 0.0
+    off = np.abs(np.expm1(error))
+    return float(np.median(off) + TAIL * np.quantile(off, 0.9))
+
+
+def assess(sample: Sample, scales: Scales, shares: Shares) -> float:
+    """Return what the search for scales lowers."""
+    folds = Folds(rows_of(sample.questions, shares), sample, scales)
+    likelihood = 0.0
+    total = 0.0
+    for groups, weight in ((sample.models, 1.0), (sample.devices, DEVICES)):
+        error, deviation = folds.without(groups)
+        total += weight * loss(error)
+        likelihood += weight * float(np.mean(np.log(deviation) + 0.5 * (error / deviation) ** 2))
+    total += CALIBRATED * loss(folds.calibrated(sample.devices, QUICK)[0])
+    return total + LIKELIHOOD * likelihood
+
+
+LIKELIHOOD = 0.05
+"""What the predictive likelihood counts: it keeps the intervals honest where the error alone does not care."""
+
+
+def tune(
+    sample: Sample,
+    scales: Scales,
+    shares: Shares,
+    seconds: float,
+    seed: int = 0,
+    tell: Callable[[str], None] = lambda _: None,
+) -> tuple[Scales, Shares]:
+    """Search scales and shares by coordinates, in the logarithm, until the time is over.
+
+    Args:
+        seconds: For the search.
+        seed: Of the order of the coordinates.
+        tell: Called with each improvement.
+    """
+    names = [field.name for field in dataclasses.fields(Scales) if field.name != "constant"]
+    names += [f"shares.{field.name}" for field in dataclasses.fields(Shares)]
+    random = np.random.default_rng(seed)
+    steps = dict.fromkeys(names, STEP)  # with the sign of the direction that helped last
+    best = assess(sample, scales, shares)
+    begun = time.monotonic()
+    while active := [name for name in names if abs(steps[name]) > LEAST_STEP]:
+        for name in random.permutation(active):
+            if time.monotonic() - begun > seconds:
+                return scales, shares
+            better = False
+            for step in (steps[name], -steps[name]):
+                tried = _changed(scales, shares, name, math.exp(step))
+                found = assess(sample, *tried) if tried else math.inf
+                if found < best - 1e-4:
+                    (scales, shares), best, better = tried or (scales, shares), found, True
+                    steps[name] = step
+                    tell(f"{time.monotonic() - begun:.0f} s, {name}: {best:.4f}")
+                    break
+            steps[name] *= 1.3 if better else 0.6
+    return scales, shares
+
+
+def _changed(scales: Scales, shares: Shares, name: str, factor: float) -> tuple[Scales, Shares] | None:
+    part = name.removeprefix("shares.")
+    if part == name:
+        return replace(scales, **{name: getattr(scales, name) * factor}), shares
+    value = getattr(shares, part) * factor
+    return None if part != "layers" and value > 1 else (scales, replace(shares, **{part: value}))
+
+
+def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[str, float]]:
+    """Return regime -> unit -> how many standard deviations reach ``LEVEL`` of what is left out (split conformal).
+
+    Where a unit has few models or devices, it is drawn towards all of the regime (``Scores.reach``).
+    """
+    rows = rows_of(sample.questions, shares)
+    folds = Folds(rows, sample, scales)
+    found: dict[str, dict[str, float]] = {}
+    for regime, scores in (
+        ("known", Scores.of(sample, *folds.without(sample.models), sample.models, sample.models)),
+        ("unseen", Scores.of(sample, *folds.without(sample.devices), sample.devices, rows.keys["pair"])),
+        ("calibrated", Scores.calibrated(sample, folds)),
+    ):
+        found[regime] = {unit: scores.reach(number) for number, unit in enumerate(UNITS)}
+    return found
+
+
+ALL_COUNT = 4
+"""Models or devices that all units together count for beside those of one unit: few of a unit say little."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How many standard deviations left-out figures are away.
+
+    Args:
+        values: (n,) for each published figure, several versions of a runtime apart.
+        groups: (n,) what it was left out with.
+        units: (n,) index into ``UNITS``.
+        draws: (n,) which draw it is of: a model; a device with a runtime and precision; a device with the model that
+            calibrates it.
+    """
+
+    values: Array
+    groups: Array
+    units: Array
+    draws: Array
+
+    @staticmethod
+    def of(sample: Sample, error: Array, deviation: Array, groups: Array, draws: Array) -> Scores:
+        """Return the scores of every row of a sample."""
+        place = sample.figures
+        values = np.abs(error[place] + sample.logs[place] - sample.published) / deviation[place]
+        return Scores(values, groups[place], sample.units[place], draws[place])
+
+    @staticmethod
+    def calibrated(sample: Sample, folds: Folds) -> Scores:
+        """Return the scores of devices of which one model is known, for many of their models."""
+        error, deviation, places, draws = folds.calibrated(sample.devices)
+        order = np.argsort(sample.figures, kind="stable")
+        starts = np.searchsorted(sample.figures[order], np.arange(len(sample.logs) + 1))
+        copies = np.diff(starts)[places]  # versions of each row
+        each = np.repeat(np.arange(len(places)), copies)
+        figure = order[np.repeat(starts[places] - np.append(0, np.cumsum(copies)[:-1]), copies) + np.arange(len(each))]
+        at = places[each]
+        values = np.abs(error[each] + sample.logs[at] - sample.published[figure]) / deviation[each]
+        return Scores(values, sample.devices[at], sample.units[at], draws[each])
+
+    def reach(self, unit: int, but: int | None = None) -> float:
+        """Return the score that ``LEVEL`` do not exceed: this unit's, drawn towards all units' where it has few groups.
+
+        Args:
+            unit: Index into ``UNITS``.
+            but: A group that takes no part.
+        """
+        others = np.ones(len(self.values), bool) if but is None else self.groups != but
+        alike = others & (self.units == unit)
+        if not others.any():
+            return math.inf
+        apart = len(np.unique(self.groups[alike]))
+        own = self._share(alike) if apart else 0.0
+        return (apart * own + ALL_COUNT * self._share(others)) / (apart + ALL_COUNT)
+
+    def _share(self, rows: Array) -> float:
+        """Return the score that ``LEVEL`` of some rows do not exceed."""
+        values, groups, draws = self.values[rows], self.groups[rows], len(np.unique(self.draws[rows]))
+        _, inverse, counts = np.unique(groups, return_inverse=True, return_counts=True)
+        weights = counts[inverse] ** -0.5  # figures of one group are no independent witnesses
+        order = np.argsort(values)
+        share = np.cumsum(weights[order]) / weights.sum()
+        level = LEVEL * (draws + 1) / draws  # what comes is one draw more (Lei et al., JASA 2018, section 2)
+        return float(values[order][min(len(order) - 1, int(np.searchsorted(share, level)))])
+
+
+PARTS = ("processors", "npu")
+
+
+def fitted(points: Sequence[Point], like: LatencyModel) -> LatencyModel:
+    """Return the model with the scales of another one, given these points."""
+    parts: dict[str, Known] = {}
+    for part, mine in by_part(points).items():
+        if not mine:
+            continue
+        sample = Sample.of(mine)
+        parts[part] = Known(rows_of(sample.questions, like.shares[part]), sample.logs, like.parts[part].scales)
+    return LatencyModel(parts, like.shares, like.conformal, like.about)
+
+
+def by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
+    """Return the points of each process."""
+    kept = [point for point in points if point.question is not None]
+    return {part: [point for point in kept if (point.kind == "npu") == (part == "npu")] for part in PARTS}
+
+
+def thinned(points: Sequence[Point], most: int = MOST, seed: int = 0) -> list[Point]:
+    """Return at most so many figures of a device, runtime and precision, drawn at random.
+
+    The search for scales needs no more of them, and its work grows with the third power.
+    """
+    random = np.random.default_rng(seed)
+    alike: dict[tuple[str, ...], list[Point]] = {}
+    for point in merged(points):
+        if asked := point.question:
+            alike.setdefault((point.group, asked.place.unit, asked.runtime, asked.precision), []).append(point)
+    drawn = (random.permutation(len(same))[:most] for same in alike.values())
+    return [same[place] for same, places in zip(alike.values(), drawn, strict=True) for place in sorted(places)]
+
+
+def fit(
+    points: Sequence[Point], before: LatencyModel | None, seconds: float, seed: int, tell: Callable[[str], None]
+) -> LatencyModel:
+    """Return the model of some figures.
+
+    Args:
+        before: Where the search for scales begins; at ``Scales()`` and ``Shares()`` when None.
+        seconds: For the search; 0 keeps the scales.
+        seed: Of the search.
+        tell: Called with what is done.
+    """
+    parts: dict[str, Known] = {}
+    shares: dict[str, Shares] = {}
+    bounds: dict[str, dict[str, dict[str, float]]] = {}
+    usable = {part: mine for part, mine in by_part(points).items() if mine}
+    few = {part: thinned(mine, seed=seed) for part, mine in usable.items()}
+    work = {part: float(len(mine)) ** 3 for part, mine in few.items()}  # of one assessment
+    for part, mine in usable.items():
+        sample = Sample.of(mine)
+        groups = f"{len(set(sample.devices))} devices and {len(set(sample.models))} models"
+        tell(f"{part}: {len(sample.published)} figures of {groups}")
+        begin = (Scales(), Shares())
+        if before is not None and part in before.parts:
+            begin = (before.parts[part].scales, before.shares[part])
+        told: list[str] = []
+        share = seconds * work[part] / sum(work.values())
+        scales, shares[part] = tune(Sample.of(few[part]), *begin, share, seed, told.append)
+        for line in told[-3:]:
+            tell(line)
+        bounds[part] = conformal(sample, scales, shares[part])
+        parts[part] = Known(rows_of(sample.questions, shares[part]), sample.logs, scales)
+    about = {"figures": sum(len(known.rows) for known in parts.values()), "seed": seed, "level": LEVEL}
+    return LatencyModel(parts, shares, bounds, about)
+
+
+def _refuse_other(out: Path) -> None:
+    """Refuse files called as the model's that are no model.
+
+    Raises:
+        OutputError: when there are.
+    """
+    present = [out / name for name in ("latency.npz", "latency.json") if os.path.lexists(out / name)]
+    if not present:
+        return
+    try:
+        ours = set(json.loads((out / "latency.json").read_text(encoding="utf-8"))) == {"about", "parts"}
+        ours = ours and zipfile.is_zipfile(out / "latency.npz") and not any(path.is_symlink() for path in present)
+    except (OSError, ValueError, TypeError, RecursionError):
+        ours = False
+    if not ours:
+        raise OutputError(f"{present[0]} is no model that vlatool wrote.", "name another directory, or move it away")
+
+
+def fit_files(
+    path: Path, out: Path, seconds: float, seed: int, anew: bool = False, tell: Callable[[str], None] = lambda _: None
+) -> None:
+    """Fit on a file and write the model's data.
+
+    Args:
+        anew: Begin the search for scales at ``Scales()`` and ``Shares()``, and not at those of the shipped model, which
+            saw all that was published.
+        tell: Called with what is done.
+
+    Raises:
+        DataError: when the file is malformed, or has no row to fit on.
+        OutputError: when other files have the names of the model's.
+    """
+    _refuse_other(out)
+    _refuse_other(out)
+    points = read_points(path)
+    shipped = not anew and (DATA / "latency.json").is_file()
+    before = read_model(DATA) if shipped else None  # and not the user's own: the search begins at what was shipped
+    if not any(point.question for point in points):
+        raise DataError(f"{path} has no row to fit on: {next(point.why for point in points)}.")
+    out.mkdir(parents=True, exist_ok=True)  # before the search: its minutes are not to be lost
+    found = fit(points, before, seconds, seed, tell)
+    write(found, out)
+    tell(f"written: {out / 'latency.npz'}, {out / 'latency.json'}")

@@ -1,0 +1,147 @@
+"""Predictions of published latencies without the model, or the device, that they belong to.
+
+Leaving a group out of a Gaussian process needs no second fit: with A the inverse of the covariance of all rows, the
+group's mean is y_g - inv(A_gg) (A y)_g and its covariance inv(A_gg) (Rasmussen and Williams 2006, section 5.4.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.latency_model.features import Question
+from vlatool.latency_model.gaussian_process import Rows, Scales, kernel
+from vlatool.latency_model.published import Point, merged
+
+Array = NDArray[Any]
+UNITS = ("cpu", "gpu", "igpu", "npu")
+LONGEST = 32
+"""Models that calibrate a held-out device, one after the other, at most."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The rows that a fit works on.
+
+    Args:
+        questions: One for each row.
+        logs: (n,) natural logarithm of ms.
+        models, devices: (n,) codes of the groups that are left out whole.
+        units: (n,) index into ``UNITS``.
+        figures: (m,) row of each published figure: several versions of a runtime are one row.
+        published: (m,) their logarithms.
+    """
+
+    questions: tuple[Question, ...]
+    logs: Array
+    models: Array
+    devices: Array
+    units: Array
+    figures: Array
+    published: Array
+
+    @staticmethod
+    def of(points: Sequence[Point]) -> Sample:
+        """Take the points that can be asked about, one row for each question."""
+        asked = [point for point in points if point.question is not None]
+        known = merged(asked)
+        row = {point.question: place for place, point in enumerate(known)}
+        figures = np.array([row[point.question] for point in asked], np.int64)
+        published = np.array([point.log_ms for point in asked])
+        models, devices = (_codes([getattr(each, name) for each in known]) for name in ("model", "group"))
+        units = np.array([UNITS.index(point.kind) for point in known])
+        questions = tuple(point.question for point in known if point.question is not None)
+        logs = np.array([point.log_ms for point in known])
+        return Sample(questions, logs, models, devices, units, figures, published)
+
+
+def _codes(names: Sequence[str]) -> Array:
+    known = {name: code for code, name in enumerate(sorted(set(names)))}
+    return np.array([known[name] for name in names])
+
+
+class Folds:
+    """Predictions of each row without its group.
+
+    Args:
+        rows: Of the sample.
+        sample: The sample.
+        scales: Of the process.
+    """
+
+    def __init__(self, rows: Rows, sample: Sample, scales: Scales) -> None:
+        covariance = kernel(rows, rows, scales)
+        covariance[np.diag_indices(len(rows))] += scales.noise**2
+        self._inverse = np.linalg.inv(covariance)
+        self._residual = sample.logs - rows.prior
+        self._weights = self._inverse @ self._residual
+        self._sample = sample
+
+    def without(self, groups: Array) -> tuple[Array, Array]:
+        """Return error of log(ms) (predicted less measured) and its predicted standard deviation, row by row."""
+        error, deviation = np.zeros(len(groups)), np.zeros(len(groups))
+        for index, mean, covariance in self._each(groups):
+            error[index], deviation[index] = mean - self._residual[index], np.sqrt(np.diag(covariance))
+        return error, deviation
+
+    def calibrated(self, groups: Array, most: int = LONGEST) -> tuple[Array, Array, Array, Array]:
+        """Leave each device out, tell the process of one of its models, and predict the others; for many of its models.
+
+        Args:
+            groups: Devices.
+            most: Models of each that are told, one after the other.
+
+        Returns:
+            Errors, standard deviations, the rows that they belong to, and which telling each is of.
+        """
+        errors: list[Array] = []
+        deviations: list[Array] = []
+        places: list[Array] = []
+        for index, mean, covariance in self._each(groups):
+            models = np.unique(self._sample.models[index])
+            for model in models[:: max(1, -(-len(models) // most))]:
+                seen = self._sample.models[index] == model
+                rest = ~seen
+                if not rest.any():
+                    continue
+                across = covariance[np.ix_(rest, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
+                told = self._residual[index][seen] - mean[seen]
+                errors.append(mean[rest] + across @ told - self._residual[index][rest])
+                spread = np.diag(covariance)[rest] - np.einsum("ij,ij->i", across, covariance[np.ix_(rest, seen)])
+                deviations.append(np.sqrt(np.maximum(spread, 1e-9)))
+                places.append(index[rest])
+        if not errors:  # every device has one model alone
+            return np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)
+        draws = np.repeat(np.arange(len(places)), [len(each) for each in places])
+        return np.concatenate(errors), np.concatenate(deviations), np.concatenate(places), draws
+
+    def once(self, groups: Array, random: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Leave each device out, tell the process of one of its models, drawn at random, and predict the others.
+
+        Returns:
+            Error and standard deviation of each row, and which rows were told.
+        """
+        error, deviation = np.zeros(len(groups)), np.ones(len(groups))
+        told = np.zeros(len(groups), bool)
+        for index, mean, covariance in self._each(groups):
+            models = np.unique(self._sample.models[index])
+            seen = self._sample.models[index] == models[random.integers(len(models))]
+            told[index[seen]] = True
+            if seen.all():
+                continue
+            across = covariance[np.ix_(~seen, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
+            known = self._residual[index][seen] - mean[seen]
+            error[index[~seen]] = mean[~seen] + across @ known - self._residual[index][~seen]
+            spread = np.diag(covariance)[~seen] - np.einsum("ij,ij->i", across, covariance[np.ix_(~seen, seen)])
+            deviation[index[~seen]] = np.sqrt(np.maximum(spread, 1e-9))
+        return error, deviation, told
+
+    def _each(self, groups: Array) -> Iterator[tuple[Array, Array, Array]]:
+        for code in np.unique(groups):
+            index = np.flatnonzero(groups == code)
+            covariance = np.linalg.inv(self._inverse[np.ix_(index, index)])
+            yield index, self._residual[index] - covariance @ self._weights[index], covariance

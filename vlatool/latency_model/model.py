@@ -1,0 +1,260 @@
+"""How long a graph takes on a board: a prediction with an interval, or why there is no ground for one."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import DataError
+from vlatool.files.edited import whole_file
+from vlatool.latency_model.features import ALIKE, Question, Shares, rows_of
+from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales
+
+Array = NDArray[Any]
+DATA = Path(__file__).with_name("data")
+PLACE = "VLATOOL_LATENCY"
+"""Variable that names a directory of ``vlatool hwselect fit``."""
+LEVEL = 0.8
+"""Share of measurements that fall into the interval."""
+WIDEST = 1.4
+"""Half an interval in log(ms), above which nothing useful is said: more than a factor of 4 either way."""
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Milliseconds of one run.
+
+    Args:
+        ms: Median; NaN when unknown.
+        low, high: Interval that ``LEVEL`` of measurements fall into.
+        regime: ``known`` (this runtime and precision were measured on this device), ``calibrated`` (the user measured
+            something there), ``unseen``.
+        why: Why it is unknown; empty when it is known.
+    """
+
+    ms: float
+    low: float = math.nan
+    high: float = math.nan
+    regime: str = "unseen"
+    why: str = ""
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a prediction."""
+        return not self.why
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a process is given: figures and scales.
+
+    Args:
+        rows: What was measured.
+        logs: (n,) natural logarithm of the ms.
+        scales: Of the fit.
+    """
+
+    rows: Rows
+    logs: Array
+    scales: Scales
+
+    def without(self, runtimes: Iterable[int]) -> Process:
+        """Return the process that is not given the figures of some runtimes (codes of ``KEYS``)."""
+        kept = ~np.isin(self.rows.keys["runtime"], sorted(runtimes))
+        return Process(self.rows.take(kept), self.logs[kept], self.scales)
+
+
+CROWD = 900
+"""Figures of one runtime that are left out when nobody asks about it."""
+
+
+def crowds(rows: Rows) -> set[int]:
+    """Return the runtimes (codes of ``KEYS``) with very many figures."""
+    codes, counts = np.unique(rows.keys["runtime"], return_counts=True)
+    return {int(code) for code in codes[counts > CROWD]}
+
+
+@dataclass
+class LatencyModel:
+    """Two processes: one for processors and GPUs, one for neural processing units.
+
+    Args:
+        parts: ``processors`` and ``npu`` -> what the process is given.
+        shares: The same -> the roofline below it.
+        conformal: The same -> regime -> unit -> standard deviations that the interval spans on either side.
+        about: Where it was fitted, for reports.
+        own: Codes of the devices (of ``KEYS``) that the user measured.
+    """
+
+    parts: Mapping[str, Known]
+    shares: Mapping[str, Shares]
+    conformal: Mapping[str, Mapping[str, Mapping[str, float]]]
+    about: Mapping[str, Any]
+    own: frozenset[int] = field(default_factory=frozenset)
+    _processes: dict[tuple[str, frozenset[int]], Process] = field(default_factory=dict, init=False, repr=False)
+
+    def predict(self, questions: Sequence[Question]) -> list[Predicted]:
+        """Answer every question, in order."""
+        found = [Predicted(math.nan, why="the latency model has no figures of such a unit")] * len(questions)
+        for part in self.parts:
+            places = [place for place, question in enumerate(questions) if part_of(question) == part]
+            for place, answer in zip(places, self._answers(part, [questions[each] for each in places]), strict=True):
+                found[place] = answer
+        return found
+
+    def conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
+        """Return the model that also knows what a user measured: (question, ms)."""
+        parts = dict(self.parts)
+        own = set(self.own)
+        for part, known in self.parts.items():
+            mine = [(question, ms) for question, ms in measured if part_of(question) == part]
+            if not mine:
+                continue
+            rows = rows_of([question for question, _ in mine], self.shares[part])
+            logs = np.log([ms for _, ms in mine])
+            parts[part] = Known(Rows.joined(known.rows, rows), np.append(known.logs, logs), known.scales)
+            own.update(rows.keys["device"].tolist())
+        return LatencyModel(parts, self.shares, self.conformal, self.about, frozenset(own))
+
+    def _answers(self, part: str, questions: list[Question]) -> list[Predicted]:
+        if not questions:
+            return []
+        known = self.parts[part]
+        rows = rows_of(questions, self.shares[part])
+        mean, deviation = self._process(part, rows).predict(rows)
+        pairs, runtimes = (set(known.rows.keys[name].tolist()) for name in ("pair", "runtime"))
+        found = []
+        for number, question in enumerate(questions):
+            regime = "known" if int(rows.keys["pair"][number]) in pairs else "unseen"
+            if int(rows.keys["device"][number]) in self.own:
+                regime = "calibrated"
+            if why := no_ground(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen"):
+                found.append(Predicted(math.nan, regime=regime, why=why))
+                continue
+            spans = self.conformal[part][regime]
+            half = float(spans.get(question.place.unit, max(spans.values())) * deviation[number])
+            if half > WIDEST:
+                factor = math.exp(half)
+                reason = f"published figures leave a factor of {factor:.1f} either way; measure it on the board"
+                found.append(Predicted(math.nan, regime=regime, why=reason))
+                continue
+            ms = math.exp(mean[number])
+            found.append(Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime))
+        return found
+
+    def _process(self, part: str, rows: Rows) -> Process:
+        """Return the process for some questions.
+
+        A runtime with very many figures that nobody asks about is left out: it says next to nothing of the others, and
+        the work grows with the third power of the figures.
+        """
+        unasked = frozenset(crowds(self.parts[part].rows) - set(rows.keys["runtime"].tolist()))
+        if (part, unasked) not in self._processes:
+            self._processes[part, unasked] = self.parts[part].without(unasked)
+        return self._processes[part, unasked]
+
+
+OTHER_NPU = "figures of one neural processing unit say too little of another; measure it on the board"
+
+
+def part_of(question: Question) -> str:
+    """Return which process answers."""
+    return "npu" if question.place.unit == "npu" else "processors"
+
+
+def no_ground(question: Question, published: bool, seen: bool) -> str:
+    """Return why nothing can be said, or an empty string.
+
+    Args:
+        question: What is asked.
+        published: Whether a figure of the runtime is known.
+        seen: Whether one of this device is known.
+    """
+    if question.runtime == "hailort" and "attention" in question.work.traits:
+        return "Hailo's published figures are of convolutional networks; a transformer's latency there is unknown"
+    precision = ALIKE.get(question.precision, question.precision)
+    if question.place.unit == "npu" and precision in ("float32", "w4", "w8"):
+        return f"the unit does not compute in {question.precision}"
+    if not published:
+        return f"no latency was published for the runtime {question.runtime}"
+    return OTHER_NPU if question.place.unit == "npu" and not seen else ""
+
+
+def shipped() -> LatencyModel:
+    """Return the model of the package's data files, or of those in ``$VLATOOL_LATENCY``.
+
+    Raises:
+        DataError: when the files there cannot be read.
+    """
+    own = os.environ.get(PLACE)
+    try:
+        return read_model(Path(own) if own else DATA)
+    except DAMAGE as error:
+        reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        fix = f"unset {PLACE}, or make one: vlatool hwselect fit POINTS.csv -o DIR" if own else "install vlatool again"
+        raise DataError(f"There is no latency model in {own or DATA}: {reason}.", fix) from error
+
+
+DAMAGE = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading a file that is none of ours raises."""
+
+
+@functools.cache
+def read_model(folder: Path) -> LatencyModel:
+    """Return the model of a directory that ``write`` wrote; read once in a process."""
+    parameters = json.loads((folder / "latency.json").read_text(encoding="utf-8"))
+    parts, shares = {}, {}
+    with (folder / "latency.npz").open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+        for part, values in parameters["parts"].items():
+            arrays = {name: stored[f"{part}.{name}"] for name in ("model", "traits", "device", "prior")}
+            keys = stored[f"{part}.keys"]
+            if keys.ndim != 2 or keys.shape[1] != len(KEYS):
+                raise ValueError("it was fitted by another version of vlatool")
+            rows = Rows({name: keys[:, place].astype(np.int64) for place, name in enumerate(KEYS)},
+                        **{name: array.astype(float) for name, array in arrays.items()})  # fmt: skip
+            parts[part] = Known(rows, stored[f"{part}.logs"].astype(float), Scales(**values["scales"]))
+            shares[part] = Shares(**values["shares"])
+    if not parts:
+        raise ValueError("it has no part")
+    conformal = {part: values["conformal"] for part, values in parameters["parts"].items()}
+    return LatencyModel(parts, shares, conformal, parameters["about"])
+
+
+def write(model: LatencyModel, folder: Path) -> None:
+    """Write ``latency.npz`` and ``latency.json`` as ``shipped`` reads them."""
+    import dataclasses
+
+    arrays: dict[str, Array] = {}
+    described: dict[str, Any] = {}
+    for part, known in model.parts.items():
+        rows = known.rows
+        arrays[f"{part}.keys"] = np.stack([rows.keys[name] for name in KEYS], axis=1).astype(np.uint32)
+        for name in ("model", "traits", "device", "prior"):
+            arrays[f"{part}.{name}"] = getattr(rows, name).astype(np.float32)
+        arrays[f"{part}.logs"] = known.logs.astype(np.float32)
+        described[part] = {
+            "scales": {key: float(f"{value:.5g}") for key, value in dataclasses.asdict(known.scales).items()},
+            "shares": {key: float(f"{value:.5g}") for key, value in dataclasses.asdict(model.shares[part]).items()},
+            "conformal": {
+                regime: {unit: round(value, 4) for unit, value in units.items()}
+                for regime, units in model.conformal[part].items()
+            },
+        }
+    text = json.dumps({"about": dict(model.about), "parts": described}, indent=1)
+    with whole_file(folder / "latency.npz") as stored, whole_file(folder / "latency.json") as told:
+        with stored.open("wb") as stream:  # by its name numpy would call it .npz
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+        told.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,300 @@
+"""Published latencies, in the columns of the collection that the model is fitted on.
+
+    device, power_mode, runtime, model, params_m, gflops_or_gmacs, input, precision, batch, metric, value,
+    macts_m, n_layers, device_class; any others are not read
+
+``gflops_or_gmacs`` holds 10^9 multiply-accumulates, ``params_m`` and ``macts_m`` 10^6 weights and activations.
+``data/models.csv`` says more of some models (weights as often as they are read); what is left out follows from the
+other columns; a row without any ground is kept apart, with the reason.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vlatool.errors import DataError
+from vlatool.latency_model.features import Place, Question, Work
+
+DATA = Path(__file__).with_name("data")
+NEEDED = ("device", "runtime", "model", "precision", "metric", "value", "device_class")
+PRECISIONS = {
+    "fp32": "float32", "float32": "float32", "fp16": "float16", "float16": "float16", "bf16": "bfloat16",
+    "bfloat16": "bfloat16", "fp8": "float8", "int8": "int8", "int4": "w4", "w4": "w4", "w8": "w8",
+    "fp16/int4 mix": "float16", "fp4/int4 or fp16": "w4",
+}  # fmt: skip
+RUNTIMES = (
+    ("ncnn-vulkan", "ncnn-vulkan"), ("ncnn", "ncnn-cpu"), ("tflite", "tflite-cpu"), ("xnnpack", "tflite-cpu"),
+    ("armnn", "armnn-cpu"), ("tensorrt dit_only.*backbone", "torch-cuda"), ("tensorrt", "tensorrt"),
+    ("whisper_trt", "tensorrt"), ("openvino.*igpu", "openvino-igpu"), ("openvino.*npu", "openvino-npu"),
+    ("openvino", "openvino-cpu"), (".*inductor cpu", "inductor-cpu"), ("torch.compile", "torch-cuda, compiled"),
+    ("torch|pytorch", "torch-cuda"), ("mlc|nanollm", "mlc"), ("hailort", "hailort"), ("mnn", "mnn-cpu"),
+    ("executorch", "executorch-cpu"), ("onnxruntime-(gpu|cuda)", "onnxruntime-gpu"),
+    ("onnxruntime", "onnxruntime-cpu"),
+)  # fmt: skip
+"""Beginning of a published runtime's name and the model -> the runtime that its figures count for. "dit_only" leaves
+the backbone to PyTorch, and the 127 ms that are published are PyTorch's."""
+TRAIT_NAMES = (
+    ("depthwise", "mobile|shuffle|mnas|efficientnet|ghost|proxyless|blazeface|fastestdet|yolo-fastest|mixnet|fbnet"
+                  "|lcnet|tinynet|edgenext|repvit|hardcore|fastvit|convnext|efficientformer|rexnet|semnas|mobilevit|convmixer"
+                  "|regnetz|poolformer|efficientvit|starnet|inception_next"),
+    ("attention", "vit|deit|beit|swin|bert|xcit|cait|eva|llama|gpt|clip|dino|volo|pit_|tnt|twins|coat|pvt|maxvit|gr00t"
+                  "|owl|sam|mvit|nest|jx_|crossvit|gcvit|davit|caformer|flexi|lm|phi|vila|llava|whisper|halo|botnet"
+                  "|lambda|bat_resnext|diffusion|stereo"),
+    ("grouped", "regnet|resnext|resnest|skresnext|ecaresn|gernet|dpn"),
+    ("branches", "densenet|dpn|inception|googlenet|squeeze|dla|hrnet|nasnet|yolo|ssd|shuffle|retinanet|unet"),
+    ("dense", "alexnet|vgg|llama|gpt|chatglm|phi|smollm"),
+)  # fmt: skip
+"""Trait -> names of architectures that have it, where no graph is at hand."""
+ROW_OF_WEIGHTS = 3000.0
+"""Numbers in a row of a language model's weights, where a step of decoding is not described further."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One published figure.
+
+    Args:
+        question: What was measured; None when there is no ground to predict it.
+        log_ms: Natural logarithm of the milliseconds of one item.
+        group: Name of the board, as held out: see ``TWINS``.
+        kind: ``device_class``: cpu, gpu, igpu, npu.
+        model: Name of the model, as held out.
+        why: Why there is no question.
+    """
+
+    question: Question | None
+    log_ms: float
+    group: str
+    kind: str
+    model: str
+    why: str = ""
+
+
+def read_points(path: Path) -> list[Point]:
+    """Read a file of published latencies.
+
+    Raises:
+        DataError: when it cannot be read, lacks a column, or a value is not a number; names the line.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream)
+            missing = [name for name in NEEDED if name not in (reader.fieldnames or ())]
+            if missing:
+                known = ", ".join(reader.fieldnames or ()) or "none"
+                raise DataError(f"{path} has no column '{missing[0]}'; its columns: {known[:300]}.")
+            rows = [(reader.line_num, _stripped(row)) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    found = [_point(row, f"{path}, line {number}") for number, row in rows]
+    if not found:
+        fix = f"give a CSV file with a row for each figure; columns: {', '.join(NEEDED)}"
+        raise DataError(f"{path} holds no row.", fix)
+    return found
+
+
+def merged(points: Iterable[Point]) -> list[Point]:
+    """Return points with one for each question: several versions of a runtime count as one figure, their mean log."""
+    groups: dict[Question, list[Point]] = {}
+    for point in points:
+        if point.question is not None:
+            groups.setdefault(point.question, []).append(point)
+    return [replace(same[0], log_ms=sum(each.log_ms for each in same) / len(same)) for same in groups.values()]
+
+
+def _point(row: Mapping[str, str], where: str) -> Point:
+    value = _number(row.get("value", ""), where, "value")
+    kind, metric = row["device_class"], row["metric"]
+    if metric not in ("latency_ms", "fps", "tokens_per_s"):
+        raise DataError(f"{where}: the metric '{metric}' is unknown; allowed: latency_ms, fps, tokens_per_s.")
+    if kind not in ("cpu", "gpu", "igpu", "npu"):
+        raise DataError(f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.")
+    board = _name(row["device"])
+    blank = Point(None, math.nan, TWINS.get(board, board), kind, family(row["model"]))
+    if not (value > 0 and math.isfinite(value)):
+        return replace(blank, why="its value is 0, endless or missing: nothing was measured")
+    blank = replace(blank, log_ms=math.log(value if metric == "latency_ms" else 1000 / value))
+    precision = PRECISIONS.get(row["precision"])
+    place = place_of(row)
+    runtime = runtime_of(f"{row['runtime']} {row['model']}")
+    if on_processor(row):
+        blank, runtime = replace(blank, kind="cpu"), "ncnn-cpu"
+    if precision is None:
+        return replace(blank, why=f"the precision '{row['precision']}' is unknown")
+    if place is None:
+        return replace(blank, why=f"nothing is known of the device '{row['device']}' ({blank.kind})")
+    if not runtime:
+        return replace(blank, why=f"the runtime '{row['runtime']}' is unknown")
+    if metric == "tokens_per_s" and precision == "int8":
+        precision = "w8"
+    work = work_of(row, where, decoding=metric == "tokens_per_s")
+    if work is None:
+        return replace(blank, why="neither the row nor data/models.csv says how much it computes")
+    if row.get("batch") in ("throughput", "offline"):
+        runtime += ", streams"
+    elif metric == "fps" and row.get("batch", "1") not in ("", "1"):
+        runtime += f", batch {row['batch']}"
+    return replace(blank, question=Question(work, place, runtime, precision))
+
+
+def runtime_of(name: str) -> str:
+    """Return the runtime that a published name (and its model) counts for, empty when it is unknown."""
+    return next((known for pattern, known in RUNTIMES if re.match(pattern, name.lower())), "")
+
+
+def work_of(row: Mapping[str, str], where: str, *, decoding: bool) -> Work | None:
+    """Return the work of a row; None when its multiply-accumulates are not known."""
+    macs, weights = (
+        _number(row.get("gflops_or_gmacs", ""), where, "gmacs"),
+        _number(row.get("params_m", ""), where, "p"),
+    )
+    activations, layers = _number(row.get("macts_m", ""), where, "a"), _number(row.get("n_layers", ""), where, "l")
+    known = _models().get(row["model"], {})
+    macs, weights = known.get("gmacs", macs), known.get("params_m", weights)
+    if decoding and weights > 0:  # each weight is used once
+        macs, activations = weights / 1e3, weights / ROW_OF_WEIGHTS
+    traits = frozenset(trait for trait, names in TRAIT_NAMES if re.search(names, row["model"].lower()))
+    if decoding:
+        traits = traits | {"dense", "attention"}
+    if not (macs > 0 and weights > 0):
+        return None
+    activations = activations if activations > 0 else known.get("macts_m", math.nan)
+    layers = layers if layers > 0 else known.get("layers", math.nan)
+    activations = activations if activations > 0 else _usual(ACTIVATIONS, macs, weights, traits)
+    layers = layers if layers > 0 else _usual(LAYERS, macs, weights, traits)
+    return Work(macs * 1e9, weights * 1e6, activations * 1e6, layers, traits, f"{row['model']} {row.get('input', '')}")
+
+
+ACTIVATIONS = (2.01, 0.86, -0.26, {"depthwise": 0.70, "attention": 0.41, "grouped": 0.14, "dense": -0.62})
+LAYERS = (3.2, 0.1, 0.12, {"depthwise": 0.5, "attention": 0.5, "grouped": 0.6, "branches": 0.38, "dense": -1.0})
+"""Logarithm of 10^6 activations, and of layers, by log(10^9 MACs), log(10^6 weights) and traits: least squares over the
+rows that name them (activations of 1,094 models; layers of 61, a judgement for attention and grouped convolutions)."""
+
+
+def _usual(
+    known: tuple[float, float, float, Mapping[str, float]], macs: float, weights: float, traits: Iterable[str]
+) -> float:
+    constant, by_macs, by_weights, by_trait = known
+    extra = sum(by_trait.get(trait, 0.0) for trait in traits)
+    return math.exp(constant + by_macs * math.log(macs) + by_weights * math.log(weights) + extra)
+
+
+def _stripped(row: Mapping[str | None, str | None]) -> dict[str, str]:
+    return {key: (text or "").strip() for key, text in row.items() if key}
+
+
+def _name(device: str) -> str:
+    """Return a device's name without remarks, so that one device has one name."""
+    return re.sub(r"\s*\(.*\)", "", re.sub(r" \(oc 2\.9ghz\)", "-2.9ghz", device.lower()))
+
+
+def place_of(row: Mapping[str, str]) -> Place | None:
+    """Return what a row was measured on; None when the device is not known."""
+    name = _name(row["device"])
+    devices = known_devices()
+    unit = "cpu" if on_processor(row) else row["device_class"]
+    threads = re.search(r"(\d+)t\b", row["runtime"].lower())
+    cluster = re.search(r"powersave=\d", row["runtime"])
+    part = CLUSTERS.get(cluster[0], "") if cluster else ""
+    other = "gpu" if unit == "igpu" else "igpu"
+    places = ((f"{name} {part}", unit), (name, unit), (name, other))
+    found = next((devices[place] for place in places if place in devices), None)
+    if found is None:
+        return None
+    cores, peaks = found.cores, dict(found.peaks)
+    parts = (row.get("power_mode", ""), threads and threads[0], cluster and cluster[0], row.get("batch", ""))
+    setting = " ".join(part for part in parts if part)
+    if threads and unit == "cpu" and int(threads[1]) < cores:
+        share = int(threads[1]) / cores
+        cores, peaks = float(threads[1]), {dtype: peak * share for dtype, peak in peaks.items()}
+    if row.get("power_mode") == "MaxQ":
+        peaks = {dtype: peak * MAX_Q for dtype, peak in peaks.items()}
+    return replace(found, device=name, unit=unit, cores=cores, peaks=peaks, setting=setting)
+
+
+PART = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
+"""What a name says beside the model's: figures of its parts are held out with it."""
+SPELLING = re.compile(r"[\W_]+")
+"""What differs between two spellings of one model's name: ``resnet-50``, ``resnet50`` and ``ResNet_50``."""
+
+
+def family(model: str) -> str:
+    """Return the name that a model is held out by.
+
+    Example:
+        >>> family("LeViT_128") == family("levit-128⭐")
+        True
+    """
+    return SPELLING.sub("", PART.sub("", model).lower()).replace("yolov11", "yolo11")
+
+
+TWINS = {
+    "jetson-agx-orin": "jetson-agx-orin-64gb", "jetson-orin-nano-8gb-super": "jetson-orin-nano-8gb",
+    "raspberry-pi-5-2.9ghz": "raspberry-pi-5",
+}  # fmt: skip
+"""Name -> the board that it is, overclocked, in another power mode, or named in another way: held out with it."""
+CLUSTERS = {"powersave=1": "little", "powersave=2": "big"}
+"""ncnn's ``powersave`` -> which cores of a processor with two kinds compute (ncnn, ``set_cpu_powersave``)."""
+
+
+def on_processor(row: Mapping[str, str]) -> bool:
+    """Say whether a figure of a GPU is one of the processor.
+
+    ncnn has no Vulkan kernels for int8: the layers run on the processor, and the published figures of both are equal
+    (ResNet-50 with one thread: 107.0 and 106.8 ms on AGX Orin, 374.8 and 370.6 on AGX Xavier, 516 and 517 on Nano).
+    """
+    return row["runtime"].lower().startswith("ncnn-vulkan") and row["precision"] == "int8"
+
+
+MAX_Q = 0.5
+"""Share of the peak in MLPerf's MaxQ on AGX Orin (throughput fell to 0.49-0.61 of MaxP)."""
+
+
+@functools.cache
+def known_devices() -> dict[tuple[str, str], Place]:
+    """Return (name, unit) -> what is known of each device of ``data/devices.csv``."""
+    found = {}
+    for row in _table("devices.csv"):
+        peaks = {dtype: float(row[dtype]) for dtype in ("float32", "float16", "int8") if row[dtype]}
+        found[row["device"].lower(), row["unit"]] = Place(
+            row["device"].lower(), row["unit"], float(row["cores"]), float(row["clock_ghz"]), peaks,
+            float(row["bandwidth_gb_s"]), isa=row["isa"],
+        )  # fmt: skip
+    return found
+
+
+@functools.cache
+def published_as() -> dict[tuple[str, str], str]:
+    """Return (profile, unit) -> the device that published figures name so."""
+    return {
+        (profile, row["unit"]): row["device"].lower()
+        for row in _table("devices.csv")
+        for profile in row["profile"].split(";")
+        if profile
+    }
+
+
+@functools.cache
+def _models() -> dict[str, dict[str, float]]:
+    numbers = ("gmacs", "params_m", "macts_m", "layers")
+    return {row["model"]: {key: float(row[key]) for key in numbers if row[key]} for row in _table("models.csv")}
+
+
+def _table(name: str) -> list[dict[str, str]]:
+    with (DATA / name).open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _number(text: str, where: str, column: str) -> float:
+    if not text:
+        return math.nan
+    try:
+        return float(text)
+    except ValueError:
+        raise DataError(f"{where}: '{text}' in the column '{column}' is no number.") from None

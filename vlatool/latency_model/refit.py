@@ -1,0 +1,124 @@
+"""Score the whole way of fitting: scales, figures and intervals are found without what is then predicted."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.errors import DataError, UsageError
+from vlatool.latency_model.fit import fit
+from vlatool.latency_model.model import LatencyModel, Predicted
+from vlatool.latency_model.published import Point, merged, read_points
+from vlatool.latency_model.score import DRAWS, FOLDS, summary, told_as
+from vlatool.machine.processes import single_threads
+from vlatool.user_code.children import spread
+
+Answered = list[tuple[Point, Predicted]]
+
+
+def refit_points(
+    path: Path, held_out: str | None, seed: int, seconds: float, tell: Callable[[str, float | None], None]
+) -> dict[str, dict[str, Any]]:
+    """Predict a file's rows with models that were fitted anew without them, in a process for each processor.
+
+    Nothing of what is left out takes part: not in the scales, which begin at built-in values, not in the figures, and
+    not in the intervals.
+
+    Args:
+        path: Published latencies.
+        held_out: ``models``: a tenth of the models at a time; ``devices``: each board.
+        seed: Of the dealing of models, of the search, and of the choice of the models that calibrate.
+        seconds: For the search of each part.
+        tell: Called with what is done and the share of it.
+
+    Returns:
+        ``models``; or ``devices`` and ``calibrated``, where a board is left out but for one of its models.
+
+    Raises:
+        UsageError: when ``held_out`` is none of these.
+        DataError: when the file is malformed, or nothing of it is left to fit on.
+    """
+    if held_out not in KINDS:
+        given = "not given" if held_out is None else f"'{held_out}'"
+        raise UsageError(
+            f"--held-out is {given}; with --refit, allowed: models, devices (which tells calibrated, too)."
+        )
+    points = read_points(path)
+    folds = dealt([point for point in points if point.question], held_out, seed)
+    if len(folds) < 2:
+        raise DataError(f"{path} has no two {held_out}: nothing is left to fit on.")
+    answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
+    how = {"points": str(path.absolute()), "held_out": held_out, "seed": seed, "seconds": seconds}
+    jobs = [{**how, "held": sorted(held)} for held in folds]
+    processes = len(os.sched_getaffinity(0))
+    parts = spread(f"{__name__}:fold", jobs, processes, tell, "the fit", (__name__,))
+    with single_threads(), contextlib.closing(parts):
+        for done, part in enumerate(parts, 1):
+            for kind, found in part.items():
+                answered[kind] += [(points[number], Predicted(**told)) for number, told in found]
+            tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
+    unasked = [point for point in points if not point.question]
+    told = f"all fitted anew without it, {seconds:g} s each"
+    return {
+        kind: summary(
+            [point for point, _ in found] + unasked, [each for _, each in found], f"{told_as(kind, seed)}; {told}"
+        )
+        for kind, found in answered.items()
+    }
+
+
+KINDS = {"models": ("models",), "devices": ("devices", "calibrated")}
+
+
+def dealt(points: Sequence[Point], held_out: str, seed: int) -> list[frozenset[str]]:
+    """Return the names of the models, or of the boards, that are left out together."""
+    if held_out != "models":
+        return [frozenset({name}) for name in sorted({point.group for point in points})]
+    names = sorted({point.model for point in points})
+    order = np.random.default_rng(seed).permutation(len(names))
+    parts = [frozenset(names[place] for place in order[number::FOLDS]) for number in range(FOLDS)]
+    return [part for part in parts if part]
+
+
+def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Compute one part in this process: kind -> number of the point and what was predicted for it."""
+    points = read_points(Path(job["points"]))
+    numbers = {id(point): number for number, point in enumerate(points)}
+    found = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
+    return {kind: [[numbers[id(point)], asdict(told)] for point, told in part] for kind, part in found.items()}
+
+
+def one_fold(
+    points: Sequence[Point], held: frozenset[str], held_out: str, seed: int, seconds: float
+) -> dict[str, Answered]:
+    """Return what a model that was fitted without some models or boards says of them."""
+
+    def out(point: Point) -> bool:
+        return (point.model if held_out == "models" else point.group) in held
+
+    mine = [point for point in points if out(point) and point.question]
+    model = fit([point for point in points if not out(point)], None, seconds, seed, lambda _: None)
+    found = {held_out: answers(model, mine)}
+    if held_out == "devices":
+        random = np.random.default_rng(seed)
+        names = sorted({point.model for point in mine})
+        found["calibrated"] = []
+        for _ in range(DRAWS):
+            known = names[random.integers(len(names))]
+            measured = merged(point for point in mine if point.model == known)
+            taught = model.conditioned(
+                [(each.question, float(np.exp(each.log_ms))) for each in measured if each.question]
+            )
+            found["calibrated"] += answers(taught, [point for point in mine if point.model != known])
+    return found
+
+
+def answers(model: LatencyModel, points: Sequence[Point]) -> Answered:
+    """Return what a model says of some points."""
+    return list(zip(points, model.predict([point.question for point in points if point.question]), strict=True))

@@ -1,0 +1,159 @@
+"""How far predictions are from published latencies, and how often their intervals hold."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import DataError, UsageError
+from vlatool.latency_model.features import rows_of
+from vlatool.latency_model.fit import Scores, by_part
+from vlatool.latency_model.folds import UNITS, Folds, Sample
+from vlatool.latency_model.model import LEVEL, PLACE, WIDEST, Predicted, no_ground, shipped
+from vlatool.latency_model.published import Point, read_points
+
+Array = NDArray[Any]
+SPLITS = ("models", "devices", "calibrated")
+DRAWS = 5
+"""Models that calibrate each device, one after the other."""
+FOLDS = 10
+"""Parts that the models are dealt into; one part is left out at a time. Devices are left out one at a time."""
+
+
+def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict[str, Any]:
+    """Predict a file; with ``held_out`` from its own other rows.
+
+    Args:
+        path: Published latencies.
+        held_out: ``models``: a tenth of the models is left out at a time; ``devices``: each device; ``calibrated``:
+            each device but for one of its models. The widths of the intervals come from the errors of the others,
+            whose predictions knew what is left out here; ``_refit`` is stricter.
+            None: the shipped model predicts every row.
+        seed: Of the dealing of models, and of the choice of the model that calibrates.
+
+    Raises:
+        UsageError: when ``held_out`` is none of these.
+        DataError: when the file is malformed, or the model knows nothing of its kind of unit.
+    """
+    points = read_points(path)
+    own = os.environ.get(PLACE)
+    whose = f"the model of {own}" if own else "the shipped model"
+    if held_out is None:
+        found = shipped().predict([point.question for point in points if point.question])
+        return summary(points, found, whose)
+    if held_out not in SPLITS:
+        raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.")
+    shown: list[Point] = []
+    answers: list[Predicted] = []
+    for draw in range(DRAWS if held_out == "calibrated" else 1):
+        known: dict[Any, Predicted] = {}
+        for part, mine in by_part(points).items():
+            if mine:
+                known.update(_left_out(Sample.of(mine), part, held_out, seed + 1000 * draw))
+        drawn = [point for point in points if not point.question or known[point.question].regime != "told"]
+        answers += [known[point.question] for point in drawn if point.question]
+        shown += drawn
+    return summary(shown, answers, f"{told_as(held_out, seed)}; scales of {whose}")
+
+
+def told_as(held_out: str, seed: int) -> str:
+    """Return what is left out, in words."""
+    return {
+        "models": f"{FOLDS} folds of whole models, dealt with seed {seed}",
+        "devices": "each device left out whole",
+        "calibrated": f"each device left out but for one model, {DRAWS} times, chosen with seed {seed}",
+    }[held_out]
+
+
+def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, Predicted]:
+    """Return question -> its prediction from the rows that are not left out with it."""
+    model = shipped()
+    if part not in model.parts:
+        raise DataError(f"The latency model has no figures of {part}, and so no scales for them.", f"unset {PLACE}")
+    rows = rows_of(sample.questions, model.shares[part])
+    folds = Folds(rows, sample, model.parts[part].scales)
+    random = np.random.default_rng(seed)
+    told = np.zeros(len(sample.logs), bool)
+    groups = sample.devices
+    if held_out == "models":
+        groups = (random.permutation(sample.models.max() + 1) % FOLDS)[sample.models]
+    if held_out == "calibrated":
+        error, deviation, told = folds.once(groups, random)
+        scores = Scores.calibrated(sample, folds)
+    else:
+        error, deviation = folds.without(groups)
+        draws = sample.models if held_out == "models" else rows.keys["pair"]
+        scores = Scores.of(sample, error, deviation, groups, draws)
+    regime = {"models": "known", "devices": "unseen", "calibrated": "calibrated"}[held_out]
+    reach = {pair: scores.reach(pair[1], pair[0]) for pair in set(zip(groups, sample.units, strict=True))}
+    lonely = _lonely(sample, groups, told)
+    found: dict[Any, Predicted] = {}
+    for place, question in enumerate(sample.questions):
+        half = reach[groups[place], sample.units[place]] * deviation[place]
+        why = no_ground(question, not lonely[place], regime != "unseen")
+        if not why and half > WIDEST:
+            why = "published figures leave too wide an interval"
+        if told[place] or why:
+            found[question] = Predicted(math.nan, regime="told" if told[place] else regime, why=why or "it was told")
+        else:
+            ms = math.exp(sample.logs[place] + error[place])
+            found[question] = Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime)
+    return found
+
+
+def _lonely(sample: Sample, groups: Array, told: Array) -> Array:
+    """Say of each row whether its runtime occurs in no other group and was not told: then nothing is known of it."""
+    runtimes = np.array([question.runtime for question in sample.questions])
+    found = np.zeros(len(runtimes), bool)
+    for runtime in np.unique(runtimes):
+        rows = runtimes == runtime
+        found[rows] = len(np.unique(groups[rows])) < 2 and not told[rows].any()
+    return found
+
+
+def summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> dict[str, Any]:
+    """Return how far predictions are from figures, as JSON values."""
+    asked = [point for point in points if point.question]
+    why: dict[str, int] = {}
+    for reason in [point.why for point in points if not point.question] + [each.why for each in answers if each.why]:
+        why[reason] = why.get(reason, 0) + 1
+    known = [(point, answer) for point, answer in zip(asked, answers, strict=True) if answer.known]
+    groups = {"all but npu": [pair for pair in known if pair[0].kind != "npu"]}
+    groups |= {unit: [pair for pair in known if pair[0].kind == unit] for unit in UNITS}
+    return {
+        "how": how, "rows": len(points), "predicted": len(known), "level": LEVEL,
+        "groups": {name: _errors(pairs) for name, pairs in groups.items() if pairs},
+        "unknown": dict(sorted(why.items(), key=lambda item: -item[1])),
+    }  # fmt: skip
+
+
+def _errors(pairs: Sequence[tuple[Point, Predicted]]) -> dict[str, float]:
+    measured = np.exp([point.log_ms for point, _ in pairs])
+    found, low, high = (np.array([getattr(answer, name) for _, answer in pairs]) for name in ("ms", "low", "high"))
+    off = np.abs(found / measured - 1)
+    inside = (low <= measured) & (measured <= high)
+    return {
+        "rows": len(pairs), "median": float(np.median(off)), "p90": float(np.quantile(off, 0.9)),
+        "coverage": float(inside.mean()), "factor": float(np.exp(np.median(np.log(high / low)) / 2)),
+    }  # fmt: skip
+
+
+def lines(found: Mapping[str, Any]) -> Iterator[str]:
+    """Return what a person reads."""
+    yield f"{found['how']}"
+    yield f"{found['predicted']} of {found['rows']} rows predicted; relative error |predicted - measured| / measured"
+    yield f"{'':14}{'rows':>6}{'median':>9}{'90th pct':>10}{'in interval':>13}{'interval':>10}"
+    for name, each in found["groups"].items():
+        yield (
+            f"{name:14}{each['rows']:>6}{each['median']:>9.1%}{each['p90']:>10.1%}{each['coverage']:>13.1%}"
+            f"{'x/÷ ' + format(each['factor'], '.2f'):>10}"
+        )
+    yield f"The interval is meant to hold {found['level']:.0%}."
+    for reason, count in list(found["unknown"].items())[:12]:
+        yield f"  unknown, {count}: {reason}"

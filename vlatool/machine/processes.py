@@ -1,0 +1,80 @@
+"""What processes that vlatool starts have in common: isolated, they find this vlatool, in as many threads as meant."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+SINGLE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Variables that make numpy's libraries compute in one thread; read when they are loaded."""
+PR_SET_PDEATHSIG = 1
+"""Of ``prctl(2)``."""
+START = """\
+import sys
+sys.path[:] = sys.argv.pop(1).splitlines()
+import runpy
+sys.argv[:] = sys.argv[1:]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+"""What an isolated process does first: ``-P`` would say it shorter, from Python 3.11 on."""
+
+
+def python_command(module: str, arguments: Sequence[str] = (), path: Sequence[str] | None = None) -> list[str]:
+    """Return the command that runs a module as ``__main__`` in an isolated Python (``-I``).
+
+    Neither the current directory nor variables of Python choose what it imports, but ``import_path()`` alone.
+
+    Args:
+        module: Its full name.
+        arguments: ``sys.argv[1:]`` of the module.
+        path: Where modules are imported from; ``import_path()`` when None.
+    """
+    joined = "\n".join(import_path() if path is None else path)
+    return [sys.executable, "-I", "-c", START, joined, module, *arguments]
+
+
+def python_code(code: str, arguments: Sequence[str] = ()) -> list[str]:
+    """Return the command that runs some code in an isolated Python; see ``python_command``."""
+    begin = "import sys\nsys.path[:] = sys.argv.pop(1).splitlines()\n"
+    return [sys.executable, "-I", "-c", begin + code, "\n".join(import_path()), *arguments]
+
+
+def import_path() -> list[str]:
+    """Return where a child imports from: as this process, less the current directory that Python itself put first.
+
+    The current directory stays where the user's own ``PYTHONPATH`` names it. This vlatool comes before what is
+    installed, and after the standard library.
+    """
+    own = {os.path.realpath(entry) for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry}
+    here = os.path.realpath(os.curdir)
+    wanted = [os.path.abspath(entry) for entry in sys.path if entry]
+    found = [entry for entry in dict.fromkeys(wanted) if os.path.realpath(entry) != here or here in own]
+    package = str(Path(__file__).resolve().parents[2])
+    if package in found:
+        return found
+    installed = (number for number, entry in enumerate(found) if Path(entry).name in ("site-packages", "dist-packages"))
+    found.insert(next(installed, len(found)), package)
+    return found
+
+
+def die_with_parent() -> None:
+    """Let the kernel kill this process when the thread that started it ends, however that ends (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def single_threads() -> Iterator[None]:
+    """Let processes that are started meanwhile compute in one thread: they are as many as there are processors."""
+    before = {name: os.environ.get(name) for name in SINGLE}
+    os.environ.update(SINGLE)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})

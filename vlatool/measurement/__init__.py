@@ -1,0 +1,1 @@
+"""How latency, memory and answers are measured: processes that need numpy and one engine."""

@@ -1,0 +1,214 @@
+"""What two bundles answer to observations that neither was made for: whether the one still follows the other.
+
+``python -m vlatool.measurement.agreement`` reads one line of JSON (the fields of ``_pairs.Job``) and prints one (those
+of ``Agreement``). Both are loaded as a robot loads them: every file is hashed, and the golden action must be computed.
+Each observation is answered twice, once right after ``reset`` and once in another order without it; where values are
+kept by design, the second time is a row of inferences in which both answer the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import random
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.machine.processes import die_with_parent
+from vlatool.measurement.child import answer, ask
+from vlatool.measurement.pairs import Job
+
+Array = NDArray[Any]
+FEWEST = 24
+"""Observations that are answered however long that takes."""
+STILL = 1e-6
+"""Spread of an element, as a share of its size, up to which it is said not to vary."""
+SEQUENCE = "consecutive"
+"""Kind of the observations that policies which keep values answer in a row."""
+CLOSE = 0.25
+"""Largest relative difference of outputs that do not vary (as of the golden action)."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How one output of the candidate follows the baseline's on observations of one kind.
+
+    Args:
+        kind: Of the observations (``data.Drawn.kind``).
+        output: Its name.
+        correlation: Over observations and elements, each by the baseline's spread: 1 follows it everywhere, 0 is what
+            a constant reaches, -1 is its opposite.
+        samples: Observations.
+    """
+
+    kind: str
+    output: str
+    correlation: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What a process found.
+
+    Args:
+        followed: One for each output and kind of observation.
+        looked: Observations that the candidate answered twice.
+        strays: How many of them it answered otherwise the second time.
+        unsteady: How many the baseline did.
+        skipped: Observations that the baseline cannot answer.
+        golden: Golden error of baseline and candidate; None without a golden action.
+        engines: Engines of baseline and candidate.
+    """
+
+    followed: tuple[Followed, ...] = ()
+    looked: int = 0
+    strays: int = 0
+    unsteady: int = 0
+    skipped: int = 0
+    golden: tuple[float | None, ...] = (None, None)
+    engines: tuple[str, ...] = ("", "")
+
+
+def measure_agreement(job: Job, timeout: float | None = None) -> Agreement:
+    """Measure in a fresh process.
+
+    Raises:
+        VlatoolError: what a bundle raises when it is loaded or run; GraphError when the process ends or takes longer
+            than ``timeout`` seconds.
+    """
+    about = f"{job.candidate} beside {job.baseline}"
+    found = ask("vlatool.measurement.agreement", (), json.dumps(dataclasses.asdict(job)), about, timeout)
+    found["followed"] = tuple(Followed(**each) for each in found["followed"])
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
+    return Agreement(**values)
+
+
+def run_agreement(job: Job) -> Agreement:
+    """Measure in this process; ``job.seconds`` ends it early, once ``FEWEST`` observations are answered."""
+    from vlatool.bundle.bundle import Bundle
+    from vlatool.measurement.turns import loaded, pool_of
+
+    baseline = Bundle.open(job.baseline)
+    policies = [loaded(path, job) for path in (job.baseline, job.candidate)]
+    pool = pool_of(job, baseline) if job.pairs else []
+    asked, skipped = _asked(policies, pool, job)
+    if any(step.keep for step in baseline.manifest.program):
+        for policy in policies:
+            policy.reset()
+        asked += _asked(policies, [replace(each, kind=SEQUENCE) for each in pool], job, afresh=False)[0]
+    strays = [_strays(policy, asked, which, job.seed) for which, policy in enumerate(policies)]
+    kinds = dict.fromkeys(each.kind for each in asked)
+    followed = [one for kind in kinds for one in _followed(policies, [each for each in asked if each.kind == kind])]
+    return Agreement(tuple(followed), len(asked), strays[1], strays[0], skipped,
+                     tuple(policy.golden_error for policy in policies),
+                     tuple(policy.engine for policy in policies))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Asked:
+    kind: str
+    observation: Mapping[str, Any]
+    noise: Mapping[str, Any] | None
+    outputs: tuple[Mapping[str, Array], Mapping[str, Array]]
+
+
+def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job, afresh: bool = True) -> tuple[list[_Asked], int]:
+    """Ask both for every observation, some bits of which are new, right after a reset (``afresh``) or in a row."""
+    from vlatool.errors import GraphError
+    from vlatool.measurement.answers import varied
+    from vlatool.runtime.program import draw
+
+    numbers = np.random.default_rng([job.seed, 3])
+    steps, spec = policies[0].bundle.manifest.program, policies[0].spec
+    found: list[_Asked] = []
+    skipped = 0
+    end = time.monotonic() + job.seconds
+    for place, drawn in enumerate(pool):
+        if place >= FEWEST and time.monotonic() > end:
+            break
+        observation = varied(drawn.observation, spec, numbers)
+        noise = {name: draw(wanted, numbers) for step in steps for name, wanted in step.noise.items()} or None
+        try:
+            theirs = _outputs(policies[0], observation, noise, afresh)
+        except GraphError:
+            skipped += 1
+            continue
+        found.append(
+            _Asked(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise, afresh)))
+        )
+    return found, skipped
+
+
+def _outputs(
+    policy: Any, observation: Mapping[str, Any], noise: Mapping[str, Any] | None, afresh: bool
+) -> dict[str, Array]:
+    if afresh:
+        policy.reset()
+    return {name: np.array(value) for name, value in policy.infer(observation, noise=noise).outputs.items()}
+
+
+def _strays(policy: Any, asked: Sequence[_Asked], which: int, seed: int) -> int:
+    """Count the answers that are others in another order without reset; 0 for a policy that keeps values by design."""
+    from vlatool.measurement.answers import Answers
+
+    if any(step.keep for step in policy.bundle.manifest.program):
+        return 0
+    answers = Answers([each.outputs[which] for each in asked])
+    for place in random.Random(seed).sample(range(len(asked)), len(asked)):
+        answers.look(place, policy.infer(asked[place].observation, noise=asked[place].noise).outputs)
+    return answers.strays
+
+
+def _followed(policies: Sequence[Any], asked: Sequence[_Asked]) -> list[Followed]:
+    kind, count = asked[0].kind, len(asked)
+    found = []
+    for tensor in policies[0].spec.outputs:
+        theirs, mine = (
+            _physical(policy, tensor.name, [each.outputs[which][tensor.name] for each in asked])
+            for which, policy in enumerate(policies)
+        )
+        found.append(Followed(kind, tensor.name, correlation(mine, theirs), count))
+    return found
+
+
+def _physical(policy: Any, name: str, values: Sequence[Array]) -> Array:
+    """Return an output in physical units by the bundle's own statistics, (N, ...); logits without their mean."""
+    from vlatool.runtime.statistics import load_normaliser
+
+    tensor = next(each for each in policy.spec.outputs if each.name == name)
+    wide = np.stack(values).astype(np.float64)
+    if tensor.kind == "discrete":
+        return np.asarray(wide - wide.mean(-1, keepdims=True))
+    normaliser = load_normaliser(tensor, policy.bundle.path / "assets")
+    return wide if normaliser is None else np.asarray(normaliser.inverse(wide.astype(np.float32)))
+
+
+def correlation(mine: Array, theirs: Array) -> float:
+    """Return how (N, ...) answers follow others, see ``Followed``; elements that do not vary do not count.
+
+    Where none varies, 1 says that they are near each other and 0 that they are not.
+    """
+    if mine.shape != theirs.shape:
+        return 0.0
+    count = len(theirs)
+    mine, theirs = mine.reshape(count, -1), theirs.reshape(count, -1)
+    spread = theirs.std(axis=0)
+    varied = spread > STILL * max(float(np.abs(theirs).max(initial=0.0)), 1e-12)
+    if not varied.any():
+        near = float(np.linalg.norm(mine - theirs)) <= CLOSE * (float(np.linalg.norm(theirs)) or 1.0)
+        return float(near)
+    one, two = ((each - each.mean(axis=0))[:, varied] / spread[varied] for each in (mine, theirs))
+    size = float(np.linalg.norm(one) * np.linalg.norm(two))
+    return float((one * two).sum() / size) if size > 0 else 0.0
+
+
+if __name__ == "__main__":
+    die_with_parent()
+    answer(lambda: dataclasses.asdict(run_agreement(Job(**json.loads(sys.stdin.readline())))))

@@ -1,0 +1,135 @@
+"""Run in a fresh process: load a bundle, infer, and say how long each part took and how much memory it needed.
+
+``python -m vlatool.measurement.cold_start BUNDLE ENGINE THREADS [OBSERVATIONS]`` prints one line of JSON.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from vlatool.machine.processes import die_with_parent
+from vlatool.measurement.child import answer, ask
+from vlatool.measurement.job import Limits
+from vlatool.measurement.memory import peak_rss_mb, resident_mb
+
+MORE = 5
+"""Inferences after the first: an engine's arena may grow with the second."""
+PARTS = {
+    "interpreter": "Python",
+    "imported": "numpy and runtime",
+    "engine": "engine library",
+    "loaded": "graphs and weights",
+    "first": "first inference",
+    "more": "later inferences",
+}
+
+
+def cold_start(
+    bundle: Path,
+    engine: str,
+    threads: int,
+    limits: Limits = Limits(),  # noqa: B008
+    timeout: float | None = None,
+    observations: Path | None = None,
+) -> dict[str, Any]:
+    """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
+
+    Args:
+        bundle, engine, threads: What is loaded, and how.
+        limits, timeout: Of the process.
+        observations: File of observations (``save_drawn``) to infer on after the golden one.
+
+    Returns:
+        ``start_ms`` (from the start of the process until its first line of Python), ``import_ms``, ``engine_ms`` (the
+        engine's library), ``load_ms``, ``first_ms`` (the first inference after the load), ``total_ms`` (from the start
+        of the process to the first action), ``peak_rss_mb`` (10^6 bytes) and ``rss_mb``: part -> what the process
+        holds once that part is done.
+
+    Raises:
+        VlatoolError: what the bundle raises; GraphError when the process ends in another way, or takes longer.
+    """
+    begun = time.monotonic_ns()
+    words = (str(bundle), engine, str(threads), *([str(observations)] if observations else []))
+    found = ask("vlatool.measurement.cold_start", words, "", str(bundle), timeout, limits)
+    found["start_ms"] = (found.pop("begun_ns") - begun) / 1e6
+    found["total_ms"] = (found.pop("acted_ns") - begun) / 1e6
+    return found
+
+
+def main(arguments: list[str]) -> dict[str, Any]:
+    """Load and run in this process."""
+    begun = time.monotonic_ns()  # the same clock in every process of a machine
+    rss = {"interpreter": resident_mb()}
+    from vlatool.bundle.bundle import Bundle
+    from vlatool.runtime import load
+    from vlatool.runtime.policy import DEFAULT_ENGINE
+
+    imported = time.monotonic_ns()
+    rss["imported"] = resident_mb()
+    named = arguments[1] or Bundle.open(arguments[0], verify=False).manifest.engine  # load verifies what it opens
+    _import_engine(named or DEFAULT_ENGINE)
+    ready = time.monotonic_ns()
+    rss["engine"] = resident_mb()
+    policy = load(arguments[0], engine=arguments[1], threads=int(arguments[2]), warmup=0)
+    loaded = time.monotonic_ns()
+    rss["loaded"] = resident_mb()
+    observation, noise = _observation(policy)
+    before = time.monotonic_ns()
+    policy.infer(observation, noise=noise)
+    acted = time.monotonic_ns()
+    rss["first"] = resident_mb()
+    for _ in range(MORE):
+        policy.infer(observation, noise=noise)
+    if len(arguments) > 3:
+        _infer_on(policy, Path(arguments[3]))
+    rss["more"] = resident_mb()
+    return {
+        "begun_ns": begun,
+        "import_ms": (imported - begun) / 1e6,
+        "engine_ms": (ready - imported) / 1e6,
+        "load_ms": (loaded - ready) / 1e6,
+        "first_ms": (acted - before) / 1e6,
+        "acted_ns": acted,
+        "peak_rss_mb": peak_rss_mb(),
+        "rss_mb": rss,
+    }
+
+
+def _observation(policy: Any) -> tuple[Any, Any]:
+    """Return the golden observation with its noise, or a recorded or synthetic one where there is no golden."""
+    from vlatool.runtime.policy import load_golden
+
+    golden = load_golden(policy.bundle)
+    if golden is not None:
+        return golden[0], golden[1]
+    from vlatool.data import observations_for
+
+    return observations_for(policy.bundle, 1)[0], None
+
+
+def _infer_on(policy: Any, path: Path) -> None:
+    """Infer on the observations of a file; one that no action can be had for has had its memory all the same."""
+    from vlatool.data import read_drawn
+    from vlatool.errors import GraphError
+
+    for drawn in read_drawn(path):
+        try:
+            policy.infer(drawn.observation)
+        except GraphError:
+            policy.reset()
+
+
+def _import_engine(name: str) -> None:
+    """Import the library of an engine by asking for its version; what it needs is told when the graphs are opened."""
+    from vlatool import registry
+
+    engine: Any = registry.load("engines", name)
+    engine.version()
+
+
+if __name__ == "__main__":
+    die_with_parent()
+    answer(lambda: main(sys.argv[1:]))

@@ -1,0 +1,155 @@
+"""Run a module of vlatool under limits: ``python -m vlatool.measurement.limited LIMITS MODULE ARGUMENTS...``.
+
+The limits are set before anything is imported that could take memory or start threads.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import runpy
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from vlatool.errors import UsageError
+from vlatool.machine.processes import die_with_parent, python_command
+from vlatool.measurement.job import Limits
+
+GROUPS = (
+    (Path("/sys/fs/cgroup"), "memory.max", ("memory.swap.max", "0")),
+    (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", ("memory.memsw.limit_in_bytes", "")),
+)
+"""Where groups are made in v2 and v1: directory, file of the limit, file against swapping and what it gets (the limit
+itself when empty)."""
+
+
+def command(limits: Limits, module: str, arguments: Sequence[str] = ()) -> list[str]:
+    """Return the command of a module, under the limits where there are any."""
+    if not limits:
+        return python_command(module, arguments)
+    return python_command("vlatool.measurement.limited", (json.dumps(asdict(limits)), module, *arguments))
+
+
+@contextlib.contextmanager
+def grouped(limits: Limits) -> Iterator[Limits]:
+    """Yield the limits with a control group for the memory where this user may make one, and remove it in the end.
+
+    Memory that a control group limits is what the kernel counts as resident, as on the board. Elsewhere each process
+    limits its private writable memory (``RLIMIT_DATA``), which counts what is reserved and not touched, too.
+    """
+    _sweep()
+    made = _made(limits) if limits.memory_mb else None
+    try:
+        yield limits if made is None else replace(limits, cgroup=str(made))
+    finally:
+        if made is not None:
+            _remove(made)
+
+
+def _sweep() -> None:
+    """Remove the groups of runs that were killed."""
+    for base, *_ in GROUPS:
+        for left in base.glob("vlatool-*-*"):
+            number = left.name.split("-")[1]
+            if number.isdigit() and not Path("/proc", number).exists():
+                _remove(left, 0.0)
+
+
+def _remove(group: Path, patience_s: float = 1.0) -> None:
+    """Remove a group once its last process has been reaped."""
+    end = time.monotonic() + patience_s
+    while True:
+        try:
+            group.rmdir()
+        except FileNotFoundError:
+            return
+        except OSError:
+            if time.monotonic() >= end:
+                return
+            time.sleep(0.02)
+        else:
+            return
+
+
+def ran_out(limits: Limits) -> bool:
+    """Say whether a control group has ended a process for its memory."""
+    if not limits.cgroup:
+        return False
+    for name in ("memory.events", "memory.oom_control"):
+        with contextlib.suppress(OSError):
+            text = (Path(limits.cgroup) / name).read_text(encoding="ascii")
+            counted = dict(line.split() for line in text.splitlines() if len(line.split()) == 2)
+            if "oom_kill" in counted:
+                return int(counted["oom_kill"]) > 0
+    return False
+
+
+def _made(limits: Limits) -> Path | None:
+    size = str(int(limits.memory_mb * 1e6))
+    for base, name, (swap, value) in GROUPS:
+        found = None
+        try:
+            found = Path(tempfile.mkdtemp(prefix=f"vlatool-{os.getpid()}-", dir=base))
+            if not (found / name).exists():  # no group, but a plain directory: nothing is mounted there
+                raise FileNotFoundError(found / name)
+            (found / name).write_text(size, encoding="ascii")
+        except OSError:
+            if found is not None:
+                with contextlib.suppress(OSError):
+                    found.rmdir()
+            continue
+        with contextlib.suppress(OSError):  # a kernel without swap accounting has no such file
+            (found / swap).write_text(value or size, encoding="ascii")
+        return found
+    return None
+
+
+def chosen(limits: Limits) -> Limits:
+    """Return the limits with the processors named: those that are wanted, the first ones of them where fewer.
+
+    Raises:
+        UsageError: when one that is wanted is not there.
+    """
+    usable = sorted(os.sched_getaffinity(0))
+    if missing := [cpu for cpu in limits.cpus if cpu not in usable]:
+        told = ", ".join(map(str, usable))
+        raise UsageError(f"--pin names processor {missing[0]}; this process may use {told}.")
+    if not (limits.cpus or limits.cores):
+        return limits
+    wanted = limits.cpus or tuple(usable)
+    return replace(limits, cpus=wanted[: limits.cores or len(wanted)])
+
+
+def limit_this_process(limits: Limits) -> None:
+    """Take the limits upon this process and all that it starts.
+
+    Raises:
+        OSError: when a processor is not there.
+    """
+    if limits.cpus:
+        os.sched_setaffinity(0, limits.cpus)
+    if limits.cgroup:
+        (Path(limits.cgroup) / "cgroup.procs").write_text(str(os.getpid()), encoding="ascii")
+    elif limits.memory_mb:
+        size = int(limits.memory_mb * 1e6)
+        resource.setrlimit(resource.RLIMIT_DATA, (size, size))
+
+
+def main() -> None:
+    """Set the limits and become the module."""
+    die_with_parent()
+    read = json.loads(sys.argv[1])
+    limit_this_process(Limits(**{**read, "cpus": tuple(read["cpus"])}))
+    module = sys.argv[2]
+    sys.argv = [module, *sys.argv[3:]]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

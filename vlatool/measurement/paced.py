@@ -1,0 +1,162 @@
+"""A control loop at a fixed rate: what each of its ticks gets, measured from the moment at which the tick was due.
+
+The loop wants one action at every tick, from an observation of that tick, before the next one. It sleeps until a tick
+is due, infers, and goes on to the newest tick that is due then: those in between were passed over while the policy
+computed. Such a tick has waited for the next action all the same, so it counts with the time until that action
+(otherwise one stall of 50 ms at 100 Hz would count once instead of five times: coordinated omission).
+"""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from vlatool.measurement.answers import Answers
+from vlatool.measurement.interleaved import percentile_measurements
+from vlatool.report import Measurement
+from vlatool.runtime.policy import Policy
+from vlatool.stats.intervals import wilson
+
+TELL_S = 1.0
+"""Seconds between two reports of progress."""
+SLACK_S = 4e-3
+"""Time until the next tick in which ``between`` may be called."""
+OVERLOADED = 0.01
+"""Share of ticks that are passed over from which a loop is too fast for the policy: ticks that share an inference are
+no independent samples, and no bound is given for them."""
+
+
+def _doubles() -> array[float]:
+    return array("d")
+
+
+@dataclass
+class Ticks:
+    """What a loop saw, one entry for each tick.
+
+    Args:
+        period_ms: Between two ticks.
+        response_ms: From the moment at which a tick was due to the action that served it.
+        due_s: When it was due, ``time.monotonic``.
+        wakeup_ms: How late the loop woke up for a tick that it slept until.
+        served: For each inference, the ticks that it served.
+        age_ms: How old the observation behind the newest action was when the tick was due; from the second action on.
+        passed_over: Ticks that began and ended while the policy computed.
+    """
+
+    period_ms: float
+    response_ms: array[float] = field(default_factory=_doubles)
+    due_s: array[float] = field(default_factory=_doubles)
+    wakeup_ms: array[float] = field(default_factory=_doubles)
+    age_ms: array[float] = field(default_factory=_doubles)
+    served: array[int] = field(default_factory=lambda: array("q"))
+    passed_over: int = 0
+
+    @property
+    def misses(self) -> int:
+        """Ticks whose action came after the next tick was due."""
+        return sum(value > self.period_ms for value in self.response_ms)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON values."""
+        return {
+            "period_ms": self.period_ms,
+            "wakeup_ms": list(self.wakeup_ms),
+            "age_ms": list(self.age_ms),
+            "misses": self.misses,
+            "passed_over": self.passed_over,
+            "inferences": len(self.served),
+            "worth": sum(self.served) ** 2 / max(1, sum(count * count for count in self.served)),
+        }
+
+
+def run_paced(
+    policy: Policy,
+    observations: Sequence[Mapping[str, Any]],
+    rate: float,
+    ticks: int,
+    answers: Answers | None = None,
+    tell: Callable[[str, float | None], None] = lambda what, share: None,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+    between: Callable[[float], None] = lambda share: None,
+) -> Ticks:
+    """Serve ticks of a control loop.
+
+    Args:
+        policy: Answers.
+        observations: In turns.
+        rate: Ticks in a second.
+        ticks: How many.
+        answers: What the policy is expected to answer.
+        tell: What is being done, and the share that is done.
+        clock, sleep: In seconds; other ones in tests.
+        between: Called with the share of ticks that are done, where there is time until the next.
+    """
+    period = 1.0 / rate
+    found = Ticks(period * 1e3)
+    begun = clock() + period
+    tick, served, told = 0, 0, -TELL_S
+    actions: list[tuple[float, float]] = []  # the last two: when the observation was taken, when the action was there
+    while tick < ticks:
+        place = served % len(observations)
+        if not place:
+            policy.reset()
+        if (now := clock()) - told >= TELL_S:
+            tell(f"serving ticks at {rate:g} Hz", tick / ticks)
+            told = now
+        due = begun + tick * period
+        if (left := due - clock()) > 0:
+            sleep(left)
+            found.wakeup_ms.append((clock() - due) * 1e3)
+        now = clock()
+        newest = min(ticks - 1, max(tick, int((now - begun) / period)))
+        action = policy.infer(observations[place])
+        done = clock()
+        found.passed_over += newest - tick
+        found.served.append(newest + 1 - tick)
+        for each in range(tick, newest + 1):
+            when = begun + each * period
+            found.due_s.append(when)
+            found.response_ms.append((done - when) * 1e3)
+            if there := [taken for taken, ready in actions if ready <= when]:
+                found.age_ms.append((when - there[-1]) * 1e3)
+        actions = [*actions[-1:], (now, done)]
+        served, tick = served + 1, newest + 1
+        if answers is not None:
+            answers.look(place, action.outputs)
+        if begun + tick * period - clock() > SLACK_S:
+            between(tick / ticks)
+    return found
+
+
+def paced_measurements(found: Mapping[str, Any], ticks: int, rate: float) -> list[Measurement]:
+    """Return misses, ages and lateness of a loop from ``Ticks.to_dict``."""
+    misses, period = int(found["misses"]), float(found["period_ms"])
+    worth = 0 if overloaded(found, ticks) else int(found["worth"])
+    low, high = wilson(min(worth, round(misses * worth / ticks)), worth) if worth else (None, None)
+    note = f"ticks at {rate:g} Hz whose action came after the next tick, {period:g} ms later; "
+    note += f"{found['inferences']:,} inferences, {found['passed_over']:,} ticks passed over while the policy computed"
+    measured = [Measurement("deadline_misses", misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
+    ages, late = found["age_ms"], found["wakeup_ms"]
+    if ages:
+        about = "age of the observation behind the newest action when a tick is due"
+        measured += _percentiles("age", ages, worth, ticks / rate, about)
+        measured.append(Measurement("age_max", max(ages), "ms", samples=len(ages), note=about))
+    if late:
+        about = "how late the loop wakes up for a tick that it slept until"
+        measured += _percentiles("wakeup", late, worth, ticks / rate, about)
+    return measured
+
+
+def _percentiles(what: str, samples: Sequence[float], worth: float, seconds: float, about: str) -> list[Measurement]:
+    found = percentile_measurements(what, samples, (50.0, 99.0), True, worth, seconds)
+    return [replace(each, note=each.note or about) for each in found]
+
+
+def overloaded(found: Mapping[str, Any], ticks: int) -> bool:
+    """Say whether so many ticks share an inference that nothing can be bounded."""
+    return bool(found["passed_over"] > OVERLOADED * ticks)

@@ -1,0 +1,116 @@
+"""Two bundles timed call by call in one fresh process: the unit of which a gate takes several.
+
+``python -m vlatool.measurement.turns`` reads one line of JSON (the fields of ``Job``) and prints one (those of
+``Pairs``). Both bundles are in one process and take turns in random order, so that a slow phase of the machine hits
+both; the process is fresh, because how memory happens to lie makes one process faster than the next.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean, median
+from typing import Any
+
+from vlatool.measurement.child import ask
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process measures.
+
+    Args:
+        baseline, candidate: Directories of bundles.
+        engine: Of the runtime; that which each bundle was made for when empty.
+        threads: Intra-op threads.
+        warmup: Calls of each before the first that counts.
+        pairs: Calls of each that count.
+        seconds: After which no further pair begins, once ``FEWEST`` are measured.
+        seed: Of the order in which the bundles are loaded and called, and of noise and changes to observations.
+        observations: File of observations (``save_drawn``); drawn by the seed from the baseline alone when empty.
+    """
+
+    baseline: str
+    candidate: str
+    engine: str = ""
+    threads: int = 1
+    warmup: int = 20
+    pairs: int = 150
+    seconds: float = 10.0
+    seed: int = 0
+    observations: str = ""
+
+
+MOST = 2.0
+"""The largest factor that one observation counts for in the mean."""
+FEWEST = 30
+"""Pairs that are measured however long they take: a median of fewer says little."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """What a process found.
+
+    Args:
+        baseline_ms, candidate_ms: Milliseconds of each call, in the order of the pairs.
+        places: What each pair was called with: an observation given exactly, or the same one varied, are two places
+            (``_turns.place_of``); each pair has one of its own when empty.
+        slow: Logarithms of candidate over baseline, of further pairs at the place that seemed the slowest for the
+            candidate; empty when none seemed slow.
+        slow_input: The observation of that place, in words.
+        looked: Timed answers of the candidate that were held against those of a fresh session.
+        strays: How many of those differ.
+        unsteady: How many of the baseline's differ likewise, looked at when the candidate's do.
+    """
+
+    baseline_ms: tuple[float, ...]
+    candidate_ms: tuple[float, ...]
+    places: tuple[int, ...] = ()
+    slow: tuple[float, ...] = ()
+    slow_input: str = ""
+    looked: int = 0
+    strays: int = 0
+    unsteady: int = 0
+
+    @property
+    def log_ratio(self) -> float:
+        """Natural logarithm of the candidate's median over the baseline's: above 0 is slower."""
+        return math.log(median(self.candidate_ms) / median(self.baseline_ms))
+
+    @property
+    def mean_log_ratio(self) -> float:
+        """The mean over places of the same, each from the medians of its calls: what some slow ones change.
+
+        One place counts for a factor of ``MOST`` at most: a call that the machine interrupted would outweigh all
+        others, and what is slower than that at few places is found by ``slow``.
+        """
+        mine, theirs = (self.medians(taken) for taken in (self.candidate_ms, self.baseline_ms))
+        most = math.log(MOST)
+        return fmean(min(most, max(-most, math.log(mine[place] / theirs[place]))) for place in mine)
+
+    def medians(self, taken: Sequence[float]) -> dict[int, float]:
+        """Return place -> median of its calls, of one of the two series."""
+        return medians(taken, self.places or range(len(taken)))
+
+
+def medians(taken: Sequence[float], places: Sequence[int]) -> dict[int, float]:
+    """Return place -> median of its calls."""
+    calls: dict[int, list[float]] = {}
+    for value, place in zip(taken, places, strict=True):
+        calls.setdefault(place, []).append(value)
+    return {place: median(values) for place, values in calls.items()}
+
+
+def measure_pairs(job: Job, timeout: float | None = None) -> Pairs:
+    """Measure in a fresh process.
+
+    Raises:
+        VlatoolError: what a bundle raises; GraphError when the process ends or takes longer than ``timeout`` seconds.
+    """
+    about = f"{job.candidate} beside {job.baseline}"
+    found = ask("vlatool.measurement.turns", (), json.dumps(dataclasses.asdict(job)), about, timeout)
+    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
+    return Pairs(**values)

@@ -1,0 +1,288 @@
+"""The calls of a process that times two bundles: which observation is next, and what both answer.
+
+Half of the observations of a block, another half each time, are given to the bit as they were recorded or drawn: a
+robot's inputs are exact where a gripper is open or a pixel is black, and a graph can tell. The others are varied anew
+in every call, so that most calls have bits that were never seen: an answer that is remembered is of little use. The
+same observation, with the same bits and the same noise, goes to both bundles. Each observation of a block is called
+three times but never twice in a row, so that however early a slow policy is cut off, its latency is a median, of exact
+calls or of varied ones. Afterwards fresh sessions answer some of the timed calls again.
+
+A place is what a call was made with: an observation, exact or varied (``place_of``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import math
+import random
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import DRAWN, RECORDED, Drawer, Drawn, read_drawn
+from vlatool.errors import GraphError, VlatoolError
+from vlatool.machine.processes import die_with_parent
+from vlatool.measurement.answers import Answers, varied
+from vlatool.measurement.child import answer
+from vlatool.measurement.pairs import FEWEST, Job, Pairs, medians
+from vlatool.runtime import Policy, load
+from vlatool.runtime.program import draw
+
+WARMUP_MS = 200.0
+"""How long each bundle runs before its first call that counts, at least ``Job.warmup`` calls."""
+BLOCK, REPEATS = 10, 3
+"""Observations of a block, and calls of each."""
+SUSPECT = 1.25
+"""Candidate over baseline from which an observation is called further times."""
+CONFIRM = 20
+"""Those further pairs."""
+REPLAYED = 24
+"""Timed answers that a fresh session gives again."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """An observation with the noise of its inference, and what the baseline and the candidate answered."""
+
+    observation: Mapping[str, Any]
+    noise: Mapping[str, Any] | None
+    outputs: tuple[Mapping[str, Any], Mapping[str, Any]]
+
+
+class Turns:
+    """Both policies, open, and the observations of a process.
+
+    Raises:
+        VlatoolError: when one cannot be loaded.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.order = random.Random(job.seed)
+        self.noise = np.random.default_rng([job.seed, 1])
+        baseline = Bundle.open(job.baseline)
+        self.pool = pool_of(job, baseline)
+        self.spec = baseline.manifest.spec
+        self.steps = baseline.manifest.program
+        self.policies: list[Any] = [None, None]
+        for which in self.order.sample((0, 1), 2):
+            self.policies[which] = self._load(which)
+            self._warm_up(self.policies[which])
+        self.taken: tuple[list[float], list[float]] = ([], [])
+        self.places: list[int] = []
+        self.unusable: set[int] = set()
+        self.kept: list[Call] = []
+
+    def measure(self) -> Pairs:
+        """Time all pairs, look again at what seemed slow, and replay."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self._time()
+        gc.enable()
+        if not self.places:
+            raise GraphError(f"{self.job.baseline} answers none of the observations that were drawn for it.")
+        slow, told = self._confirm()
+        self.policies = [None, None]
+        looked, strays = self._replay(1)
+        unsteady = self._replay(0)[1] if strays else 0
+        baseline, candidate = map(tuple, self.taken)
+        return Pairs(baseline, candidate, tuple(self.places), slow, told, looked, strays, unsteady)
+
+    def _load(self, which: int) -> Policy:
+        path = (self.job.baseline, self.job.candidate)[which]
+        return loaded(path, self.job)
+
+    def _warm_up(self, policy: Policy) -> None:
+        begun, number = time.monotonic(), 0
+        while number < self.job.warmup or (time.monotonic() - begun) * 1e3 < WARMUP_MS:
+            drawn = self.pool[number % len(self.pool)]
+            try:
+                policy.infer(drawn.observation)
+            except GraphError:  # told where it is timed, if the other one answers
+                policy.reset()
+            number += 1
+
+    def _time(self) -> None:
+        begun, number, called = time.monotonic(), 0, 0
+        while called < self.job.pairs:
+            if called >= FEWEST and time.monotonic() - begun > self.job.seconds:
+                break
+            block = [(number * BLOCK + place) % len(self.pool) for place in range(min(BLOCK, len(self.pool)))]
+            block = halved(block, self.order)
+            called += self._time_block(sequence(block, self.order)[: self.job.pairs - called])
+            number += 1
+
+    def _time_block(self, places: Sequence[int]) -> int:
+        """Time a block and keep its calls for the replay, or some of them; return how many there were."""
+        for policy in self.policies:
+            policy.reset()
+        calls = [call for place in places if (call := self._pair(place)) is not None]
+        if self._keeps_values():  # what they answer depends on all that came before: one block, from its start
+            whole = len(calls) == len(places)
+            self.kept = calls if whole and (not self.kept or self.order.random() < 0.5) else self.kept
+        else:
+            self.kept += self.order.sample(calls, min(len(calls), REPEATS + 2))
+        return len(places)
+
+    def _keeps_values(self) -> bool:
+        return any(step.keep for step in self.steps)
+
+    def _pair(self, place: int) -> Call | None:
+        """Time both with an observation, exact or varied; None when the baseline cannot answer it."""
+        if place in self.unusable:
+            return None
+        observation, noise = self._variant(place)
+        took = [0.0, 0.0]
+        outputs: list[dict[str, Any]] = [{}, {}]
+        failed: dict[int, GraphError] = {}
+        for which in self.order.sample((0, 1), 2):
+            infer = self.policies[which].infer
+            start = time.perf_counter_ns()
+            try:
+                action = infer(observation, noise=noise)
+            except GraphError as error:
+                failed[which] = error
+                continue
+            took[which] = (time.perf_counter_ns() - start) / 1e6
+            outputs[which] = {name: np.array(value) for name, value in action.outputs.items()}
+        if failed:
+            self._skip(place, failed)
+            return None
+        self.places.append(place)
+        for which in (0, 1):
+            self.taken[which].append(took[which])
+        return Call(observation, noise, (outputs[0], outputs[1]))
+
+    def _skip(self, place: int, failed: Mapping[int, GraphError]) -> None:
+        """Leave out what the baseline cannot answer.
+
+        Raises:
+            GraphError: when it is the candidate alone that cannot.
+        """
+        if 0 not in failed:
+            what = f"{self.job.candidate} fails where the baseline answers ({self._told(place)})"
+            raise GraphError(f"{what}: {failed[1].message}")
+        self.unusable.add(place)
+        for policy in self.policies:
+            policy.reset()
+
+    def _variant(self, place: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
+        number, exact = observation_of(place)
+        drawn = self.pool[number].observation
+        observation = dict(drawn) if exact else varied(drawn, self.spec, self.noise)
+        noise = {name: draw(wanted, self.noise) for step in self.steps for name, wanted in step.noise.items()}
+        return observation, noise or None
+
+    def _told(self, place: int) -> str:
+        number, exact = observation_of(place)
+        return described(self.pool[number], exact)
+
+    def _confirm(self) -> tuple[tuple[float, ...], str]:
+        """Time further pairs of the place (an observation, exact or varied) where the candidate seemed the slowest."""
+        mine, theirs = (medians(self.taken[which], self.places) for which in (1, 0))
+        place = max(mine, key=lambda each: mine[each] / theirs[each])
+        if mine[place] / theirs[place] < SUSPECT:
+            return (), ""
+        before = len(self.places)
+        logs: list[float] = []
+        for _ in range(CONFIRM):
+            self._pair(self.order.choice(self.places[:before]))  # another one between them
+            if self._pair(place) is not None:
+                logs.append(math.log(self.taken[1][-1] / self.taken[0][-1]))
+        del self.places[before:], self.taken[0][before:], self.taken[1][before:]
+        return tuple(logs), f"{self._told(place)}: {math.exp(median(logs)):.2f}x" if logs else ""
+
+    def _replay(self, which: int) -> tuple[int, int]:
+        """Let a fresh session answer the kept calls; return how many, and how many it answers otherwise."""
+        policy = self._load(which)
+        keeps = self._keeps_values()
+        calls = self.kept if keeps else self.order.sample(self.kept, min(REPLAYED, len(self.kept)))
+        answers = Answers([call.outputs[which] for call in calls])
+        for place, call in enumerate(calls):
+            if place == 0 or not keeps:
+                policy.reset()
+            answers.look(place, policy.infer(call.observation, noise=call.noise).outputs)
+        return answers.looked, answers.strays
+
+
+def loaded(path: str, job: Job) -> Policy:
+    """Load a bundle as a robot does: every file is hashed, and the golden action is computed.
+
+    What a stage found to be wrong was looked at by the gate before.
+
+    Raises:
+        VlatoolError: what ``load`` raises, with the bundle's path.
+    """
+    try:
+        known = [each["name"] for each in Bundle.described(path).manifest.findings]
+        return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known)
+    except VlatoolError as error:
+        if path in error.message:
+            raise
+        raise type(error)(f"{path}: {error.message}", error.fix) from error
+
+
+def pool_of(job: Job, baseline: Bundle) -> list[Drawn]:
+    """Return the observations of a process: those of its file, else drawn from the baseline's spec alone."""
+    if job.observations:
+        return read_drawn(Path(job.observations))
+    return Drawer(baseline).draw(wanted(job.pairs), np.random.default_rng([job.seed, 2]))
+
+
+def wanted(pairs: int) -> int:
+    """Return how many observations so many pairs take."""
+    return max(BLOCK, math.ceil(pairs / REPEATS))
+
+
+def place_of(number: int, exact: bool) -> int:
+    """Return the place of an observation: ``exact`` when it is given to the bit as it was drawn, else varied."""
+    return 2 * number + exact
+
+
+def observation_of(place: int) -> tuple[int, bool]:
+    """Return the number of a place's observation, and whether it is given exactly."""
+    return place // 2, bool(place % 2)
+
+
+def halved(numbers: Sequence[int], order: random.Random) -> list[int]:
+    """Return the places of observations, a random half of them exact; which half is the larger is drawn as well."""
+    exact = set(order.sample(numbers, (len(numbers) + order.randrange(2)) // 2))
+    return [place_of(number, number in exact) for number in numbers]
+
+
+def sequence(places: Sequence[int], order: random.Random) -> list[int]:
+    """Return each place ``REPEATS`` times in random order, never twice in a row unless there is one alone."""
+    found: list[int] = []
+    for _ in range(REPEATS):
+        part = order.sample(places, len(places))
+        if found and part[0] == found[-1]:
+            part.reverse()
+        found += part
+    return found
+
+
+def described(drawn: Drawn, exact: bool = True) -> str:
+    """Return an observation in a few words; one that is not ``exact`` is varied."""
+    texts = [f"{name} {value!r}" for name, value in drawn.observation.items() if isinstance(value, str)]
+    kind = {RECORDED: "as recorded", DRAWN: "drawn"}.get(drawn.kind, "recorded otherwise")
+    return ", ".join([kind, *([] if exact else ["slightly varied"]), *texts])
+
+
+def run_job(job: Job) -> Pairs:
+    """Measure in this process."""
+    return Turns(job).measure()
+
+
+if __name__ == "__main__":
+    die_with_parent()
+    answer(lambda: dataclasses.asdict(run_job(Job(**json.loads(sys.stdin.readline())))))

@@ -1,0 +1,204 @@
+"""``policy.yaml``: the description of a policy that a person writes beside its code and weights."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from vlatool.bundle.bundle import LOCATION
+from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import MissingExtra, SourceError, SpecError, nearest
+from vlatool.files.kept import carry
+from vlatool.files.yaml import read_mapping
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.statistics import load_normaliser
+
+FILE = "policy.yaml"
+KEYS = (
+    "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
+    "parts", "calibration", "evaluation", "weights", "files",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Description:
+    """What ``policy.yaml`` says.
+
+    Args:
+        folder: Where relative paths start.
+        factory: ``path.py:make`` or ``package.module:make``; empty for a policy that is an ONNX file.
+        arguments: Keyword arguments of the factory.
+        program: How the graphs are run.
+        environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation.
+        parts: Part name -> globs of module names.
+        calibration, evaluation: Recorded observations, or None.
+        weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
+            module alone. Empty when the factory loads the weights.
+        files: Globs of the files that the factory reads; None: every file of weights beside it.
+    """
+
+    folder: Path
+    name: str
+    version: str
+    spec: PolicySpec
+    factory: str = ""
+    arguments: dict[str, Any] = field(default_factory=dict)
+    program: tuple[ProgramStep, ...] = ()
+    environment: dict[str, Any] = field(default_factory=dict)
+    parts: dict[str, list[str]] = field(default_factory=dict)
+    calibration: Path | None = None
+    evaluation: Path | None = None
+    description: str = ""
+    license: str = ""
+    weights: str = ""
+    files: tuple[str, ...] | None = None
+
+    def assets(self) -> set[str]:
+        """Files, relative to the folder, that the spec needs on the robot."""
+        inputs = [*self.spec.inputs, *self.spec.outputs]
+        statistics = {tensor.statistics.partition("#")[0] for tensor in inputs if tensor.statistics}
+        return statistics | {tensor.tokenizer for tensor in inputs if tensor.tokenizer}
+
+
+def read_description(path: Path) -> Description:
+    """Read ``policy.yaml``, or the one in a directory.
+
+    Raises:
+        SourceError: when it is missing, is not YAML, or lacks something.
+        SpecError: when the spec or the program is impossible.
+    """
+    file = path / FILE if path.is_dir() else path
+    data = _mapping(file)
+    for key in data:
+        if key not in KEYS:
+            raise SourceError(f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.")
+    if data.get("schema", 1) != 1:
+        raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
+    for key in ("arguments", "environment", "parts"):
+        if not isinstance(data.get(key) or {}, Mapping):
+            raise SourceError(f"{file}: '{key}' must be a mapping; got {data[key]!r}.")
+    for key in ("name", "spec"):
+        if key not in data:
+            raise SourceError(f"{file} has no '{key}'.", "see docs/guides/your-own-policy.md for a complete example")
+    spec = PolicySpec.from_dict(data["spec"])
+    program = program_from(data["program"]) if "program" in data else single_graph(spec)
+    check_program(program, {step.graph for step in program}, spec)
+    return Description(
+        folder=file.parent,
+        name=str(data["name"]),
+        version=str(data.get("version", "0.0.0")),
+        spec=spec,
+        factory=str(data.get("source", "")),
+        arguments=dict(data.get("arguments") or {}),
+        program=program,
+        environment=dict(data.get("environment") or {}),
+        parts=dict(data.get("parts") or {}),
+        calibration=_data_file(file, data, "calibration"),
+        evaluation=_data_file(file, data, "evaluation"),
+        description=str(data.get("description", "")),
+        license=str(data.get("license", "")),
+        weights=_weights(file, data.get("weights", "")),
+        files=_files(file, data.get("files")),
+    )
+
+
+def _files(file: Path, patterns: Any) -> tuple[str, ...] | None:
+    """Globs inside the policy's folder."""
+    if patterns is None:
+        return None
+    each = [patterns] if isinstance(patterns, str) else patterns
+    inside = isinstance(each, list) and all(
+        isinstance(one, str) and one and not one.startswith("/") and ".." not in one.split("/") for one in each
+    )
+    if not inside:
+        raise SourceError(f"{file}: 'files' must be globs inside the folder, as [weights.pt]; got {patterns!r}.")
+    return tuple(each)
+
+
+def _weights(file: Path, pattern: Any) -> str:
+    """A glob inside the policy's folder."""
+    if not isinstance(pattern, str) or pattern.startswith("/") or ".." in pattern.split("/"):
+        raise SourceError(f"{file}: 'weights' must be a glob inside the folder, as \"*.safetensors\"; got {pattern!r}.")
+    return pattern
+
+
+def write_location(out: Path, folder: Path) -> None:
+    """Note where the policy's code is; the note is no part of the bundle's identity."""
+    (out / LOCATION).write_text(json.dumps({"folder": str(folder.resolve())}) + "\n", encoding="utf-8")
+
+
+def read_location(bundle: Path) -> Path:
+    """Return the folder of the policy's code.
+
+    Raises:
+        SourceError: when the bundle has no note, or the folder is gone.
+    """
+    try:
+        folder = Path(json.loads((bundle / LOCATION).read_text(encoding="utf-8"))["folder"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise SourceError(
+            f"{bundle} does not say where the policy's code is.", "start again from the source"
+        ) from error
+    if not folder.is_absolute() or ".." in folder.parts or "\0" in str(folder):
+        raise SourceError(f"{bundle} notes {str(folder)!r} as the place of the code.", "start again from the source")
+    if not folder.is_dir():
+        raise SourceError(f"The policy's code was in {folder}, which is gone.", "start again from the source")
+    return folder
+
+
+def _mapping(file: Path) -> Mapping[str, Any]:
+    if not file.exists():
+        raise SourceError(f"There is no {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
+    return read_mapping(file, str(file), SourceError)
+
+
+def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
+    """The named file must exist; the default name may be absent."""
+    named = data.get(key)
+    path = file.parent / str(named or f"{key}.npz")
+    if named and not path.is_file():
+        raise SourceError(f"{file} names the {key} data {named}, which does not exist.")
+    return path if path.is_file() else None
+
+
+def copy_assets(described: Description, out: Path) -> None:
+    """Copy tokenizers and statistics to ``assets/``, recorded data to ``data/``.
+
+    Raises:
+        SourceError: when a file that the spec names is missing.
+        SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
+    """
+    for name in sorted(described.assets()):
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            raise SourceError(f"The spec names {name}, which is not inside {described.folder}.")
+        if not (described.folder / name).is_file():
+            raise SourceError(f"The spec names {name}, which is not in {described.folder}.")
+        target = out / "assets" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(described.folder / name, target)
+    check_assets(described, out / "assets")
+    for key, path in (("calibration", described.calibration), ("evaluation", described.evaluation)):
+        if path is not None:
+            (out / "data").mkdir(exist_ok=True)
+            carry(path, out / "data" / f"{key}.npz")
+
+
+def check_assets(described: Description, copies: Path) -> None:
+    """Read the copies of tokenizers and statistics as a robot would; what a robot would need for it may be absent.
+
+    Raises:
+        SpecError: when one does not fit the spec; names the file that was copied.
+    """
+    try:
+        with contextlib.suppress(MissingExtra):
+            ObservationEncoder(described.spec, copies)
+        for tensor in described.spec.outputs:
+            load_normaliser(tensor, copies)
+    except SpecError as error:
+        raise SpecError(error.message.replace(str(copies), str(described.folder)), error.fix) from error

@@ -1,0 +1,199 @@
+"""Import what ``path.py:make`` or ``package.module:make`` names."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, nearest
+from vlatool.files.printable import message_of
+from vlatool.module.fresh import compile_afresh
+from vlatool.user_code.children import left
+
+OWN_NAME = "vlatool_source_"
+"""How the names begin that files of a policy are imported under."""
+
+
+def split_factory(factory: str) -> tuple[str, str]:
+    """Split ``WHERE:FUNCTION``.
+
+    Raises:
+        SourceError: when it is not of that form.
+    """
+    where, _, function = factory.rpartition(":")
+    if not where or not function.isidentifier():
+        raise _no_function(factory)
+    return where, function
+
+
+def _no_function(named: str) -> SourceError:
+    if named.endswith(".onnx"):
+        fix = "name the file itself as SOURCE, and leave source out of the policy.yaml beside it: vlatool export "
+        fix += named if "/" in named else f"DIRECTORY/{named}"
+        return SourceError(f"'{named}' is an ONNX file and no Python function.", fix)
+    if named.endswith(".py"):
+        return SourceError(f"'{named}' names a file and no function in it.", f"add the function: {named}:NAME")
+    return SourceError(f"'{named}' names no factory.", "write path/to/policy.py:make or package.module:make")
+
+
+def factory_file(factory: str, folder: Path) -> Path | None:
+    """Return the Python file of ``path.py:make`` (relative to ``folder``), None for ``package.module:make``."""
+    where, _ = split_factory(factory)
+    return (folder / where).resolve() if where.endswith(".py") else None
+
+
+def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
+    """Import the factory function.
+
+    Args:
+        factory: ``path.py:make`` (relative to ``folder``) or ``package.module:make``.
+
+    Raises:
+        SourceError: when the file or the function does not exist, or the import fails.
+        MissingExtra: when the import lacks a package.
+    """
+    where, function = split_factory(factory)
+    path = factory_file(factory, folder)
+    if path is not None and not path.is_file():
+        raise SourceError(f"There is no file {path} (from '{factory}').")
+    if path is None:
+        _check_package(factory)
+    compile_afresh(folder)
+    try:
+        with exits_told(f"importing '{where}'"):
+            module = _import_path(path) if path is not None else importlib.import_module(where)
+    except VlatoolError:
+        raise
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"Importing '{where}' needs the package '{error.name}', which is not installed.",
+            _install_hint(str(error.name)),
+        ) from error
+    except Exception as error:  # the seam: user code may raise anything while it is imported
+        raise SourceError(f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.") from error
+    found = getattr(module, function, None)
+    if not callable(found):
+        known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
+        raise SourceError(f"'{where}' has no function '{function}'; {nearest(function, known)}.")
+    if path is None:
+        _check_own(found, factory)
+    return found  # type: ignore[no-any-return]
+
+
+def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
+    """Import the factory and call it.
+
+    Raises:
+        SourceError: when the call raises.
+    """
+    make = import_factory(factory, folder)
+    try:
+        with _importable(factory_file(factory, folder)), exits_told(f"the factory '{factory}'"):
+            return make(**arguments)
+    except (VlatoolError, MemoryError):
+        raise
+    except ModuleNotFoundError as error:
+        raise MissingExtra(
+            f"'{factory}' needs the package '{error.name}', which is not installed.", _install_hint(str(error.name))
+        ) from error
+    except Exception as error:  # the seam: user code may raise anything
+        raise SourceError(f"The factory '{factory}' failed: {type(error).__name__}: {message_of(error)}.") from error
+
+
+@contextlib.contextmanager
+def exits_told(what: str) -> Iterator[None]:
+    """Turn what a user's code raises beside ``Exception`` (``sys.exit``, classes of its own) into an error.
+
+    Errors of vlatool that say what input was bad, or what package is absent, pass: its functions raise them where the
+    code calls any. A verdict of vlatool's, or its exit code, is not for the code to give.
+
+    Raises:
+        SourceError: saying what was raised; Ctrl-C stays Ctrl-C.
+    """
+    about = what[:1].upper() + what[1:]
+    try:
+        yield
+    except (InputError, MissingExtra, KeyboardInterrupt):
+        raise
+    except VlatoolError as error:
+        told = message_of(error).partition("\n")[0].rstrip(".")
+        raise SourceError(f"{about} raised {type(error).__name__}: {told}.") from error
+    except Exception:
+        raise
+    except BaseException as error:  # the seam: user code may raise anything
+        raise left(about, type(error).__name__, message_of(error)) from error
+
+
+def _check_package(factory: str) -> None:
+    """Refuse modules of Python itself: what they hold builds no policy, but may run commands."""
+    package = split_factory(factory)[0].partition(".")[0]
+    if package in sys.stdlib_module_names:
+        raise SourceError(
+            f"'{factory}' names a function of Python's standard library, which makes neither policy nor environment.",
+            "name a function in a file beside policy.yaml, or in a package that is made for it",
+        )
+
+
+def _check_own(found: Any, factory: str) -> None:
+    """Refuse a function that the named package only imports from elsewhere.
+
+    Raises:
+        SourceError: naming the module that defines it.
+    """
+    package = split_factory(factory)[0].partition(".")[0]
+    module = str(getattr(found, "__module__", None) or type(found).__module__)
+    if module.partition(".")[0] != package:
+        raise SourceError(
+            f"'{factory}' is defined in '{module}', not in the package '{package}'.",
+            "name a function that the package itself defines, or write one in a file beside policy.yaml",
+        )
+
+
+def _import_path(path: Path) -> ModuleType:
+    digest = hashlib.sha256(str(path).encode() + path.read_bytes()).hexdigest()[:16]
+    name = f"{OWN_NAME}{digest}_{path.stem}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise SourceError(f"{path} is not a Python file.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        with _importable(path):
+            exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
+    except BaseException:
+        sys.modules.pop(name, None)
+        raise
+    return module
+
+
+@contextlib.contextmanager
+def _importable(path: Path | None) -> Iterator[None]:
+    """Let the file import its neighbours."""
+    if path is None:
+        yield
+        return
+    for neighbour in path.parent.glob("*.py"):
+        loaded = getattr(sys.modules.get(neighbour.stem), "__file__", None)
+        if loaded and Path(loaded).name == neighbour.name and Path(loaded).parent != path.parent:
+            del sys.modules[neighbour.stem]  # another policy's file of the same name
+    sys.path.insert(0, str(path.parent))
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):
+            sys.path.remove(str(path.parent))
+
+
+def _install_hint(package: str) -> str:
+    extra = {"torch": "build", "minigrid": "sim", "gymnasium": "sim", "metaworld": "metaworld", "mujoco": "metaworld"}
+    known = extra.get(package.partition(".")[0])
+    return f"pip install 'vlatool[{known}]'" if known else f"pip install {package}"

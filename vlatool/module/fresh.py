@@ -1,0 +1,60 @@
+"""A policy's own code is compiled from its source: bytecode in ``__pycache__`` is in no hash, and may say anything."""
+
+from __future__ import annotations
+
+import os
+import site
+import sys
+import sysconfig
+from functools import lru_cache
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from types import CodeType
+
+from vlatool.user_code import trust
+
+VARIABLE = "PYTHONPYCACHEPREFIX"
+_folders: dict[str, bool] = {}
+"""Folder -> whether it was trusted before: then what it has links to is no more cached than what is in it."""
+_usual = SourceFileLoader.get_code
+
+
+def compile_afresh(folder: Path) -> None:
+    """Let this process read no ``__pycache__`` below a policy's folder, however its files are imported.
+
+    Where the folder was trusted before, all that lies outside of Python's own directories is compiled afresh, and
+    Python processes that the policy starts read no such directory at all.
+    """
+    remembered = not trust.is_named(folder)
+    _folders[str(folder.resolve())] = remembered
+    if remembered:
+        os.environ[VARIABLE] = os.devnull  # below it is nothing, and nothing can be put there
+    SourceFileLoader.get_code = _get_code  # type: ignore[method-assign, assignment]
+
+
+def _get_code(self: SourceFileLoader, fullname: str) -> CodeType | None:
+    path = self.get_filename(fullname)
+    if not _is_own(os.path.dirname(path)):
+        return _usual(self, fullname)
+    return self.source_to_code(self.get_data(path), path)
+
+
+def _is_own(place: str) -> bool:
+    """Say whether a directory holds a policy's code, and not what is installed."""
+    places = {os.path.abspath(place), os.path.realpath(place)}
+    inside = {remembered for folder, remembered in _folders.items() if any(_below(each, folder) for each in places)}
+    library = any(_below(os.path.realpath(place), each) for each in _libraries())
+    return True in inside or (not library and (bool(inside) or any(_folders.values())))
+
+
+def _below(place: str, folder: str) -> bool:
+    return place == folder or place.startswith(folder.rstrip(os.sep) + os.sep)
+
+
+@lru_cache(1)
+def _libraries() -> tuple[str, ...]:
+    """Python's own directories, those of installed packages, and this package."""
+    found = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    found += [*site.getsitepackages(), site.getusersitepackages(), str(Path(__file__).parents[1])]
+    found += [entry for entry in sys.path if Path(entry).name in ("site-packages", "dist-packages")]
+    return tuple({os.path.realpath(entry) for entry in found})

@@ -1,0 +1,132 @@
+"""A torch module as an ONNX model: torch's dynamo exporter, kept quiet, its faults in words, nodes named by modules."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import logging
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from torch import nn
+
+from vlatool.bundle.program import ProgramStep
+from vlatool.errors import SourceError, require
+from vlatool.graph.draws import refuse_draws
+from vlatool.graph.nodes import FOLDED
+from vlatool.module.factory import exits_told
+from vlatool.module.failures import export_error
+from vlatool.module.norms import divide_by_roots
+
+EXTERNAL_DATA_BYTES = 1_500_000_000
+"""Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
+
+
+def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, opset: int, **options: Any) -> Any:
+    """Export a module with torch's dynamo exporter; return its ``ONNXProgram``.
+
+    Args:
+        arguments: One tensor for each feed of the step, real or fake.
+        options: For ``torch.onnx.export``.
+
+    Raises:
+        GraphError: when torch cannot, or the graph would draw random numbers.
+    """
+    torch = require("torch", "build")
+    try:
+        with quiet_exporter(), torch.no_grad(), exits_told("the policy's forward()"):
+            exported = torch.onnx.export(
+                module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
+                output_names=list(step.gives), verbose=False, **options,
+            )  # fmt: skip
+    except SourceError:
+        raise
+    except Exception as error:  # the seam: the exporter raises many foreign types
+        raise_interrupt(error)
+        raise export_error(error, step.graph, module) from error
+    refuse_draws(exported.model, step.graph)
+    divide_by_roots(exported.model)
+    return exported
+
+
+def raise_interrupt(error: BaseException | None) -> None:
+    """Raise Ctrl-C again where a library has wrapped it into an error of its own."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        seen.add(id(error))
+        error = error.__cause__ or error.__context__
+
+
+def name_by_module(model: Any) -> None:
+    """Name every node after the torch module that it comes from, so that globs can choose layers.
+
+    ``blocks.0.mlp.fc1/MatMul``; a second node of that type in the module is ``blocks.0.mlp.fc1/MatMul_1``. What belongs
+    to no module keeps the exporter's name. A layer with a normalisation folded in comes from the module that holds its
+    weights; the normalisation's is noted beside it (``FOLDED``).
+    """
+    seen: Counter[str] = Counter()
+    for node in model.graph.all_nodes():
+        scopes = node.metadata_props.get("pkg.torch.onnx.name_scopes", "")
+        found = ast.literal_eval(scopes) if scopes.startswith("[") else []
+        if len(found) < 2 or not found[-2]:
+            continue
+        module = _folded_into(node) or found[-2]
+        if module != found[-2]:
+            node.metadata_props[FOLDED] = found[-2]
+        base = f"{module}/{node.op_type}"
+        node.name = base if not seen[base] else f"{base}_{seen[base]}"
+        seen[base] += 1
+
+
+def _folded_into(node: Any) -> str:
+    """Return the module whose weights a node has that an exporter folded a BatchNorm into; nothing for others."""
+    if "BatchNorm" not in node.metadata_props.get("pkg.onnxscript.rewriter.rule_name", ""):
+        return ""
+    weight = node.inputs[1].name if len(node.inputs) > 1 and node.inputs[1] is not None else ""
+    return weight.removesuffix(".weight") if weight.endswith(".weight") else ""
+
+
+def strip_notes(model: Any) -> None:
+    """Remove what an exporter notes beside the graph (stack traces with file paths): it would leak and differ."""
+    graphs = [model.graph, *(function.graph for function in model.functions.values())]
+    model.metadata_props.clear()
+    for graph in graphs:
+        graph.metadata_props.clear()
+        graph.doc_string = None
+        values = [*graph.inputs, *graph.outputs, *graph.initializers.values()]
+        for node in graph.all_nodes():
+            folded = node.metadata_props.get(FOLDED)
+            node.metadata_props.clear()
+            if folded:
+                node.metadata_props[FOLDED] = folded
+            node.doc_string = None
+            values.extend(node.outputs)
+        for value in values:
+            value.metadata_props.clear()
+            value.doc_string = None
+
+
+def weight_bytes(module: nn.Module) -> int:
+    """Return the bytes of all parameters and buffers."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in [*module.parameters(), *module.buffers()])
+
+
+@contextlib.contextmanager
+def quiet_exporter() -> Iterator[None]:
+    """Keep the exporter's progress prints, log lines and warnings away from the user's terminal."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    nowhere = io.StringIO()
+    try:
+        with (
+            contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere), warnings.catch_warnings()
+        ):  # fmt: skip
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)

@@ -1,0 +1,125 @@
+"""Run a policy's torch modules through the same program as its graphs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.program import ProgramStep
+from vlatool.errors import SourceError, nearest, require
+from vlatool.files.printable import message_of
+from vlatool.module.factory import exits_told
+from vlatool.module.failures import remedy_for
+from vlatool.module.modules import modules_of
+from vlatool.module.origin import origin_of
+from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import Program
+from vlatool.weights.shards import read_header, shard_files
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+def load_modules(source: Bundle) -> dict[str, nn.Module]:
+    """Build the modules of a source bundle, in evaluation mode: graph name -> module.
+
+    Raises:
+        SourceError: when the code has changed since the bundle was made, or gives something else than modules.
+    """
+    require("torch", "build")
+    origin = origin_of(source)
+    origin.check()
+    modules = modules_of(origin.made(), sorted({step.graph for step in source.manifest.program}))
+    if origin.weights:
+        for name, module in modules.items():
+            _load_weights(name, module, origin.folder, origin.weights)
+    return modules
+
+
+def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:
+    """Fill a module from shards whose tensors are named as in ``state_dict()``, or ``GRAPH.`` before that.
+
+    Raises:
+        SourceError: when a tensor is missing or has another shape.
+    """
+    safetensors = require("safetensors.torch", "build")
+    stored: dict[str, Any] = {}
+    for file in shard_files(folder, pattern):
+        read_header(file)
+        stored.update(safetensors.load_file(str(file)))
+    own = module.state_dict()
+    found = {}
+    for name, value in own.items():
+        tensor = stored.get(f"{graph}.{name}", stored.get(name))
+        if tensor is None:
+            raise SourceError(f"No shard of {folder / pattern} has '{name}' of '{graph}'; {nearest(name, stored)}.")
+        if tensor.shape != value.shape:
+            got, want = list(tensor.shape), list(value.shape)
+            raise SourceError(f"'{name}' has the shape {got} in the shards; the module's is {want}.")
+        found[name] = tensor.to(value.dtype)
+    module.load_state_dict(found)
+
+
+def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
+    """Open a source bundle in eager torch behind the interface of the runtime's policy.
+
+    Args:
+        source: Of a torch policy.
+        seed: Of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
+    """
+    modules = load_modules(source)
+    sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
+    return Policy(source, Program(source.manifest.program, sessions, seed), "torch eager")
+
+
+class TorchSession:
+    """One torch module behind the session interface; remembers the feeds of its first run.
+
+    Args:
+        module: The module; takes the feeds positionally in the order of ``step.feeds``.
+        step: The program step that runs it.
+    """
+
+    def __init__(self, module: nn.Module, step: ProgramStep) -> None:
+        self.module = module
+        self.step = step
+        self.first_feeds: dict[str, Any] | None = None
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run the module on numpy arrays.
+
+        Raises:
+            SourceError: when the module fails, or gives another number of outputs than the program says.
+        """
+        torch = require("torch", "build")
+        if self.first_feeds is None:
+            self.first_feeds = dict(feeds)
+        arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
+        try:
+            with torch.inference_mode(), exits_told("the policy's forward()"):
+                given = self.module(*arguments)
+        except SourceError:
+            raise
+        except Exception as error:  # the seam: the user's module may raise anything
+            shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
+            raise SourceError(
+                f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
+                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
+                remedy_for(error),
+            ) from error
+        outputs = list(given) if isinstance(given, tuple | list) else [given]
+        if len(outputs) != len(self.step.gives):
+            raise SourceError(
+                f"The module gives {len(outputs)} outputs; the program says {', '.join(self.step.gives)}."
+            )
+        for name, value in zip(self.step.gives, outputs, strict=True):
+            if not isinstance(value, torch.Tensor):
+                raise SourceError(
+                    f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.",
+                    "return a tensor, or a tuple of tensors in the order of 'gives'",
+                )
+        return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}

@@ -1,0 +1,1 @@
+"""The whole way from a policy to a chosen bundle."""

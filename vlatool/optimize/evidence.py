@@ -1,0 +1,85 @@
+"""The accuracy of every candidate: recorded observations, paired episodes, and what succeeds without looking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from vlatool.accuracy.paired import compare_success, with_chance
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import EVALUATION
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.evaluate.recorded import Recorded, carries_recordings
+from vlatool.report import Measurement, Row
+from vlatool.stage.base import Context
+from vlatool.stage.run import cached_measure
+
+
+def with_accuracy(
+    rows: Mapping[str, Row], bundles: Mapping[str, Bundle], loop: ClosedLoop | None, cache: Path, context: Context
+) -> dict[str, Row]:
+    """Return the rows with what recordings and episodes say of them.
+
+    Args:
+        rows: Name -> row, of each bundle.
+        bundles: Name -> bundle; the first is the float32 baseline, which the others are held against.
+        loop: The episodes; None for recordings alone.
+        cache: Where measurements are kept.
+        context: Progress and workers.
+
+    Raises:
+        DataError: when the recordings or the environment cannot be used.
+    """
+    (base, baseline), *_ = bundles.items()
+    success: dict[str, Row] = {}
+    found: dict[str, Row] = {}
+    for name, bundle in bundles.items():
+        row = rows[name]
+        found[name] = replace(row, measurements=(*row.measurements, *_recorded(bundle, baseline, loop, cache, context)))
+        if loop is None:
+            continue
+        success[name] = cached_measure(loop, bundle, cache, context).rows[-1]
+        if name == base:
+            played = _with_controls(loop, bundle, success[name], cache, context)
+        else:
+            played = compare_success(success[base], success[name])
+        found[name] = _joined(found[name], played)
+    return found
+
+
+def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:
+    """Say whether recordings judge a bundle: its own, or where nothing else would, half of its calibration data."""
+    return EVALUATION in bundle.manifest.files or (loop is None and carries_recordings(bundle))
+
+
+def _recorded(
+    bundle: Bundle, baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context
+) -> tuple[Measurement, ...]:
+    if not is_recorded(bundle, loop):
+        return ()
+    stage = Recorded(baseline=None if bundle is baseline else baseline.path)
+    return cached_measure(stage, bundle, cache, context).rows[-1].measurements
+
+
+def unjudged(baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> tuple[str, ...]:
+    """Return what the recordings leave unjudged of the baseline's actions, and so of any candidate's."""
+    if not is_recorded(baseline, loop):
+        return ()
+    return cached_measure(Recorded(), baseline, cache, context).warnings
+
+
+def _joined(row: Row, played: Row) -> Row:
+    measurements = (*row.measurements, *played.measurements)
+    raw, details = {**row.raw, **played.raw}, {**row.details, **played.details}
+    return replace(row, measurements=measurements, raw=raw, details=details)
+
+
+def _with_controls(loop: ClosedLoop, baseline: Bundle, row: Row, cache: Path, context: Context) -> Row:
+    """Play what does not look, and add how often that succeeds to the row of float32."""
+    rows = []
+    for control in loop.controls():
+        context.tell(f"episodes of the control: {control.control} actions", None)
+        played = cached_measure(control, baseline, cache, context).rows[-1]
+        rows.append(replace(played, name=control.control))
+    return with_chance(row, rows)

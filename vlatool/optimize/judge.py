@@ -1,0 +1,312 @@
+"""Which candidate keeps to the limits, and by how much each other misses them: in words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from vlatool.errors import RecipeError, nearest
+from vlatool.optimize.recipe import Limits
+from vlatool.report import Measurement, Row
+
+if TYPE_CHECKING:
+    from vlatool.bundle.spec import PolicySpec
+    from vlatool.hardware.profile import Profile
+
+TOLERANCE = 1e-12
+AGAINST_FLOAT32 = "against float32"
+PROXY = 0.05
+"""Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
+FROM_FLOAT32 = ("relative_error", "disagreement", "error_baseline", "gripper_flips_baseline")
+"""Beginnings of the measurements that are distances from float32 themselves."""
+DROPS = ("success_drop", "agreement_drop", "error_increase")
+"""Which accuracy decides: the closed loop where there is one, else recorded observations."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a plan may cost in accuracy, in a measure that recorded observations give.
+
+    Args:
+        name: The measurement, or ``unit:UNIT`` for the worst action element of that unit.
+        value: The largest allowed.
+    """
+
+    name: str
+    value: float
+
+    def of(self, row: Row) -> Measurement | None:
+        """Return the measurement of a row that the budget is about, None when there is none."""
+        if self.name == "disagreement":
+            found = row.get("agreement_baseline")
+            return None if found is None else replace(found, name=self.name, value=1.0 - found.value)
+        if self.name.startswith("unit:"):
+            unit = self.name.partition(":")[2]
+            alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
+            return max(alike, key=lambda m: m.value, default=None)
+        return row.get(self.name) or row.get(f"error_baseline.{self.name}")
+
+    def found(self, row: Row) -> Measurement:
+        """Return the measurement of a row that the budget is about.
+
+        Raises:
+            RecipeError: when the row has none of that name; names those that it has.
+        """
+        found = self.of(row)
+        if found is not None:
+            return found
+        known = [each.name.removeprefix("error_baseline.") for each in row.measurements if each.origin == "measured"]
+        units = {f"unit:{each.unit}" for each in row.measurements if each.name.startswith("error_baseline.")}
+        raise RecipeError(
+            f"--max-drop names '{self.name}', which is not measured on this policy; "
+            f"{nearest(self.name, [*known, *sorted(units)])}."
+        )
+
+
+def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
+    """Return the budget on recorded observations.
+
+    Args:
+        limits: What was asked for.
+        spec: The policy's.
+        proxy: Whether something else decides in the end (episodes, the expert's actions), so that a plan is only worth
+            a look when it is near float32.
+    """
+    if limits.metric:
+        return Budget(limits.metric, limits.max_metric or 0.0)
+    name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
+    return Budget(name, min(max(PROXY, limits.max_drop), limits.max_distance) if proxy else limits.max_drop)
+
+
+def distance_of(row: Row) -> Measurement | None:
+    """Return how far a row's actions are from float32's own, None when that is not measured.
+
+    Continuous: the mean |difference| by float32's standard deviation; discrete: the share of other answers.
+    """
+    return Budget("disagreement", 0.0).of(row) or row.get("error_baseline")
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A row, held against the limits.
+
+    Args:
+        row: The row with its role and the reason for it in words.
+        within: Whether it keeps to every limit.
+        drop: Accuracy lost against float32, a share; NaN when it is not known.
+        miss: By how much it misses the limits, as a multiple of them (0 when within, infinite when unknown).
+        sentences: What to tell a person, when it is the chosen one.
+        warnings: What a person should know before trusting it.
+    """
+
+    row: Row
+    within: bool
+    drop: float
+    miss: float = 0.0
+    sentences: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_board: bool = False) -> Judged:
+    """Hold a candidate's row against the limits.
+
+    Args:
+        row: The candidate, or the baseline itself.
+        baseline: The float32 row.
+        limits: What was asked for.
+        profile: The board; None for this host.
+        on_board: Whether this host is that board, so that its own latency decides.
+
+    Returns:
+        The row with its role (``within`` / ``outside``; the baseline keeps its own) and the reason in words.
+    """
+    is_baseline = row is baseline
+    row = _with_drop(row, baseline)
+    decisive = next((found for name in DROPS if (found := row.get(name)) is not None), None)
+    if limits.metric:
+        decisive = Budget(limits.metric, 0.0).of(row)
+    rate = _both(_judge_rate(row, limits, profile, on_board), _judge_memory(row, limits, profile, on_board))
+    if is_baseline:
+        reason = "; ".join(rate.reasons) or "the reference"
+        return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
+    accuracy = _both(_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits))
+    reasons = (*accuracy.reasons, *rate.reasons)
+    kept = f"{_drop_words(decisive)}, within {_allowed(limits, decisive)}" if decisive else ""
+    row = replace(row, role="outside" if reasons else "within", reason="; ".join(reasons) or kept)
+    warnings = (*rate.warnings, *(() if reasons else accuracy.warnings))
+    drop = decisive.value if decisive else math.nan
+    return Judged(row, not reasons, drop, accuracy.miss + rate.miss, (), warnings)
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """What one limit says: reasons against the row, by how much it misses, and reservations."""
+
+    reasons: tuple[str, ...] = ()
+    miss: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+
+def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verdict:
+    if drop is None or not drop.known:
+        reason = "its accuracy is unmeasured: the policy brings neither an environment nor evaluation data"
+        return _Verdict((reason,), math.inf)
+    if limits.metric:
+        allowed = limits.max_metric or 0.0
+        if drop.value <= allowed:
+            return _Verdict()
+        told = f"{_drop_words(drop)}, allowed {_allowed(limits, drop)}"
+        return _Verdict((told,), drop.value / max(allowed, 1e-9) - 1)
+    over = drop.value - limits.max_drop
+    if over > TOLERANCE:
+        return _Verdict((f"{_drop_words(drop)}, {_points(over)} over the budget",), over / max(limits.max_drop, 0.001))
+    high = drop.high or 0.0
+    if high <= limits.max_drop:
+        return _Verdict()
+    return _Verdict(
+        warnings=(
+            f"{row.name}: the drop could be as large as {_points(high)} ({drop.samples} paired samples cannot exclude "
+            "it); more episodes would narrow it: --episodes",
+        )
+    )
+
+
+def _judge_distance(row: Row, decisive: Measurement | None, limits: Limits) -> _Verdict:
+    """Judge the distance from float32's own actions, which a drop against the expert or of success does not show."""
+    found = distance_of(row)
+    if found is None or (decisive is not None and _is_distance(decisive)):
+        return _Verdict()
+    if not found.known:
+        return _Verdict((f"its distance from float32 is unknown: {found.note}",), math.inf)
+    if found.value <= limits.max_distance:
+        return _Verdict()
+    told = f"{_distance_words(found)}, allowed {_percent(limits.max_distance)} (--max-distance)"
+    return _Verdict((told,), found.value / max(limits.max_distance, 1e-9) - 1)
+
+
+def _is_distance(decisive: Measurement) -> bool:
+    """Say whether what decides is a distance from float32 itself, so that the limit on it is the user's."""
+    return decisive.note == AGAINST_FLOAT32 or decisive.name.startswith(FROM_FLOAT32)
+
+
+def _distance_words(found: Measurement) -> str:
+    if found.name == "disagreement":
+        return f"{_percent(found.value)} of the answers are not those of float32"
+    return f"the action differs from float32's by {_percent(found.value)} of its standard deviation"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:,.0f} %" if share >= 10 else f"{100 * share:.3g} %"
+
+
+def _with_drop(row: Row, baseline: Row) -> Row:
+    """Add the drop on recorded observations, in the direction in which more is worse."""
+    if row is baseline:
+        return row
+    found: list[Measurement] = []
+    for name, drop, sign in (("agreement_expert", "agreement_drop", -1.0), ("error_expert", "error_increase", 1.0)):
+        own, base = row.get(name), baseline.get(name)
+        if own is not None and base is not None and own.known:
+            found.append(
+                Measurement(
+                    drop,
+                    sign * (own.value - base.value),
+                    "1",
+                    where=own.where,
+                    samples=own.samples,
+                    note="recorded observations",
+                )
+            )
+    if not found:
+        against = row.get("agreement_baseline") or row.get("error_baseline")
+        if against is not None and against.known:
+            agreement = against.name == "agreement_baseline"
+            value = 1.0 - against.value if agreement else against.value
+            name = "agreement_drop" if agreement else "error_increase"
+            where, count = against.where, against.samples
+            found.append(Measurement(name, value, "1", where=where, samples=count, note=AGAINST_FLOAT32))
+    return replace(row, measurements=(*row.measurements, *found))
+
+
+def _both(first: _Verdict, second: _Verdict) -> _Verdict:
+    reasons, warnings = (*first.reasons, *second.reasons), (*first.warnings, *second.warnings)
+    return _Verdict(reasons, first.miss + second.miss, warnings)
+
+
+def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
+    """Judge the memory: by what a fresh process took here, or by the prediction for another board."""
+    if limits.max_memory_mb is None:
+        return _Verdict()
+    measured = profile is None or on_board
+    found = row.get("peak_rss") if measured else row.get("memory", "predicted")
+    if found is None or not found.known:
+        return _Verdict(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
+    if found.value <= limits.max_memory_mb:
+        return _Verdict()
+    told = f"needs {found.value:.4g} MB{'' if measured else ' (predicted)'} > {limits.max_memory_mb:g} MB"
+    return _Verdict((told,), found.value / limits.max_memory_mb - 1)
+
+
+def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
+    """Judge the latency: on the board by what was measured, elsewhere by the prediction for the board."""
+    budget_ms = limits.latency_ms
+    if budget_ms is None:
+        return _Verdict()
+    if on_board or profile is None:
+        found = row.get("latency_p90") or row.get("latency_p50")
+        p90 = found.value if found else math.inf
+        late = (f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms",)
+        return _Verdict(late, p90 / budget_ms - 1) if p90 > budget_ms else _Verdict()
+    predicted = row.get("latency_p50", "predicted")
+    if predicted is None or not predicted.known:
+        unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {_rate(limits)} is unjudged"
+        return _Verdict(warnings=(unjudged,))
+    low, high = predicted.low or predicted.value, predicted.high or predicted.value
+    told = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
+    told += f", {_rate(limits)} needs {budget_ms:.3g} ms"
+    if low > budget_ms:
+        return _Verdict((told,), predicted.value / budget_ms - 1)
+    if high > budget_ms:
+        return _Verdict(warnings=(f"{row.name}: {told}: too close to call, measure on the board",))
+    return _Verdict()
+
+
+def _rate(limits: Limits) -> str:
+    slow = limits.hz is None or (limits.max_latency_ms is not None and limits.max_latency_ms < 1000.0 / limits.hz)
+    return "--max-latency-ms" if slow else f"{limits.hz:g} Hz"
+
+
+def _allowed(limits: Limits, drop: Measurement) -> str:
+    if not limits.metric:
+        return _points(limits.max_drop)
+    return f"{limits.max_metric:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
+
+
+def _drop_words(drop: Measurement) -> str:
+    if drop.name not in DROPS:
+        return f"{drop.name} is {drop.value:.4g}{'' if drop.unit == '1' else ' ' + drop.unit}"
+    subject = {
+        "success_drop": "success",
+        "agreement_drop": "agreement with the expert",
+        "error_increase": "action error",
+    }
+    name = subject[drop.name]
+    if drop.note == AGAINST_FLOAT32:
+        return _distance_words(drop if drop.name == "error_increase" else replace(drop, name="disagreement"))
+    if drop.name == "error_increase":
+        return f"{name} {'rises' if drop.value >= 0 else 'falls'} by {_points(abs(drop.value))}"
+    verb = "drops" if drop.value > 0 else ("is unchanged" if drop.value == 0 else "rises")
+    note = f" ({drop.note})" if drop.note and drop.name == "success_drop" else ""
+    return f"{name} {verb}{'' if drop.value == 0 else f' by {_points(abs(drop.value))}'}{note}"
+
+
+def _points(share: float) -> str:
+    points = f"{100 * share:.3g}"
+    return f"{points} point" + ("" if points == "1" else "s")
+
+
+def p50(row: Row, origin: str = "measured") -> float:
+    """Return the median latency of a row in ms, infinite when it is not known."""
+    found = row.get("latency_p50", origin)
+    return found.value if found is not None and found.known else math.inf

@@ -1,0 +1,131 @@
+"""A recipe: what ``optimize`` does with a policy, as YAML that a person can read, keep and repeat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, Field, ValidationError, model_validator
+
+from vlatool.errors import RecipeError, require
+from vlatool.files.numbers import Numeric
+from vlatool.files.yaml import read_mapping
+
+StageList = tuple[dict[str, dict[str, Any]], ...]
+"""Stages in order, each a mapping of one name to its options."""
+
+
+class Limits(Numeric):
+    """What a candidate must keep to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_drop: float = Field(0.01, ge=0, le=1, description="largest drop against float32, a share (0.01 = 1 point)")
+    max_distance: float = Field(
+        0.25,
+        ge=0,
+        description="largest distance from float32's own actions: mean |difference| / standard deviation, "
+        "or the share of other answers",
+    )
+    metric: str = Field("", description="a measurement that decides instead, such as relative_error, or unit:m")
+    max_metric: float | None = Field(None, ge=0, description="largest value of that measurement")
+    hz: float | None = Field(None, gt=0, description="inferences per second")
+    max_latency_ms: float | None = Field(None, gt=0, description="largest latency of one inference")
+    max_memory_mb: float | None = Field(None, gt=0, description="largest memory of the process, 10^6 bytes")
+
+    accept: tuple[str, ...] = Field((), description="findings of a bundle that are overruled, by name")
+
+    @model_validator(mode="after")
+    def _metric_has_a_bound(self) -> Limits:
+        if bool(self.metric) != (self.max_metric is not None):
+            raise ValueError("metric and max_metric belong together")
+        return self
+
+    @property
+    def latency_ms(self) -> float | None:
+        """What one inference may take, by rate and latency."""
+        given = [1000.0 / self.hz] if self.hz else []
+        given += [self.max_latency_ms] if self.max_latency_ms else []
+        return min(given) if given else None
+
+
+class Effort(Numeric):
+    """How much is measured."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    episodes: int = Field(200, ge=0, description="closed-loop episodes of each candidate; 0 for none")
+    iterations: int = Field(200, ge=20, description="timed inferences of each candidate")
+    threads: int = Field(1, ge=1, description="intra-op threads while timing")
+
+
+class Recipe(Numeric):
+    """Export, candidates and limits of one ``optimize`` run."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_: int = Field(1, alias="schema", ge=1, le=1)
+    export: StageList = ({"export.onnx": {}},)
+    candidates: dict[str, StageList] = Field(min_length=1)
+    search: bool = False
+    limits: Limits = Limits()
+    effort: Effort = Effort()
+
+    def to_yaml(self) -> str:
+        """Return YAML that ``read_recipe`` turns back into an equal recipe."""
+        yaml = require("yaml", "build")
+        plain = self.model_dump(mode="json", by_alias=True)
+        text: str = yaml.safe_dump(plain, sort_keys=False, default_flow_style=False)
+        return text
+
+
+def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str = "ort_cpu") -> Recipe:
+    """Return the candidates that are tried when the user names none.
+
+    Args:
+        limits: What a candidate must keep to.
+        effort: How much is measured.
+        calibrated: Whether the policy brings calibration data, without which static quantization is impossible.
+        engine: The engine of the board. ONNX Runtime on a CPU takes its own integer operators and dynamic
+            quantization; every other engine takes standard QDQ operators with symmetric int8.
+    """
+    own = engine == "ort_cpu"
+    layout: dict[str, Any] = {} if own else {"layout": "qdq", "activations": "int8"}
+    candidates: dict[str, StageList] = {}
+    if own or not calibrated:
+        candidates["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
+    if calibrated:
+        candidates["static_int8"] = ({"quantize.static_int8": layout},)
+        if not own:
+            candidates["static_int8_percentile"] = ({"quantize.static_int8": {"method": "percentile", **layout}},)
+    return Recipe(candidates=candidates, search=own, limits=limits, effort=effort)
+
+
+def read_recipe(path: Path) -> Recipe:
+    """Read a recipe file.
+
+    Raises:
+        RecipeError: when the file is missing, is not YAML, or says something impossible; lists every problem.
+    """
+    if not path.exists():
+        raise RecipeError(f"There is no recipe {path}.")
+    data = read_mapping(path, f"The recipe {path}", RecipeError)
+    try:
+        return Recipe.model_validate(data)
+    except ValidationError as error:
+        problems = [f"{'.'.join(map(str, item['loc'])) or 'recipe'}: {item['msg']}" for item in error.errors()]
+        raise RecipeError(f"The recipe {path}: {'; '.join(problems)}.") from error
+
+
+def stage_entries(stages: StageList) -> list[tuple[str, dict[str, Any]]]:
+    """Return (name, options) of each stage.
+
+    Raises:
+        RecipeError: when an entry is not a mapping of one name to options.
+    """
+    found: list[tuple[str, dict[str, Any]]] = []
+    for entry in stages:
+        if len(entry) != 1:
+            raise RecipeError(f"A stage is one name with its options; got {entry}.")
+        found.extend(entry.items())
+    return found

@@ -1,0 +1,309 @@
+"""The search of ``optimize``: engines, methods and mixed-precision plans race each other; losers cost little.
+
+1. Every **variant** (an engine, a method, a compute dtype) is built and tried: a few timed inferences in turns with
+   float32, and its error on calibration observations.
+2. Where variants faster than the best one inside the budget miss the budget, the layers that cost the accuracy are
+   found by running each alone in int8, and left in float in growing numbers until the budget is kept (a mixed-precision
+   plan).
+3. The fastest few inside the budget become candidates, which ``optimize`` measures in full.
+
+Each trial is a cached stage: an interrupted search goes on where it was.
+"""
+
+from __future__ import annotations
+
+import glob
+import importlib.util
+import math
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vlatool.benchmark.latency import Latency
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.errors import GraphError, VlatoolError
+from vlatool.evaluate.recorded import Recorded
+from vlatool.hardware.profile import Profile
+from vlatool.machine.host import isa
+from vlatool.machine.instruction_sets import VNNI, board_set
+from vlatool.optimize.judge import budget_of
+from vlatool.optimize.recipe import Limits, StageList, stage_entries
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
+from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.run import cached_measure, cached_transform
+
+if TYPE_CHECKING:
+    from vlatool.sensitivity.layers import LayerError
+
+CALIBRATION = "data/calibration.npz"
+FINALISTS = 3
+FINE = 0.9
+"""Share of the budget that a plan may use on calibration observations: those that it is judged on are others."""
+ROUNDS = 5
+"""Plans that are tried for one variant, at most."""
+SECONDS = 120.0
+"""What the sensitivity of all layers may take; fewer samples are used for slow policies."""
+SAMPLES = 8
+"""Observations on which it is measured, at most."""
+TIMED = 20
+QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False}
+BF16 = ("amx_bf16", "avx512_bf16")
+AMX = ("amx_tile", "amx_int8")
+INT8: dict[str, dict[str, Any]] = {
+    "int8": {}, "int8_mse": {"method": "mse"}, "int8_attention": {"attention": True},
+    "int8_elementwise": {"elementwise": True},
+}  # fmt: skip
+"""Name -> options of the int8 variants of OpenVINO."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a variant did when it was tried.
+
+    Args:
+        name: Name of the candidate that it may become.
+        stages: What makes it.
+        speedup: Against float32 in ONNX Runtime, or in ``engine`` where that is named, from a few inferences; 0 when it
+            could not be made.
+        error: Error on calibration observations, in the measure of the budget (or the nearest that needs no episodes).
+        within: Whether ``error`` keeps to the budget.
+        note: Why it could not be made.
+        engine: What its speed is compared within; empty where all plans are compared with each other.
+    """
+
+    name: str
+    stages: StageList
+    speedup: float = 0.0
+    error: float = math.inf
+    within: bool = False
+    note: str = ""
+    engine: str = ""
+
+
+@dataclass
+class Search:
+    """One run of the search.
+
+    Args:
+        baseline: The float32 bundle.
+        limits: The budget.
+        profile: The board; None for this host.
+        cache: Where trials are kept.
+        context: For progress.
+        threads: Intra-op threads.
+    """
+
+    baseline: Bundle
+    limits: Limits
+    profile: Profile | None
+    cache: Path
+    context: Context
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        self.trials: list[Trial] = []
+        self._seen: dict[str, str] = {}
+        self._begun = time.monotonic()
+        self._apart = board_set(self.profile).confined
+        self._planned = 1
+        self._layers: list[LayerError] | None = None
+        self._observations = recorded_observations(self.baseline, 256)
+        self.budget = budget_of(self.limits, self.baseline.manifest.spec)
+
+    def run(self, given: Mapping[str, StageList]) -> dict[str, StageList]:
+        """Try everything; return the finalists that are not among the given candidates, fastest first."""
+        variants = {**given, **variants_for(self.profile, calibrated=bool(self._observations))}
+        self._planned = len(variants) + 2 * ROUNDS
+        for name, stages in variants.items():
+            self._try(name, stages)
+        self._repair()
+        chosen = self._finalists()
+        return {trial.name: trial.stages for trial in chosen if trial.name not in given}
+
+    def tables(self) -> dict[str, list[dict[str, Any]]]:
+        """Return what was tried, and which layers cost the accuracy, as tables of the report."""
+        found: dict[str, list[dict[str, Any]]] = {
+            "Plans tried by the search": [
+                {
+                    "plan": trial.name,
+                    "speed-up": f"{trial.speedup:.2f}x" if trial.speedup else "",
+                    **({"against float32 in": trial.engine} if self._apart else {}),
+                    self.budget.name: f"{trial.error:.4g}" if math.isfinite(trial.error) else "",
+                    "within": "yes" if trial.within else "no",
+                    "note": trial.note,
+                }
+                for trial in sorted(self.trials, key=lambda trial: (trial.engine, -trial.speedup))
+            ]
+        }
+        if self._layers:
+            found["Layers by what they cost when they alone are int8"] = [
+                {"layer": layer.name, "error": f"{layer.error:.4g}", "share of MACs": f"{layer.macs_share:.1%}"}
+                for layer in self._layers[:15]
+            ]
+        return found
+
+    def _try(self, name: str, stages: StageList) -> Trial:
+        """Build a plan, time it against float32 and measure its error; failures are trials that say why."""
+        done = len(self.trials)
+        self._planned = max(self._planned, done + 1)
+        left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
+        told = f", about {left:.0f} s left" if done else ""
+        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{told}: {name}", done / self._planned)
+        quiet = replace(self.context, tell=lambda _what, _share: None)
+        try:
+            bundle = self.baseline
+            for stage in built(stages):
+                stage.check(bundle, self.profile)
+                bundle = cached_transform(stage, bundle, self.cache, quiet)
+            refuse_findings(bundle, self.limits.accept)
+            twin = self._seen.setdefault(graphs_of(bundle), name)
+            if twin != name:  # no product has enough rows to become a convolution, say
+                raise GraphError(f"It has the graphs of {twin}.")
+            engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
+            timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, engine=engine, **QUICK)
+            speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
+            error = self._error(bundle, quiet)
+            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine)
+        except VlatoolError as failure:
+            if failure.exit_code not in (3, 4):
+                raise
+            trial = Trial(name, stages, note=failure.message)
+        self.trials.append(trial)
+        return trial
+
+    def _error(self, bundle: Bundle, context: Context) -> float:
+        count = max(8, min(len(self._observations), 64))
+        recorded = Recorded(data=self.baseline.path / CALIBRATION, baseline=self.baseline.path, samples=count)
+        row = cached_measure(recorded, bundle, self.cache, context).rows[-1]
+        found = self.budget.of(row)
+        return math.inf if found is None or not found.known else found.value
+
+    def _repair(self) -> None:
+        """Leave sensitive layers in float where a plan is fast enough to be worth it, but outside the budget."""
+        for trial in sorted(self.trials, key=lambda trial: -trial.speedup):
+            rivals = [other for other in self.trials if other.within and other.engine == trial.engine]
+            best = max((other.speedup for other in rivals), default=0.0)
+            if trial.within or trial.speedup <= 1.05 * best or not math.isfinite(trial.error):
+                continue
+            stage = built(trial.stages)[-1]
+            if isinstance(stage, StaticInt8) and not stage.elementwise and not stage.attention:
+                self._mix(trial, stage)
+
+    def _mix(self, trial: Trial, stage: StaticInt8) -> None:
+        """Grow the set of layers that stay in float until the budget is kept, then try to shrink it."""
+        layers = self._sensitivities(stage)
+        if not layers:
+            return
+        ranked = sorted(layers, key=lambda layer: -(layer.error**2) / max(layer.macs_share, 1e-4))
+        count = self._estimate(ranked, trial.error)
+        too_few, enough = 0, len(ranked)
+        for _ in range(ROUNDS):
+            if count <= too_few or count >= enough:
+                break
+            names = [glob.escape(layer.name) for layer in ranked[:count]]
+            options = {**stage.options(), "exclude": [*stage.exclude, *names]}
+            stages = (*trial.stages[:-1], {stage.name(): options})
+            mixed = self._try(f"{trial.name}_mixed{count}", stages)
+            if mixed.within:
+                enough = count
+                count = (too_few + count) // 2
+            else:
+                too_few = count
+                count = min(2 * count, (count + enough) // 2) if enough < len(ranked) else 2 * count
+
+    def _estimate(self, ranked: list[LayerError], error: float) -> int:
+        """Return how many layers must go, were errors independent: their squares add up."""
+        total = sum(layer.error**2 for layer in ranked) or 1.0
+        allowed = (FINE * self.budget.value / error) ** 2 if error else 1.0
+        kept = 1.0
+        for count, layer in enumerate(ranked, 1):
+            kept -= layer.error**2 / total
+            if kept <= allowed:
+                return count
+        return len(ranked)
+
+    def _sensitivities(self, stage: StaticInt8) -> list[LayerError]:
+        from vlatool.sensitivity.layers import sensitivities
+
+        if self._layers is None:
+            chosen = self._observations[:: max(1, len(self._observations) // SAMPLES)][:SAMPLES]
+            self._layers = sensitivities(self.baseline, stage, None, chosen, self.context, seconds=SECONDS)
+        return self._layers
+
+    def _finalists(self) -> list[Trial]:
+        """Return the finalists of all plans that are compared with each other."""
+        made = [trial for trial in self.trials if trial.speedup > 0]
+        engines = dict.fromkeys(trial.engine for trial in made)
+        return [each for engine in engines for each in self._finalists_of([t for t in made if t.engine == engine])]
+
+    def _finalists_of(self, made: list[Trial]) -> list[Trial]:
+        """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
+        inside = sorted((trial for trial in made if trial.within), key=lambda trial: -trial.speedup)
+        if not inside:
+            return sorted(made, key=lambda trial: trial.error)[:1]
+        fast = [trial for trial in inside if trial.speedup >= 0.8 * inside[0].speedup][:FINALISTS]
+        accurate = min(inside, key=lambda trial: trial.error)
+        return fast if accurate in fast or accurate.speedup < 1.0 else [*fast, accurate]
+
+
+def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageList]:
+    """Return the plans that every search begins with: name -> stages.
+
+    Args:
+        profile: The board; None for this host.
+        calibrated: Whether there is calibration data.
+    """
+    engines = ("ort_cpu", "openvino") if profile is None else tuple(profile.engines)
+    found: dict[str, StageList] = {}
+    if "ort_cpu" in engines:
+        found["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
+        if calibrated:
+            found["static_int8"] = ({"quantize.static_int8": {}},)
+            found["static_int8_mse"] = ({"quantize.static_int8": {"method": "mse"}},)
+            found["static_int8_attention"] = ({"quantize.static_int8": {"attention": True}},)
+    if "openvino" in engines and importlib.util.find_spec("openvino") is not None:
+        found.update(_openvino_variants(processor_has(profile, *BF16), processor_has(profile, *AMX), calibrated))
+        if calibrated and processor_has(profile, "avx2") and not processor_has(profile, *VNNI):
+            reduced = {"layout": "openvino", "reduce_range": True}  # products of 7 bits do not saturate
+            found["openvino_int8_reduced"] = ({"quantize.static_int8": reduced},)
+    return found
+
+
+def _openvino_variants(bfloat16: bool, amx: bool, calibrated: bool) -> dict[str, StageList]:
+    """Return the variants of OpenVINO; with matrix units (AMX) their products are convolutions, as ``_pixels`` says."""
+    found: dict[str, StageList] = {}
+    forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if amx else {"": {}}
+    for form, how in forms.items():
+        if bfloat16:
+            found[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
+    rest = {"compute": "bfloat16"} if bfloat16 else {}
+    for name, options in INT8.items() if calibrated else ():
+        for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
+            stage = {"layout": "openvino", **rest, **how, **options}
+            found[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
+    return found
+
+
+def graphs_of(bundle: Bundle) -> str:
+    """Return what two bundles share that compute the same on the same engine."""
+    manifest = bundle.manifest
+    files = sorted(f"{path} {record.sha256}" for path, record in manifest.files.items() if path.startswith("graphs/"))
+    computes = sorted(f"{name} {graph.compute}" for name, graph in manifest.graphs.items())
+    return "\n".join([manifest.engine, *computes, *files])
+
+
+def processor_has(profile: Profile | None, *features: str) -> bool:
+    """Say whether the board's processor (this host's, for None) has one of these features."""
+    if profile is not None:
+        return any(name in features for unit in profile.units.values() for name in unit.isa)
+    return any(name in features for name in isa() or [])
+
+
+def built(stages: Iterable[dict[str, dict[str, Any]]]) -> list[Transform]:
+    """Return the stage objects of a list of entries."""
+    made = [build_stage(name, options or {}) for name, options in stage_entries(tuple(stages))]
+    return [stage for stage in made if isinstance(stage, Transform)]

@@ -1,0 +1,205 @@
+"""What every quantization method does around its own work: select nodes, walk the graphs, finish the bundle."""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import io
+import logging
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.manifest import Graph
+from vlatool.data import observations_for
+from vlatool.errors import BundleError, RecipeError, nearest, require
+from vlatool.graph.files import foreign_errors, load, part_phases, read, save
+from vlatool.graph.nodes import FOLDED
+from vlatool.graph.precision import precision_shares
+from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.finish import TRIALS, carry_over, finish
+
+if TYPE_CHECKING:
+    from vlatool.hardware.profile import Profile
+
+QuantizeGraph = Callable[[str, Path, Path], str | None]
+"""Graph name, original file, new file -> dtype of what is not quantized (float32 when None)."""
+QUANTIZED_OPS = ("MatMul", "Gemm", "Conv")
+FLOATS = ("float64", "float32", "float16")
+"""Precisions of a graph that is not quantized yet."""
+
+
+class Quantization(Transform):
+    """Options that every quantization method has."""
+
+    include: tuple[str, ...] = Field((), description="globs of node names to quantize; all when empty")
+    exclude: tuple[str, ...] = Field((), description="globs of node names to leave in float32")
+    parts: tuple[str, ...] = Field(
+        (), description="parts of the policy to quantize, as policy.yaml names them; all when empty"
+    )
+    graphs: tuple[str, ...] = Field((), description="globs of graph names to quantize; all when empty")
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """There is a graph to quantize, every pattern for graphs matches one, and none of them is quantized already."""
+        if source is None:
+            return
+        if not source.manifest.graphs:
+            raise BundleError(
+                f"{source.path} has no graph to quantize.", "export it first: vlatool export SOURCE -o BUNDLE"
+            )
+        for pattern in self.graphs:
+            if not fnmatch.filter(source.manifest.graphs, pattern):
+                raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.")
+        for name in self.chosen_graphs(source):
+            graph = source.manifest.graphs[name]
+            quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
+            lower = quantized or [graph.compute]
+            if lower != ["float32"] and lower != [""]:
+                raise BundleError(
+                    f"The graph '{name}' of {source.path} is {' and '.join(lower)} already; {self.name()} starts from "
+                    "float32.",
+                    "quantize the float32 bundle that this one was made from, or leave the graph out with --graphs",
+                )
+
+    def transform(
+        self,
+        source: Bundle | None,
+        out: Path,
+        context: Context,
+        quantize: QuantizeGraph,
+        engine: str = "",
+        made_by: dict[str, Any] | None = None,
+    ) -> Bundle:
+        """Run ``quantize(graph name, original file, new file)`` on each selected graph and finish the bundle.
+
+        A graph that shall compute in bfloat16 leaves its phases (see ``_phase``) to a float32 graph of its own.
+        """
+        bundle = source_of(source, self.name())
+        self.check(bundle, None)
+        (out / "graphs").mkdir()
+        made: dict[str, Graph] = {}
+        program = bundle.manifest.program
+        for number, (name, graph) in enumerate(bundle.manifest.graphs.items()):
+            context.tell(f"quantizing {name}", number / len(bundle.manifest.graphs))
+            original, target = bundle.file(graph.file), out / graph.file
+            selected = name in self.chosen_graphs(bundle)
+            compute: str | None = None
+            with foreign_errors(name):
+                if selected:
+                    compute = quantize(name, original, target)
+                else:
+                    save(load(original), target)
+                if compute == "bfloat16":
+                    program, parted = part_phases(program, name, target)
+                    made.update({key: replace(part, opset=graph.opset) for key, part in parted.items()})
+                shares = precision_shares(target)
+            if compute:
+                shares = {compute if key == "float32" else key: share for key, share in shares.items()}
+            made[name] = Graph(graph.file, shares, graph.opset, compute or "")
+        carry_over(bundle, out)
+        context.tell("running the quantized graphs", None)
+        observations = self.golden(bundle)
+        changes = {"program": program, "engine": engine or bundle.manifest.engine}
+        told = made_by or self.made_by()
+        return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)
+
+    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return observations, the first of which become golden; all are looked at where the engine differs.
+
+        They are those that the stage was given, where it takes any: drawn ones, of which ids are zero, do not show all
+        that engines do wrong.
+        """
+        return observations_for(bundle, TRIALS, getattr(self, "calibration", None))
+
+    def chosen_graphs(self, bundle: Bundle) -> list[str]:
+        """Return the names of the graphs that are quantized."""
+        names = bundle.manifest.graphs
+        return [name for name in names if not self.graphs or any(fnmatch.fnmatch(name, glob) for glob in self.graphs)]
+
+    def selected(self, names: Iterable[str], bundle: Bundle) -> set[str]:
+        """Return which of those nodes are quantized, by include, exclude and parts.
+
+        A pattern is held against the whole name (``blocks.0.mlp.fc1/MatMul``), the module's (``blocks.0.mlp.fc1``) and
+        that of a module that was folded into it.
+
+        Raises:
+            RecipeError: when a pattern matches no node, or a part is unknown, so that a typing error does not pass in
+                silence; when no node is left.
+        """
+        candidates = list(names)
+        if not candidates:
+            raise RecipeError(
+                f"No layer of {bundle.path} can be quantized by {self.name()}: it takes MatMul, Gemm and Conv with a "
+                "float32 weight.",
+                "look at --ops and --graphs, and at the precision of the graphs: vlatool inspect BUNDLE",
+            )
+        folded = _folded(bundle) if self.include or self.exclude or self.parts else {}
+
+        def meets(name: str, patterns: tuple[str, ...]) -> bool:
+            return _any(name, patterns) or (name in folded and _any(folded[name], patterns))
+
+        for pattern in (*self.include, *self.exclude):
+            if not any(meets(name, (pattern,)) for name in candidates):
+                raise RecipeError(f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.")
+        parts = bundle.manifest.parts
+        for part in self.parts:
+            if part not in parts:
+                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.")
+        globs = tuple(pattern for part in self.parts for pattern in parts[part])
+        kept = {name for name in candidates if not self.include or meets(name, self.include)}
+        if self.parts:
+            kept = {name for name in kept if meets(name, globs)}
+        kept = {name for name in kept if not meets(name, self.exclude)}
+        if not kept:
+            raise RecipeError(
+                f"No layer is left to quantize: include, exclude and parts rule out all {len(candidates)}.",
+                f"widen them; the first layers are {', '.join(candidates[:3])}",
+            )
+        return kept
+
+
+def quantization_library() -> Any:
+    """Import ONNX Runtime's quantizer, which needs both onnx and onnxruntime."""
+    require("onnx", "build")
+    return require("onnxruntime.quantization", "ort")
+
+
+@contextlib.contextmanager
+def quiet_quantizer() -> Iterator[Path]:
+    """Yield a scratch directory; keep the quantizer's prints, log lines and warnings away from the user."""
+    logger = logging.getLogger()
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="vlatool-") as scratch,
+            contextlib.redirect_stdout(io.StringIO()),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
+            yield Path(scratch)
+    finally:
+        logger.setLevel(level)
+
+
+def _folded(bundle: Bundle) -> dict[str, str]:
+    """Return node -> ``MODULE/TYPE`` of the module that was folded into it when the policy was exported."""
+    found = {}
+    for name, graph in bundle.manifest.graphs.items():
+        with foreign_errors(name):
+            for node in read(bundle.file(graph.file), weights=False).graph.node:
+                noted = {each.key: each.value for each in node.metadata_props}
+                if FOLDED in noted:
+                    found[node.name] = f"{noted[FOLDED]}/{node.op_type}"
+    return found
+
+
+def _any(name: str, patterns: tuple[str, ...]) -> bool:
+    module = name.rpartition("/")[0] or name
+    return any(fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(module, pattern) for pattern in patterns)

@@ -1,0 +1,1 @@
+"""Make a bundle again from its recipe."""

@@ -1,0 +1,332 @@
+"""Make a bundle again from its build record, without the cache, and compare it byte by byte with the first one."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+from vlatool.bundle.bundle import LOCATION, MANIFEST, Bundle, hash_file
+from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.files.writing import writing
+from vlatool.files.written import LEDGER
+from vlatool.machine.version import VERSION
+from vlatool.module.description import read_location
+from vlatool.optimize.differences import Compared, compare_bundles
+from vlatool.optimize.pipeline import ROBOT_FOLDERS
+from vlatool.sources import source_stage
+from vlatool.stage.base import Context, Transform, build_stage, installed_version, source_of, stage_class
+from vlatool.stage.finish import DECIDED, HANDED_OUT, history, reseal
+from vlatool.stage.run import run_transform
+from vlatool.user_code import trust
+
+Entry = dict[str, Any]
+TOLD_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
+"""How an option that is a file is told in a record."""
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """What came of making a bundle again.
+
+    Args:
+        bundle: The bundle that was checked.
+        hash: ``sha256:...`` of the bundle that was made again.
+        source: What it was made from.
+        files: Every hashed file and the manifest, compared byte by byte.
+        stages: Each stage that ran, in order, and whether its graphs are the recorded ones.
+        left_out: Fields of the manifest that were not compared, because they were measured.
+    """
+
+    bundle: Bundle
+    hash: str
+    source: str
+    files: tuple[Compared, ...]
+    stages: tuple[tuple[str, bool], ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def identical(self) -> bool:
+        """Whether every compared byte is the same."""
+        return all(file.identical for file in self.files)
+
+    @property
+    def first_difference(self) -> Compared | None:
+        """The first file that differs, None when none does."""
+        return next((file for file in self.files if not file.identical), None)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where the stages begin: what a person would type, the bundle to start from (or None), the stages to run."""
+
+    source: str
+    bundle: Bundle | None
+    stages: tuple[tuple[Entry, Transform | None], ...]
+    """An entry without a stage is the one in which ``optimize`` hands a candidate out."""
+
+
+@dataclass
+class _Places:
+    """Where files that an option names are looked for."""
+
+    given: tuple[Path, ...]
+    folders: list[Path] = field(default_factory=list)
+
+    def find(self, name: str, digest: str, stage: str) -> Path:
+        """Return the file of that name, which the record holds too, whose SHA-256 begins with ``digest``."""
+        others = []
+        for path in (*self.given, *(folder / name for folder in self.folders)):
+            if path.is_file():
+                got = hash_file(path)
+                if path.name == name and got.startswith(digest):
+                    return path
+                others.append(f"{path} has sha256:{got[:16]}")
+        got_instead = f" ({'; '.join(others)})" if others else ""
+        raise SourceError(
+            f"{stage} was given the file {name} with sha256:{digest}, which is not here{got_instead}.",
+            f"pass --file PATH/{name}, the file of that name and hash",
+        )
+
+
+def build_record(bundle: Bundle) -> tuple[Entry, ...]:
+    """Return the entries of a bundle's build record, checked.
+
+    Raises:
+        BundleError: when there is none (made by an older vlatool), or an entry makes no sense.
+    """
+    entries = history(bundle)
+    if not entries:
+        made = bundle.manifest.made_by.get("vlatool", "an unknown version")
+        raise BundleError(
+            f"{bundle.path} has no build record; vlatool {made} made it before there was one, or not by a stage.",
+            "make the bundle again, with the command that made it",
+        )
+    for number, entry in enumerate(entries):
+        stage = entry.get("stage")
+        mappings = all(isinstance(entry.get(name, {}), Mapping) for name in ("options", "versions", "files", "graphs"))
+        if not (isinstance(stage, str) and mappings and isinstance(entry.get("input", ""), str)):
+            raise BundleError(
+                f"Entry {number} of the build record of {bundle.path} makes no sense: {json.dumps(entry)[:200]}."
+            )
+        if number and stage.startswith("sources."):
+            raise BundleError(
+                f"Entry {number} of the build record of {bundle.path} is a source; only the first may be."
+            )
+    return entries
+
+
+def version_changes(entries: Iterable[Entry]) -> dict[str, tuple[str, str]]:
+    """Return package -> (recorded, installed) of each package whose version is not the recorded one.
+
+    A package that stages recorded in several versions is named with the first that is not installed.
+    """
+    changed: dict[str, tuple[str, str]] = {}
+    for entry in entries:
+        installed = {name: installed_version(name) or "not installed" for name in entry.get("versions", {})}
+        recorded = {"vlatool": entry.get("vlatool", VERSION), **entry.get("versions", {})}
+        for name, version in recorded.items():
+            now = {"vlatool": VERSION, **installed}[name]
+            if version != now:
+                changed.setdefault(name, (str(version), now))
+    return changed
+
+
+def rebuild(
+    bundle: Bundle,
+    context: Context,
+    *,
+    source: str | None = None,
+    files: tuple[Path, ...] = (),
+    cache: Path,
+    out: Path | None = None,
+    force: bool = False,
+) -> Rebuilt:
+    """Run the recorded stages again in a fresh directory and compare what they make with the bundle.
+
+    Args:
+        bundle: The bundle to make again; verified.
+        context: Whom to tell.
+        source: Policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
+            the policy was when the bundle was made, if not given.
+        files: Files that options name and that are not beside the source.
+        cache: Where to look for the place of the source; no output of a stage is taken from it.
+        out: Where to write the bundle that was made again.
+        force: Replace ``out``.
+
+    Raises:
+        SourceError: when the source is not found, or a file of it is not the recorded one.
+        BundleError: when the bundle has no usable build record.
+        VlatoolError: what a stage raises.
+    """
+    entries = build_record(bundle)
+    start = _start(bundle, entries, source, files, cache)
+    same: list[tuple[str, bool]] = []
+    with tempfile.TemporaryDirectory(prefix="vlatool-rebuild-") as scratch:
+        made = start.bundle
+        for number, (entry, stage) in enumerate(start.stages):
+            before, place = made, Path(scratch) / f"{number}-{entry['stage']}"
+            made = _hand_out(entry, before, place) if stage is None else run_transform(stage, before, place, context)
+            same.append((entry["stage"], _graphs_as_recorded(entry, made)))
+            if before is not None and before is not start.bundle:
+                shutil.rmtree(before.path)
+        made = source_of(made, "rebuild")
+        left_out = ("accuracy",) if "candidate" in bundle.manifest.made_by else ()
+        compared = compare_bundles(bundle, made, left_out)
+        if out is not None:
+            with writing(out, force=force) as draft:
+                shutil.copytree(made.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER))
+        return Rebuilt(bundle, made.hash, start.source, compared, tuple(same), left_out)
+
+
+def _start(
+    bundle: Bundle, entries: tuple[Entry, ...], source: str | None, files: tuple[Path, ...], cache: Path
+) -> _Start:
+    """Find the source, check that it is the recorded one, and build every stage before any runs."""
+    places = _Places(files, [bundle.path.parent, Path()])
+    if source is not None and (Path(source) / MANIFEST).is_file():
+        begin, first = Bundle.open(source), None
+        later = _from_bundle(begin, entries, bundle)
+    elif not entries[0]["stage"].startswith("sources."):
+        raise BundleError(
+            f"The build record of {bundle.path} begins with {entries[0]['stage']}, whose input "
+            f"({entries[0].get('input', '')[:19]}) was made by a vlatool that kept no record.",
+            "pass --source BUNDLE, the bundle of that hash, or make the bundle again from the policy",
+        )
+    else:
+        begin = None
+        first, source = _recorded_source(bundle, entries, source, cache)
+        later = entries[1:]
+        policy = getattr(first, "model", None) or getattr(first, "policy", None)
+        if policy is not None:
+            places.folders.insert(0, policy if policy.is_dir() else policy.parent)
+    stages = [(entry, None if entry["stage"] == HANDED_OUT else _stage(entry, places)) for entry in later]
+    beginning = [] if first is None else [(entries[0], first)]
+    return _Start(str(source), begin, (*beginning, *stages))
+
+
+def _from_bundle(begin: Bundle, entries: tuple[Entry, ...], bundle: Bundle) -> tuple[Entry, ...]:
+    """Return the stages that are left when a person hands in the output of an earlier one."""
+    for number, entry in enumerate(entries):
+        if entry.get("input") == begin.hash:
+            return entries[number:]
+    wanted = ", ".join(f"{entry['stage']} from {entry['input'][:19]}" for entry in entries if entry.get("input"))
+    raise BundleError(
+        f"{begin.path} is {begin.hash[:19]}, from which no stage of {bundle.path} started; recorded: {wanted}.",
+        "pass the bundle of one of these hashes, or the policy",
+    )
+
+
+def _stage(entry: Entry, places: _Places) -> Transform:
+    """Build the stage of an entry, its files found and checked."""
+    name, options = entry["stage"], dict(entry.get("options", {}))
+    fields = stage_class(name).model_fields
+    for key, value in options.items():
+        if key in fields and Path in (fields[key].annotation, *get_args(fields[key].annotation)) and value is not None:
+            told = TOLD_FILE.fullmatch(str(value))
+            if told is None:
+                raise BundleError(f"The build record names the file '{value}' of {name} without its hash.")
+            options[key] = places.find(told["name"], told["hash"], name)
+    stage = build_stage(name, options)
+    if not isinstance(stage, Transform):
+        raise BundleError(
+            f"The build record names the stage {name}, which measures; only stages that make a bundle do."
+        )
+    return stage
+
+
+def _recorded_source(
+    bundle: Bundle, entries: tuple[Entry, ...], source: str | None, cache: Path
+) -> tuple[Transform, str]:
+    """Return the source stage and where its policy is; its files have the recorded hashes."""
+    problem: VlatoolError | None = None
+    for place in [source] if source is not None else _noted_places(bundle, entries, cache):
+        try:
+            return _checked_source(place, entries[0], bundle), place
+        except VlatoolError as error:
+            problem = problem or error
+    raise problem or SourceError(
+        f"{bundle.path} does not say where its source is (a policy named '{bundle.manifest.name}'), or it is gone.",
+        "pass --source SOURCE: the directory of the policy, path.py:make or the .onnx file",
+    )
+
+
+def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
+    """Return the stage of a source whose files have the recorded hashes.
+
+    Raises:
+        SourceError: naming each file that differs, what was got and what is recorded.
+    """
+    stage = source_stage(source)
+    if stage.name() != entry["stage"]:
+        raise SourceError(f"{source} is read by {stage.name()}; {bundle.path} was made by {entry['stage']}.")
+    stage = stage.as_recorded(entry, bundle)
+    stage.check(None, None)
+    got, recorded = stage.input_hashes(), entry.get("files", {})
+    wrong = [
+        f"{name}: got {_told(got.get(name))}, recorded {_told(recorded.get(name))}"
+        for name in dict.fromkeys([*recorded, *got])
+        if got.get(name) != recorded.get(name)
+    ]
+    if wrong:
+        more = f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+        raise SourceError(
+            f"The source {source} is not what {bundle.path} was made from: {'; '.join(wrong[:5])}{more}.",
+            "go back to the recorded files, or make a new bundle from these",
+        )
+    return stage
+
+
+def _told(digest: str | None) -> str:
+    return f"sha256:{digest[:16]}" if digest else "no such file"
+
+
+def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> Iterator[str]:
+    """Yield where the source may be: as the bundle or the cached source bundle notes.
+
+    Raises:
+        SourceError: when the user neither named nor trusted that folder.
+    """
+    description = next(iter(entries[0].get("files", {})), "policy.yaml")
+    wanted = entries[1].get("input") if len(entries) > 1 else bundle.hash
+    cached = [path.parent for path in sorted((cache / "stages").glob(f"{entries[0]['stage']}-*/{MANIFEST}"))]
+    refused: SourceError | None = None
+    for noted in [bundle.path, *(path for path in cached if f"sha256:{hash_file(path / MANIFEST)}" == wanted)]:
+        if (noted / LOCATION).is_file():
+            try:
+                folder = read_location(noted)
+            except SourceError:
+                continue
+            try:
+                trust.require(folder, "the policy's code")
+            except SourceError as error:
+                refused = refused or error
+                continue
+            yield str(folder / description)
+    if refused:
+        raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
+
+
+def _hand_out(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
+    """Seal a candidate as ``optimize`` does; what it measured and decided is taken from the record."""
+    bundle = source_of(bundle, HANDED_OUT)
+    out.mkdir()
+    manifest = replace(
+        bundle.manifest,
+        parent=bundle.hash,
+        made_by={**bundle.manifest.made_by, **entry.get("options", {})},
+        source={},
+        files={graph.file: bundle.manifest.files[graph.file] for graph in bundle.manifest.graphs.values()},
+        **{name: entry[name] for name in DECIDED if name in entry},
+    )
+    return reseal(bundle, out, manifest, ROBOT_FOLDERS)
+
+
+def _graphs_as_recorded(entry: Entry, made: Bundle) -> bool:
+    files = {name: record.sha256 for name, record in made.manifest.files.items()}
+    return all(files.get(name) == digest for name, digest in entry.get("graphs", {}).items())

@@ -1,0 +1,143 @@
+"""Whether integer products are exact on this machine, or saturate: asked of an engine by a product that would.
+
+x86 without VNNI multiplies uint8 with int8 in pairs and adds both products in 16 bits. Two times 255 x 127 is 64,770
+and becomes 32,767: an int8 policy computes other actions there, in silence. ONNX Runtime has an option that is exact on
+such processors, for uint8 activations and at a cost; int8 activations are exact without it. The option is a rewriting
+of the graph (of its weights to uint8), so that a session that rewrites nothing saturates all the same.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import math
+import zlib
+from typing import Any
+
+import numpy as np
+
+from vlatool import registry
+from vlatool.bundle.manifest import Manifest
+
+MODEL = (
+    "eNrtlD0OgkAQRneA6DIqGZfaQuw4go2EWBEpbO1QtiAxIIQfoZEDeECPI9JhvIG8ZJpvXv24Ltj2peMa4Y5qEkvUGpklAlLLOBZBnEeN"
+    "PESxDDLcIKQDJbRoL9OhtEKoeklA+eO9RAgRSgG1NfGD3C+uYnrLkrC45PaTc4cTqS5UXssfIyMjf4u9IHA/IfE0xtqdPSPF7bvjATuZ"
+    "Xa2EgXMOgqPCqTvn3I3110iuhozMN+NnLrw="
+)
+"""An ONNX model, compressed: float32 ``x`` (16, 64), quantized to uint8 in steps of 1, times int8 weights (64, 16) that
+are all 127, as ``y``."""
+WRITTEN = (
+    "eNrt1D0KwkAUBOC8GPDl+cO6Fgpapdwj2BjWymAKW7sVFlmQlSQbYtKYA3gIL+AdDZZewXwwzUw/GG7eIa0J7gQFQcMhi6bHUllnGn0wVqucVgQZ"
+    "QfVdTTRJlUvL6946fdE5LQgMhzoKdqpwIiTf3ZbwAp8Pq9w4p614IsbI2EBClbT46PV6f0uMGEgoksDz2q1A5ktoEvBO8+6C+JTGCBzJR9YlPndl"
+    "/VMyGZDHZh8iph5R"
+)
+"""The same product, written as an integer operator (MatMulInteger), not as pairs around a float one."""
+SHAPE = (16, 64)
+WANTED = 255.0 * 127 * SHAPE[1]
+PRECISE = ("session.x64quantprecision", "1")
+"""The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``)."""
+SIGNED = ("session.qdqisint8allowed", "1")
+"""The option of ONNX Runtime that leaves int8 activations of quantize/dequantize pairs int8: on x86 it rewrites them to
+uint8 else, with which convolutions saturate where those of int8 are exact."""
+UNFUSED = ("session.disable_quant_qdq", "1")
+"""The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
+EXACT = "exact"
+EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
+SATURATING = "saturating: they are added in pairs of 16 bits"
+UNKNOWN = "not known: the engine does not compute the product that would show it"
+
+
+def model(written: bool = False) -> bytes:
+    """Return the product, or the one that is written as an integer operator, as a serialized ``ModelProto``."""
+    return zlib.decompress(base64.b64decode(WRITTEN if written else MODEL))
+
+
+def operand() -> Any:
+    """Return the value of its input, with which every element of the product is ``WANTED``."""
+    return np.full(SHAPE, 255, np.float32)
+
+
+@functools.lru_cache(maxsize=4)
+def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float:
+    """Return the smallest element of the product in ONNX Runtime, NaN when it fails; asked once in each process.
+
+    Args:
+        ort: The module.
+        precise: With the option that makes it exact.
+        written: Of the integer operator, in a session that rewrites as little of a graph as it can.
+    """
+    try:
+        options = ort.SessionOptions()
+        options.log_severity_level = 4
+        options.intra_op_num_threads = 1
+        if written:
+            as_written(ort, options, precise)
+        elif precise:
+            options.add_session_config_entry(*PRECISE)
+        session = ort.InferenceSession(model(written), options, providers=["CPUExecutionProvider"])
+        return float(session.run(None, {"x": operand()})[0].min())
+    except Exception:  # the seam: a build without these operators runs float32 all the same
+        return math.nan
+
+
+def said(product: float) -> str:
+    """Say what a smallest element of the product means."""
+    if math.isnan(product):
+        return UNKNOWN
+    return EXACT if product == WANTED else SATURATING
+
+
+def as_written(ort: Any, options: Any, precise: bool) -> None:
+    """Set the options of a session that shall compute the operators of a graph as they are written.
+
+    Args:
+        ort: The module.
+        options: ``SessionOptions``, which are changed.
+        precise: Rewrite weights, so that integer products are exact: that takes the second level of rewriting, whose
+            other parts merge float operators. The one that would make integer products of pairs stays off.
+    """
+    levels = ort.GraphOptimizationLevel
+    options.graph_optimization_level = levels.ORT_ENABLE_EXTENDED if precise else levels.ORT_DISABLE_ALL
+    for entry in (PRECISE, UNFUSED) if precise else ():
+        options.add_session_config_entry(*entry)
+
+
+def is_int8(manifest: Manifest) -> bool:
+    """Say whether a graph of a bundle has int8 products."""
+    return any("int8" in graph.precision for graph in manifest.graphs.values())
+
+
+def told(manifest: Manifest, engine: str) -> tuple[str, str]:
+    """Say how an engine computes the int8 products of a bundle on this machine, and what to do about it.
+
+    Returns:
+        A sentence and a remedy; both are empty where the bundle has no such products, and where they are exact.
+
+    Raises:
+        MissingExtra: when the engine is not installed.
+    """
+    if not is_int8(manifest):
+        return "", ""
+    session: Any = registry.load("engines", engine)
+    found = str(session.arithmetic())
+    if found == EXACT:
+        return "", ""
+    return f"Its int8 products are {found}.", REMEDY.get(engine, "") if found == SATURATING else ""
+
+
+def machine(engine: str) -> str:
+    """Return what an engine computes on: this "machine", and where OpenVINO is confined on it, what to."""
+    from vlatool.machine.host import (  # only where there is something to say: it takes its time
+        MAX_CPU_ISA,
+        onednn_max_cpu_isa,
+    )
+
+    confined = onednn_max_cpu_isa() if engine == "openvino" else None
+    return f"machine (OpenVINO confined to {confined} by {MAX_CPU_ISA})" if confined else "machine"
+
+
+REMEDY = {
+    "openvino": "quantize again with --reduce-range, or with --layout ort for ONNX Runtime, whose products are exact",
+    "ort_cpu": "quantize again with --reduce-range, or with --activations int8",
+}
+"""Engine -> what was seen to be right on processors that saturate."""

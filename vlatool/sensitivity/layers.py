@@ -1,0 +1,267 @@
+"""What each layer costs when it alone is int8: error of the actions, on recorded observations."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import TensorSpec
+from vlatool.errors import DataError, require
+from vlatool.graph.files import foreign_errors, save
+from vlatool.graph.layers import Layer
+from vlatool.graph.qdq import Range
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.policy import Action, Policy, relative_error
+from vlatool.runtime.program import Program
+from vlatool.sensitivity._switches import add_switches
+from vlatool.stage.base import Context, SampleSet
+
+Array = NDArray[Any]
+Place = tuple[str, str]
+"""Graph name and layer name."""
+
+
+@dataclass(frozen=True)
+class LayerError:
+    """What int8 in one layer, or in a group of layers, does to the actions.
+
+    Args:
+        name: Node name, for example ``blocks.3.attn.out/MatMul``; names joined by ``+`` for a group.
+        graph: Name of the graph that it is in.
+        error: Relative L2 error of the raw action output, mean over the observations.
+        elements: Label -> mean |error| in physical units (un-normalised); empty for discrete actions.
+        flips: Share of steps whose gripper element changes sign, or (discrete) whose largest logit is another one; 0
+            when there is none.
+        jump: ``|d' - d|₂ / |d|₂`` with ``d`` the raw last step minus the first of a chunk, mean over the observations:
+            how far the place where the next chunk begins moves. 0 for chunks of one step and for discrete actions.
+        macs_share: Share of the graph's multiply-accumulates (0-1); NaN when they cannot be counted.
+        samples: Observations that it was measured on.
+    """
+
+    name: str
+    graph: str
+    error: float
+    elements: Mapping[str, float]
+    flips: float
+    jump: float
+    macs_share: float
+    samples: int = 0
+
+
+def sensitivities(
+    bundle: Bundle,
+    stage: StaticInt8,
+    ranges: Mapping[str, Mapping[str, Range]] | None,
+    observations: Sequence[Mapping[str, Any]],
+    context: Context,
+    *,
+    seconds: float = math.inf,
+) -> list[LayerError]:
+    """Measure every layer that a stage would quantize, alone in int8 and all else in float32; the worst first.
+
+    Each observation starts an episode of its own: kept values are zero and the noise is drawn from the same seed.
+
+    Args:
+        bundle: A float32 bundle.
+        stage: Which layers, and how they are written.
+        ranges: Graph -> value -> (low, high), as ``ranges_of`` gives; calibrated as the stage does when None. A graph
+            that is absent gets its ranges at run time, as dynamic int8 does.
+        observations: Raw observations, at least one.
+        context: For progress.
+        seconds: No further observation is begun that would not end within them; the first one always is.
+
+    Raises:
+        DataError: when there is no observation, or one does not fit the spec.
+        GraphError: when a graph cannot be rewritten or run.
+    """
+    found = ranges_of(bundle, stage, context) if ranges is None else ranges
+    with Switchboard(bundle, stage, found) as board:
+        return board.errors([(place,) for place in board.shares], observations, context, seconds=seconds)
+
+
+def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, dict[str, Range]]:
+    """Return graph -> value -> (low, high) that the stage quantizes activations over, from its calibration data.
+
+    Raises:
+        DataError: when the bundle has no calibration data, or a sample does not fit.
+    """
+    stage.check(bundle, None)
+    _, wanted = stage.plan(bundle)
+    statistics = stage.statistics(bundle, wanted, SampleSet(), context)
+    return {graph: stage.ranges(values) for graph, values in statistics.items()}
+
+
+class _Tape:
+    """What the graphs gave in the float run of an observation, up to the first graph that is now another one."""
+
+    def __init__(self) -> None:
+        self.recorded: list[Mapping[str, Array]] = []
+        self.recording = True
+        self.place = 0
+        self.changed = False
+
+    def start(self, *, recording: bool) -> None:
+        self.recording, self.place, self.changed = recording, 0, recording
+        if recording:
+            self.recorded.clear()
+
+
+class _Switchable:
+    """A session of a graph with switches; while nothing before it has changed, it gives what it gave before."""
+
+    def __init__(self, session: OrtCpuSession, flags: Mapping[str, str], tape: _Tape) -> None:
+        self._session, self._flags, self._tape = session, flags, tape
+        self._off = dict.fromkeys(flags.values(), np.array(False))
+        self._set = self._off
+        self._active = False
+
+    def switch(self, layers: Iterable[str]) -> None:
+        """Compute those layers in int8 and all others in float32."""
+        on = {self._flags[name]: np.array(True) for name in layers}
+        self._set, self._active = {**self._off, **on}, bool(on)
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run the graph as it is switched."""
+        tape = self._tape
+        tape.changed = tape.changed or self._active
+        if not tape.changed:
+            tape.place += 1
+            return tape.recorded[tape.place - 1]
+        given = self._session.run({**feeds, **self._set})
+        if tape.recording:
+            tape.recorded.append(given)
+        return given
+
+
+class Switchboard:
+    """A float32 policy in which any choice of layers can be computed in int8; a context manager.
+
+    Args:
+        bundle: A float32 bundle.
+        stage: Which layers, and how they are written.
+        ranges: As ``ranges_of`` gives.
+        threads: Intra-op threads; the cores that this process may use when None.
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        stage: StaticInt8,
+        ranges: Mapping[str, Mapping[str, Range]],
+        threads: int | None = None,
+    ) -> None:
+        self._scratch = tempfile.TemporaryDirectory(prefix="vlatool-")
+        self._tape = _Tape()
+        self._sessions: dict[str, _Switchable] = {}
+        self.shares: dict[Place, float] = {}
+        with foreign_errors("main"):
+            layers, _ = stage.plan(bundle)
+        for name, graph in bundle.manifest.graphs.items():
+            path = bundle.file(graph.file)
+            flags: dict[str, str] = {}
+            if layers.get(name):
+                with foreign_errors(name):
+                    model, flags = add_switches(path, layers[name], ranges.get(name), stage.style)
+                    self.shares.update({(name, layer): share for layer, share in _shares(path, layers[name]).items()})
+                    path = Path(self._scratch.name) / f"{name}.onnx"
+                    save(model, path)
+            self._sessions[name] = _Switchable(OrtCpuSession(path, threads), flags, self._tape)
+        self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), "ort_cpu")
+
+    def __enter__(self) -> Switchboard:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._scratch.cleanup()
+
+    def reference(self, observation: Mapping[str, Any]) -> Action:
+        """Run in float32, and keep what the graphs gave for the ``run`` calls that follow."""
+        return self._infer((), observation, recording=True)
+
+    def run(self, places: Iterable[Place], observation: Mapping[str, Any]) -> Action:
+        """Run the observation of the last ``reference`` with those layers in int8."""
+        return self._infer(places, observation, recording=False)
+
+    def _infer(self, places: Iterable[Place], observation: Mapping[str, Any], *, recording: bool) -> Action:
+        chosen = list(places)
+        for name, session in self._sessions.items():
+            session.switch([layer for graph, layer in chosen if graph == name])
+        self._tape.start(recording=recording)
+        self.policy.reset()
+        return self.policy.infer(observation)
+
+    def errors(
+        self,
+        groups: Sequence[Sequence[Place]],
+        observations: Sequence[Mapping[str, Any]],
+        context: Context,
+        *,
+        ordered: bool = True,
+        seconds: float = math.inf,
+    ) -> list[LayerError]:
+        """Return the error of each group of layers, the worst first when ``ordered``; see ``sensitivities``.
+
+        Raises:
+            DataError: when there is no observation.
+        """
+        if not observations:
+            raise DataError("There is no observation to measure the layers on.", "record some: see docs/data")
+        spec = self.policy.spec.action
+        rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
+        start = time.monotonic()
+        for number, observation in enumerate(observations):
+            if number and (time.monotonic() - start) * (number + 1) / number > seconds:
+                break
+            wanted = self.reference(observation)
+            for index, group in enumerate(groups):
+                done = (number * len(groups) + index) / (len(observations) * len(groups))
+                context.tell(f"int8 in layer {index + 1} of {len(groups)}, all else in float32", done)
+                rows[index].append(_compare(spec, self.run(group, observation), wanted))
+        found = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
+        return sorted(found, key=lambda each: -each.error) if ordered else found
+
+    def _error(self, group: Sequence[Place], rows: list[tuple[Array, ...]]) -> LayerError:
+        spec = self.policy.spec.action
+        errors, flips, jumps, elements = (np.mean([row[index] for row in rows], axis=0) for index in range(4))
+        labels = spec.labels or tuple(str(index) for index in range(spec.width))
+        named = {} if spec.kind == "discrete" else dict(zip(labels, elements.tolist(), strict=True))
+        graphs = ", ".join(dict.fromkeys(graph for graph, _ in group))
+        share = float(sum(self.shares[place] for place in group))
+        name = "+".join(layer for _, layer in group)
+        return LayerError(name, graphs, float(errors), named, float(flips), float(jumps), share, len(rows))
+
+
+def _compare(spec: TensorSpec, got: Action, wanted: Action) -> tuple[Array, ...]:
+    """Return relative error, share of flips, relative change of the jump, and mean |error| of each element."""
+    raw, before = (np.asarray(action.outputs[spec.name], np.float64) for action in (got, wanted))
+    error = np.array(relative_error(raw, before))
+    if spec.kind == "discrete":
+        return error, np.mean(got.chunk != wanted.chunk), np.array(0.0), np.zeros(0)
+    elements = np.abs(got.chunk.astype(np.float64) - wanted.chunk).mean(axis=0)
+    columns = [index for index, label in enumerate(spec.labels) if "grip" in label.lower()]
+    flipped = (got.chunk[:, columns] > 0) != (wanted.chunk[:, columns] > 0)
+    steps, base = (each.reshape(-1, each.shape[-1]) for each in (raw, before))
+    jump = relative_error(steps[-1] - steps[0], base[-1] - base[0]) if len(base) > 1 else 0.0
+    return error, np.array(flipped.mean() if columns else 0.0), np.array(jump), elements
+
+
+def _shares(path: Path, layers: Iterable[Layer]) -> dict[str, float]:
+    """Return layer name -> share of the graph's multiply-accumulates."""
+    from vlatool.graph.macs import COMPUTE, node_macs
+    from vlatool.graph.shapes import open_graph
+
+    tensors = open_graph(require("onnx", "build"), path)
+    macs = {node.name: node_macs(node, tensors) for node in tensors.nodes if node.op_type in COMPUTE}
+    total = sum(count or 0 for count in macs.values()) or 1
+    counts = {layer.name: macs.get(layer.name, 0) for layer in layers}
+    return {name: float("nan") if count is None else count / total for name, count in counts.items()}

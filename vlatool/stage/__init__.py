@@ -1,0 +1,1 @@
+"""Stages: what they are, how they run, finish and are kept."""

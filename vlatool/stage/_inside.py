@@ -1,0 +1,65 @@
+"""A stage in a child process, for it runs a user's code or needs variables of its own: what asks, and what answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError
+from vlatool.report import Report
+from vlatool.stage.base import Context, Measure, Transform, build_stage
+from vlatool.user_code import children
+
+PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)
+"""What such stages need; imported once, by the server that forks the children."""
+
+
+def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
+    """Run a stage in a child process, verify what it wrote to ``draft``, and return that.
+
+    Raises:
+        VlatoolError: what the stage raises; SourceError when the child ends before it is done.
+        BundleError: when what it wrote is no whole bundle.
+    """
+    job = {
+        "stage": stage.name(), "options": stage.model_dump(mode="json"), "out": str(draft), "workers": context.workers,
+        "source": str(source.path.absolute()) if source else "", "command": context.command,
+    }  # fmt: skip
+    children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), PRELOAD)
+    return Bundle.open(draft)
+
+
+def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Run the stage of a job in this process; return the hash of the bundle that it made."""
+    stage = build_stage(job["stage"], job["options"])
+    if not isinstance(stage, Transform):
+        raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
+    source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
+    made = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"]))
+    return {"hash": made.hash}
+
+
+def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:
+    """Run a measuring stage in a child process that has further variables from its start.
+
+    Raises:
+        VlatoolError: what the stage raises.
+    """
+    job = {
+        "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
+        "source": str(source.path.absolute()), "command": context.command,
+    }  # fmt: skip
+    about = f"{stage.name()} with {' '.join(f'{name}={value}' for name, value in environment.items())}"
+    told = children.call("vlatool.stage._inside:measure", job, context.tell, about, environment=environment)
+    return Report.from_json(str(told))
+
+
+def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
+    """Run the measuring stage of a job in this process; return its report as JSON."""
+    stage = build_stage(job["stage"], job["options"])
+    if not isinstance(stage, Measure):
+        raise RecipeError(f"The stage {job['stage']} makes a bundle; it measures nothing.")
+    source = Bundle.open(Path(job["source"]), verify=False)
+    return stage.run(source, Context(tell, job["workers"], job["command"])).to_json()

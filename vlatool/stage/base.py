@@ -1,0 +1,285 @@
+"""A stage: a function from a directory to a directory, described by a small frozen object that round-trips as JSON.
+
+The class of a stage is its options (the fields), its method (``run``), its command-line flags and its row in the
+reference docs. No module, session or open file crosses the border of a stage.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from pydantic import ConfigDict, ValidationError
+
+from vlatool import registry
+from vlatool.bundle.bundle import Bundle, hash_file
+from vlatool.errors import RecipeError, nearest
+from vlatool.files.numbers import Numeric
+from vlatool.machine.instruction_sets import computed_in
+from vlatool.machine.version import VERSION
+from vlatool.report import Report
+
+if TYPE_CHECKING:
+    from vlatool.hardware.profile import Profile
+
+Tell = Callable[[str, float | None], None]
+AnyStage = TypeVar("AnyStage", bound="Stage")
+BEFORE_ENGINES = ("sources", "export")
+"""Kinds of stages whose output is the same whatever OpenVINO computes in."""
+RECORD = 2
+"""Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
+
+
+def _silent(_what: str, _share: float | None) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a stage may use while it runs, none of which changes its result.
+
+    Args:
+        tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
+        workers: Processes that a stage may start.
+        command: The command line, for reports.
+        elsewhere: Measures on another machine: a job, the bundles that it names, and ``tell`` -> what was found there.
+            Here when None.
+    """
+
+    tell: Tell = field(default=_silent)
+    workers: int = 1
+    command: str = ""
+    elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
+
+
+class SampleSet:
+    """A fingerprint of the samples that a stage calibrates on, taken while they stream by.
+
+    Example:
+        >>> samples = SampleSet()
+        >>> for observation in samples.watch([{"proprio": [0.5, 1.0]}]): pass
+        >>> samples.record()["samples"]
+        1
+    """
+
+    def __init__(self) -> None:
+        self._hashes: list[str] = []
+
+    def watch(self, observations: Iterable[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+        """Yield the observations, each hashed before it is handed on; go through one ``SampleSet`` once."""
+        for observation in observations:
+            self._hashes.append(_sample_hash(observation))
+            yield observation
+
+    def record(self) -> dict[str, Any]:
+        """Return ``samples``, how many there were, and ``sha256``, the hash of their hashes in order."""
+        return {"samples": len(self._hashes), "sha256": hashlib.sha256("\n".join(self._hashes).encode()).hexdigest()}
+
+
+def _sample_hash(observation: Mapping[str, Any]) -> str:
+    """Hash names, types, shapes and values of one observation."""
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for name in sorted(observation):
+        value = np.ascontiguousarray(observation[name])
+        text = value.dtype.kind in "US"
+        content = json.dumps(value.tolist()).encode() if text else value.tobytes()
+        kind = "text" if text else value.dtype.str
+        digest.update(json.dumps([name, kind, list(np.shape(observation[name])), len(content)]).encode() + content)
+    return digest.hexdigest()
+
+
+class Stage(Numeric):
+    """Base of every stage: options as fields, extra keys refused, frozen."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Distributions whose versions change the result whatever the options; part of the cache key and the record."""
+
+    @classmethod
+    def kind(cls) -> str:
+        """Folder of the stage, for example ``quantize``."""
+        return cls.__module__.split(".")[-2]
+
+    @classmethod
+    def name(cls) -> str:
+        """Name in a recipe, for example ``quantize.static_int8``."""
+        return ".".join(cls.__module__.split(".")[-2:])
+
+    def options(self) -> dict[str, Any]:
+        """Return the options that differ from their defaults, as JSON values."""
+        return self.model_dump(mode="json", exclude_defaults=True)
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """Raise a user error when this stage cannot run on that source; cheap."""
+
+    def inputs(self) -> tuple[Path, ...]:
+        """Files outside the source whose content changes the result; part of the cache key."""
+        return ()
+
+    def used_packages(self) -> tuple[str, ...]:
+        """Return the distributions whose versions change the result of a stage with these options."""
+        return self.packages
+
+    def key(self, source_hash: str) -> str:
+        """Return the cache key of this stage's output: 16 hex digits.
+
+        What OpenVINO answers and how fast it is depends on the instruction set that it computes in, and a bundle
+        records how far its engine is from its graphs.
+        """
+        versions = {package: installed_version(package) for package in self.used_packages()}
+        files = [_content(path) for path in self.inputs()]
+        content = [self.name(), self.model_dump(mode="json"), source_hash, files, versions, VERSION, RECORD]
+        content += [] if self.name().partition(".")[0] in BEFORE_ENGINES else [computed_in()]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class Transform(Stage):
+    """A stage that makes a bundle."""
+
+    streams: ClassVar[bool] = False
+    """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
+
+    def runs(self, source: Bundle | None) -> str:
+        """Return whose code this stage runs on that source (``policy.py``); empty when only vlatool's own.
+
+        Such a stage is run in a child process; see ``vlatool.user_code.children``.
+        """
+        return ""
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Return what else a person wants to know about the new bundle, a sentence for each line."""
+        return ()
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Write the new bundle into the empty directory ``out`` and return it."""
+        raise NotImplementedError(self.name())
+
+    def _told_options(self) -> dict[str, Any]:
+        """Return the options with files named by name and content: where they were is nobody's business."""
+        told = self.options()
+        for name in told:
+            value = getattr(self, name)
+            if isinstance(value, Path):
+                told[name] = f"{value.name} sha256:{_content(value)[:16]}"
+        return told
+
+    def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
+        """Return the ``made_by`` entry of the manifest.
+
+        Args:
+            seed: Seed of what the stage draws itself; ``finish`` notes the seed of noise and golden inputs otherwise.
+            calibration: The samples that the stage calibrated on, after the last one was used.
+
+        Returns:
+            ``vlatool``, ``stage``, ``options`` that differ from their defaults, ``versions``, and where there are any
+            ``files`` (name -> SHA-256 of each file outside the source), ``seed`` and ``calibration``. No paths, no
+            times: the same command gives the same entry in another directory and on another day.
+        """
+        found = {package: installed_version(package) for package in self.used_packages()}
+        versions = {package: version for package, version in found.items() if version}
+        made: dict[str, Any] = {"vlatool": VERSION, "stage": self.name(), "options": self._told_options()}
+        files = self.input_hashes()
+        made |= {"versions": versions, **({"files": files} if files else {})}
+        made |= {} if seed is None else {"seed": seed}
+        return made | ({} if calibration is None else {"calibration": calibration.record()})
+
+    def input_hashes(self) -> dict[str, str]:
+        """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
+        found: dict[str, str] = {}
+        for path in (path for path in self.inputs() if path.is_file()):
+            digest, name, number = hash_file(path), path.name, 1
+            while found.get(name, digest) != digest:
+                number += 1
+                name = f"{path.name} ({number})"
+            found[name] = digest
+        return found
+
+
+class Measure(Stage):
+    """A stage that makes a report."""
+
+    remotely: ClassVar[bool] = False
+    """Whether it can measure on another machine (``Context.elsewhere``)."""
+
+    def on(self, profile: Profile) -> Measure:
+        """Return the stage as it is for a board."""
+        return self
+
+    def run(self, source: Bundle, context: Context) -> Report:
+        """Measure and return the report; the caller writes it."""
+        raise NotImplementedError(self.name())
+
+
+def source_of(source: Bundle | None, stage: str) -> Bundle:
+    """Return the source, which only the stages that start a chain may lack.
+
+    Raises:
+        RecipeError: when there is none.
+    """
+    if source is None:
+        raise RecipeError(f"{stage} needs a bundle to start from; begin the recipe with a sources stage.")
+    return source
+
+
+def stage_class(name: str) -> type[Stage]:
+    """Return the class of a stage by its recipe name.
+
+    Raises:
+        RecipeError: when the name is not ``kind.name`` of a known stage.
+    """
+    kind, _, entry = name.partition(".")
+    known = [f"{each}.{found}" for each in stage_kinds() for found in registry.names(each)]
+    if name.replace("-", "_") not in known:
+        raise RecipeError(f"There is no stage '{name}'; {nearest(name, known)}.")
+    found: type[Stage] = registry.load(kind, entry)
+    return found
+
+
+def stage_kinds() -> tuple[str, ...]:
+    """Folders that hold stages."""
+    return ("sources", "export", "prune", "distill", "quantize", "benchmark", "evaluate")
+
+
+def build_stage(name: str, options: Mapping[str, Any]) -> Stage:
+    """Build a stage from its recipe name and options.
+
+    Raises:
+        RecipeError: listing each option that is unknown or has an impossible value.
+    """
+    return validated(stage_class(name), options, f"stage {name}")
+
+
+def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> AnyStage:
+    """Build ``kind`` from options, with a sentence for each problem."""
+    try:
+        return kind.model_validate(dict(options))
+    except ValidationError as error:
+        problems = [_problem(item, list(kind.model_fields)) for item in error.errors()]
+        raise RecipeError(f"{where}: " + "; ".join(problems) + ".") from error
+
+
+def _problem(item: Mapping[str, Any], known: list[str]) -> str:
+    field_name = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"unknown option '{field_name}'; {nearest(field_name, known)}"
+    return f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
+
+
+def installed_version(package: str) -> str | None:
+    """Return the version of a distribution, None when it is not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _content(path: Path) -> str:
+    return hash_file(path) if path.is_file() else f"absent:{path.name}"

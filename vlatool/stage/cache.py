@@ -1,0 +1,288 @@
+"""What the cache holds, how large it is, and how it is made smaller.
+
+Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
+list of its files, work that waits to be continued by its lock, a count by its content, a shared recording by its hash.
+Everything else that lies there is named and left alone. What a running process uses is locked, and stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from vlatool.files.kept import DIGEST, FILES, STAGES, TAG
+from vlatool.files.locks import alone
+from vlatool.files.writing import sweep
+from vlatool.files.written import LEDGER, hash_once, read_listing
+from vlatool.graph.stored import is_workload
+
+STREAMS, WORKLOADS = "streams", "workloads"
+NAMES = {
+    STAGES: re.compile(r"(?P<what>[a-z]+\.[a-z0-9_]+)-[0-9a-f]{16}"),
+    STREAMS: re.compile(r"[\w.-]+"),
+    WORKLOADS: re.compile(r"[0-9a-f]{32}\.json"),
+}
+STREAM_FILES = ("lock", "data", "journal")
+DRAFT = re.compile(r"\.(?P<final>.+)\.tmp-\d+-[0-9a-f]{8}")
+PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")
+NEW_S = 60.0
+"""Seconds in which what was just made counts as in use: its maker has not locked it yet."""
+IN_USE = "is in use"
+RECENT = f"was made or used in the last {NEW_S:.0f} s"
+
+Inode = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing that the cache keeps.
+
+    Args:
+        name: Below the cache.
+        what: The stage's name; ``unfinished work`` or ``count of a policy`` for what is no stage.
+        used: When it was last made or used, in seconds since 1970.
+        files: Relative name -> inode and bytes of the files that vlatool wrote.
+    """
+
+    name: str
+    what: str
+    used: float
+    files: dict[str, tuple[Inode, int]]
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a cache holds.
+
+    Args:
+        cache: Where it is.
+        entries: The least recently used one first.
+        kept: Shared files: name below the cache -> inode and bytes.
+        unknown: Names below the cache of what vlatool did not write, as far as it lies beside entries.
+    """
+
+    cache: Path
+    entries: tuple[Entry, ...]
+    kept: dict[str, tuple[Inode, int]]
+    unknown: tuple[str, ...] = ()
+
+    @cached_property
+    def uses(self) -> Counter[Inode]:
+        """How many entries hold each file."""
+        return Counter(inode for entry in self.entries for inode in {inode for inode, _ in entry.files.values()})
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all files, one that entries share counted once."""
+        found = {inode: size for entry in self.entries for inode, size in entry.files.values()}
+        return sum({**found, **dict(self.kept.values())}.values())
+
+    def sizes(self, entry: Entry) -> tuple[int, int]:
+        """Return the bytes of an entry that are its own, and those that others have, too."""
+        files = dict(entry.files.values())
+        own = sum(size for inode, size in files.items() if self.uses[inode] == 1)
+        return own, sum(files.values()) - own
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What was removed, or would be: entries, bytes that are free then, and why others stay (name -> reason)."""
+
+    entries: tuple[Entry, ...]
+    freed: int
+    stays: dict[str, str]
+
+
+def is_cache(place: Path) -> bool:
+    """Say whether a directory is empty, or holds one of the folders of a cache."""
+    return not any(place.iterdir()) or any((place / name).exists() for name in (STAGES, STREAMS, WORKLOADS, FILES, TAG))
+
+
+def contents(cache: Path) -> Contents:
+    """Return what a cache holds; nothing for one that is not there yet.
+
+    Raises:
+        OSError: when it cannot be read.
+    """
+    found, unknown = [], []
+    for folder in (STAGES, STREAMS, WORKLOADS):
+        for path in _below(cache / folder):
+            try:
+                entry = _entry(cache, folder, path)
+            except FileNotFoundError:  # another process removed it since the folder was read
+                continue
+            if entry is not None:
+                found.append(entry)
+            elif not DRAFT.fullmatch(path.name):
+                unknown.append(path.relative_to(cache).as_posix())
+    kept, others = _kept(cache)
+    unknown += others
+    known = (STAGES, STREAMS, WORKLOADS, FILES, TAG)
+    unknown += [path.name for path in _below(cache) if path.name not in known]
+    return Contents(cache, tuple(sorted(found, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
+
+
+def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
+    """Return the shared files by their names below the cache, and the names of what lies beside them."""
+    kept, unknown = {}, []
+    for path in _below(cache / FILES):
+        name = path.relative_to(cache).as_posix()
+        with contextlib.suppress(FileNotFoundError):
+            status = path.lstat()
+            if DIGEST.fullmatch(path.name) and stat.S_ISREG(status.st_mode):
+                kept[name] = _inode(status)
+            elif not PART.fullmatch(path.name):
+                unknown.append(name)
+    return kept, unknown
+
+
+def prune(
+    cache: Path, *, older_than_s: float | None = None, most_bytes: int | None = None, dry_run: bool = False
+) -> Removed:
+    """Remove entries, the least recently used first, and then the recordings that no entry holds any more.
+
+    Args:
+        cache: The cache.
+        older_than_s: Remove what was not used for so many seconds; 0 for everything.
+        most_bytes: Remove until no more than that is left.
+        dry_run: Only say what would be removed.
+    """
+    held = contents(cache)
+    uses = Counter(held.uses)
+    orphans = {inode: size for inode, size in held.kept.values() if not uses[inode]}
+    left = held.bytes - sum(orphans.values())
+    removed: list[Entry] = []
+    stays: dict[str, str] = {}
+    for entry in held.entries:
+        old = older_than_s is not None and _now() - entry.used >= older_than_s
+        if not old and (most_bytes is None or left <= most_bytes):
+            continue
+        reason = _remove(cache, entry, dry_run)
+        if reason:
+            stays[entry.name] = reason
+        if not reason.startswith((IN_USE, RECENT)):
+            removed.append(entry)
+            files = dict(entry.files.values())
+            uses.subtract(files.keys())
+            left -= sum(size for inode, size in files.items() if not uses[inode])
+    if not dry_run:
+        stays |= _swept(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
+    return Removed(tuple(removed), held.bytes - left, stays)
+
+
+def _now() -> float:
+    """Return the time of day, as files have it."""
+    return time.time_ns() / 1e9
+
+
+def _below(folder: Path) -> list[Path]:
+    if folder.is_symlink() or not folder.is_dir():
+        return []
+    return sorted(folder.iterdir())
+
+
+def _inode(status: os.stat_result) -> tuple[Inode, int]:
+    return (status.st_dev, status.st_ino), status.st_size
+
+
+def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
+    """Return an entry of the cache, None for what is none."""
+    named = NAMES[folder].fullmatch(path.name)
+    status = path.lstat()
+    if named is None or stat.S_ISLNK(status.st_mode):
+        return None
+    name = path.relative_to(cache).as_posix()
+    if folder == STAGES:
+        files = _stage_files(path)
+        return Entry(name, named["what"], status.st_mtime, files) if files else None
+    if folder == STREAMS:
+        files = _own_files(path, STREAM_FILES) if (path / STREAM_FILES[0]).is_file() else {}
+        used = (path / STREAM_FILES[0]).stat().st_mtime if files else 0.0
+        return Entry(name, "unfinished work", used, files) if files else None
+    if not stat.S_ISREG(status.st_mode) or not is_workload(path):
+        return None
+    return Entry(name, "count of a policy", status.st_mtime, {"": _inode(status)})
+
+
+def _stage_files(path: Path) -> dict[str, tuple[Inode, int]]:
+    listing = read_listing(path) if path.is_dir() else None
+    return {} if listing is None else _own_files(path, (*listing.files, LEDGER))
+
+
+def _own_files(path: Path, names: Iterable[str]) -> dict[str, tuple[Inode, int]]:
+    """Return the regular files of those names below a directory, to which no link leads."""
+    wanted, found = set(names), {}
+    for folder, _, files in os.walk(path):
+        for file in files:
+            name = Path(folder, file).relative_to(path).as_posix()
+            with contextlib.suppress(FileNotFoundError):
+                status = os.lstat(Path(folder, file))
+                if name in wanted and stat.S_ISREG(status.st_mode):
+                    found[name] = _inode(status)
+    return found
+
+
+def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
+    """Remove the files of an entry, file by file; return why something of it stays."""
+    path = cache / entry.name
+    if _now() - entry.used < NEW_S:
+        return RECENT
+    lock = path / STREAM_FILES[0] if entry.what == "unfinished work" else path
+    with alone(lock) as mine:
+        if not mine:
+            return f"{IN_USE} by a running process"
+        if dry_run:
+            return ""
+        for name in sorted(entry.files, key=lambda each: (each in (LEDGER, "manifest.json"), each == LEDGER)):
+            with contextlib.suppress(FileNotFoundError):
+                (path / name if name else path).unlink()
+        _remove_folders(path)
+    return "holds what vlatool did not write" if os.path.lexists(path) else ""
+
+
+def _remove_folders(path: Path) -> None:
+    """Remove the folders that are empty, from below."""
+    for folder, _, _ in os.walk(path, topdown=False):
+        with contextlib.suppress(OSError):
+            os.rmdir(folder)
+
+
+def _swept(cache: Path, unused: Iterable[str]) -> dict[str, str]:
+    """Remove shared files that nobody links to, and what killed writers left; return why something stays."""
+    stays = {}
+    for name in unused:
+        with contextlib.suppress(FileNotFoundError):
+            if (cache / name).lstat().st_nlink > 1:
+                continue
+            if hash_once(cache / name) != Path(name).name:
+                stays[name] = "is not what its name says"
+            else:
+                (cache / name).unlink()
+    for path in _drafts(cache):
+        path.unlink(missing_ok=True)
+    return stays
+
+
+def _drafts(cache: Path) -> Iterator[Path]:
+    """Let drafts of stages be removed whose writers are gone; yield unfinished shared files of such writers."""
+    for final in {found["final"] for path in _below(cache / STAGES) if (found := DRAFT.fullmatch(path.name))}:
+        sweep(cache / STAGES / final)
+    for path in _below(cache / FILES):
+        found = PART.fullmatch(path.name)
+        with contextlib.suppress(FileNotFoundError):
+            if found and _abandoned(path.lstat(), found["process"]):
+                yield path
+
+
+def _abandoned(status: os.stat_result, process: str) -> bool:
+    """Whether a draft's writer is gone; one in another container has no number here, so a draft must be old too."""
+    old = _now() - status.st_mtime >= NEW_S
+    return old and stat.S_ISREG(status.st_mode) and not Path(f"/proc/{process}").exists()

@@ -1,0 +1,92 @@
+"""Run one stage somewhere: input directory, stage, output directory."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import BundleError, DataError
+from vlatool.files.kept import tag
+from vlatool.files.locks import hold
+from vlatool.files.outputs import BUNDLE, refuse_replacing
+from vlatool.files.writing import writing
+from vlatool.machine.host import cache_directory as cache_directory
+from vlatool.report import REPORT, Report, read_report
+from vlatool.stage._inside import measured_with as measured_with
+from vlatool.stage._inside import run_apart
+from vlatool.stage.base import Context, Measure, Stage, Transform
+
+
+def run_transform(
+    stage: Transform, source: Bundle | None, out: Path, context: Context, *, force: bool = False, damaged: bool = False
+) -> Bundle:
+    """Run a stage that makes a bundle; ``out`` appears whole or not at all.
+
+    A stage that runs a user's code does so in a child process.
+
+    Args:
+        stage: What runs.
+        source: Its input; None for a stage that starts a chain.
+        out: The new bundle.
+        context: Whom to tell.
+        force: Replace a directory that vlatool wrote.
+        damaged: See ``vlatool.files.writing.writing``.
+
+    Raises:
+        VlatoolError: what the stage raises, and OutputError when the output cannot be written.
+    """
+    if not damaged:
+        refuse_replacing(out, force=force, kind=BUNDLE)
+    stage.check(source, None)
+    with writing(out, force=force, damaged=damaged) as draft:
+        if stage.runs(source):
+            run_apart(stage, source, draft, context)
+        else:
+            stage.run(source, draft, context)
+    return Bundle.open(out, verify=False)
+
+
+def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
+    """Return where the output of a stage is kept."""
+    return cache / "stages" / f"{stage.name()}-{stage.key(source_hash)}"
+
+
+def is_cached(stage: Stage, source_hash: str, cache: Path) -> bool:
+    """Say whether the output of a stage is there."""
+    return cached_path(stage, source_hash, cache).is_dir()
+
+
+def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
+    """Return the stage's bundle from the cache, or run the stage into the cache."""
+    path = cached_path(stage, source.hash if source else "", cache)
+    if hold(path):
+        try:
+            return Bundle.open(path)
+        except BundleError:
+            context.tell(f"the cached {stage.name()} is damaged; making it again", None)
+    tag(cache)
+    made = run_transform(stage, source, path, context, damaged=True)
+    hold(path)
+    return made
+
+
+def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
+    """Return the stage's report from the cache, or measure (always, when ``fresh``) and keep it."""
+    path = cached_path(stage, source.hash, cache)
+    if path.is_dir() and not fresh:
+        try:
+            report = read_report(path)
+            with contextlib.suppress(OSError):  # a cache that may only be read
+                os.utime(path)
+            return report
+        except DataError:
+            context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
+    report = replace(stage.run(source, context), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    tag(cache)
+    with writing(path, damaged=True) as draft:
+        (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
+    return report

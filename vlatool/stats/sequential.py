@@ -1,0 +1,163 @@
+"""Is B slower than A by more than a margin? Decided from processes that each time both, in as few as suffice.
+
+Each process gives one log ratio. Two questions are asked of their Hodges-Lehmann centre at each look: does its lower
+bound exceed the margin (then the candidate is slower: fail), does its upper bound stay below it (pass)? Neither: more
+processes. The error probability is shared out over the looks (Bonferroni), and the bounds are those of the exact
+signed-rank distribution, so the stated error holds for any symmetric noise however few processes there are.
+
+Several statistics of the same processes (``jointly``) fail when one of them does and pass when all do. Between equal
+bundles each is symmetric, whatever it is: swapping the two turns its sign.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vlatool.stats.signed_rank import fewest, hodges_lehmann, lower_bound, upper_bound
+
+LOOKS = (10, 20, 40)
+ALPHA = 0.01
+"""Chance of a false verdict over all looks, on either side."""
+POWER = 0.95
+DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the processes say.
+
+    Args:
+        verdict: ``pass``, ``fail`` or ``inconclusive``.
+        ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
+        low, high: What it lies between, each bound at the error of one look.
+        margin: The largest slowdown that passes, a share.
+        processes: How many were measured.
+        spread: Standard deviation of the log ratios of single processes.
+        alpha: Chance of a false verdict of the look, on either side.
+    """
+
+    verdict: str
+    ratio: float
+    low: float
+    high: float
+    margin: float
+    processes: int
+    spread: float
+    alpha: float = ALPHA / 3
+
+    @property
+    def detectable(self) -> float:
+        """Slowdown, a share, that as many processes with this spread would fail with a chance of ``POWER``."""
+        return math.exp(math.log1p(self.margin) + reach(self.processes, self.alpha) * self.spread) - 1
+
+    @property
+    def wanted(self) -> int:
+        """Processes, all in all, that would decide if the centre is where it seems to be; 0 when it is decided.
+
+        None would do where the centre lies on the margin: then it is a million.
+        """
+        if self.verdict != "inconclusive":
+            return 0
+        gap = abs(math.log(self.ratio) - math.log1p(self.margin))
+        needed = reach(self.processes, self.alpha) * self.spread
+        most = 1_000_000
+        if not gap or not needed < gap * math.sqrt(most):
+            return most
+        return min(most, max(self.processes + 1, math.ceil(self.processes * (needed / gap) ** 2)))
+
+
+@functools.lru_cache(maxsize=32)
+def reach(processes: int, alpha: float) -> float:
+    """Return how many standard deviations of one process beyond the margin a slowdown is found with ``POWER``.
+
+    A shift of all differences shifts the bound alike, so it is a quantile of the bound on normal noise: of ``DRAWS``
+    draws, seeded. The spread is taken as known.
+    """
+    if processes < fewest(alpha):
+        return math.inf
+    noise = np.random.default_rng(0).normal(size=(DRAWS, processes))
+    return float(np.quantile([-lower_bound(each, alpha) for each in noise], POWER))
+
+
+def judged(log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(LOOKS), sharing: int = 1) -> Decision:
+    """Judge the processes that there are.
+
+    Args:
+        log_ratios: Of each process, natural logarithm of candidate over baseline.
+        margin: The largest slowdown that passes, a share above -1.
+        alpha: Chance of a false verdict of this look, on either side.
+        sharing: Statistics of which one alone makes a gate fail, while all of them must pass: they share the error of a
+            failure, and each may keep that of a pass.
+
+    Raises:
+        ValueError: when there is no ratio or one is not finite, or the margin is none.
+    """
+    if not margin > -1:
+        raise ValueError(f"the margin is {margin}; allowed: above -1")
+    low, high = lower_bound(log_ratios, alpha / sharing), upper_bound(log_ratios, alpha)
+    limit = math.log1p(margin)
+    verdict = "fail" if low > limit else "pass" if high < limit else "inconclusive"
+    count = len(log_ratios)
+    spread = float(np.std(log_ratios, ddof=1)) if count > 1 else math.nan
+    centre = hodges_lehmann(log_ratios)
+    return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread, alpha / sharing)
+
+
+def sequential(
+    measure: Callable[[int], float], margin: float, looks: Sequence[int] = LOOKS, alpha: float = ALPHA
+) -> tuple[Decision, list[float]]:
+    """Measure process after process until a look decides, or the last look is over.
+
+    Args:
+        measure: Called with the number of the process, from 0; returns its log ratio.
+        margin: The largest slowdown that passes, a share.
+        looks: After how many processes it is judged, ascending.
+        alpha: Chance of a false verdict over all looks, on either side.
+
+    Returns:
+        The decision, and the log ratio of every process.
+
+    Raises:
+        ValueError: when the looks do not ascend, or the first is too early to decide anything.
+    """
+    decisions, found = jointly(lambda number: (measure(number),), 1, margin, looks, alpha)
+    return decisions[0], [ratios[0] for ratios in found]
+
+
+def jointly(
+    measure: Callable[[int], Sequence[float]],
+    statistics: int,
+    margin: float,
+    looks: Sequence[int] = LOOKS,
+    alpha: float = ALPHA,
+) -> tuple[list[Decision], list[Sequence[float]]]:
+    """Judge several statistics of the same processes: it ends when one fails, or when all pass.
+
+    Args:
+        measure: As in ``sequential``, but returns a log ratio for each statistic.
+        statistics: How many.
+        margin, looks, alpha: As in ``sequential``.
+
+    Returns:
+        A decision for each statistic, and the log ratios of every process.
+
+    Raises:
+        ValueError: as ``sequential``.
+    """
+    least = fewest(alpha / statistics / len(looks)) if looks else 1
+    if not looks or list(looks) != sorted(set(looks)) or looks[0] < least:
+        raise ValueError(f"the looks are {tuple(looks)}; allowed: ascending numbers from {least}")
+    found: list[Sequence[float]] = []
+    for look in looks:
+        while len(found) < look:
+            found.append(measure(len(found)))
+        decisions = [judged(ratios, margin, alpha / len(looks), statistics) for ratios in zip(*found, strict=True)]
+        verdicts = {decision.verdict for decision in decisions}
+        if "fail" in verdicts or "inconclusive" not in verdicts:
+            break
+    return decisions, found

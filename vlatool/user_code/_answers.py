@@ -1,0 +1,128 @@
+"""What a child that runs a user's code says, checked before it is believed: that code can write what it likes.
+
+A policy shares its process with the function of vlatool that answers, and can answer in its place. It decides neither
+the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import signal
+import unicodedata
+from collections.abc import Mapping
+from typing import Any
+
+from vlatool import errors
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError
+from vlatool.files.json import parse_json
+
+ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
+"""Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
+
+
+def read(line: bytes, about: str) -> dict[str, Any]:
+    """Return one thing that a child says.
+
+    Raises:
+        SourceError: when it is none of those that ``vlatool.user_code._child`` says.
+    """
+    try:
+        found = parse_json(line)
+    except ValueError as error:
+        raise nonsense(about) from error
+    if not isinstance(found, dict) or not _makes_sense(found):
+        raise nonsense(about)
+    return found
+
+
+def _makes_sense(told: Mapping[str, Any]) -> bool:
+    match told:
+        case {"progress": [str(), None]} | {"warning": str()} | {"result": _} | {"memory": True}:
+            return True
+        case {"progress": [str(), int() | float() as share]}:
+            return math.isfinite(share)
+        case {"error": str(), "message": str(), "fix": str()} | {"raised": str(), "message": str(), "ours": bool()}:
+            return True
+        case {"errno": int(number), "message": str(), "file": None | str()}:
+            return number in errno.errorcode and number not in ENDINGS
+    return False
+
+
+def result(told: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
+    """Return the result that an answer holds, or raise what it says that was raised.
+
+    Args:
+        told: The answer.
+        about: Whose code the child runs.
+        own: The child runs vlatool's code alone: what fails in it is a bug of vlatool.
+
+    Raises:
+        InputError, MissingExtra: of the class that is named.
+        SourceError: for everything else that was raised; RuntimeError where ``own``.
+        OSError, MemoryError: what the child met.
+    """
+    if "result" in told:
+        return told["result"]
+    if "memory" in told:
+        raise MemoryError
+    message = plain(told["message"])
+    if "error" in told:
+        kind = getattr(errors, told["error"], None)
+        if isinstance(kind, type) and issubclass(kind, InputError | MissingExtra):
+            raise kind(told["message"], told["fix"])
+        name = f"{told['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
+        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}")
+    if "errno" in told:
+        raise OSError(told["errno"], message, told["file"])
+    name = plain(told["raised"])
+    if own:
+        raise RuntimeError(f"{about} failed in its process: {name}: {message}")
+    if told["ours"]:
+        raise SourceError(
+            f"{about}: the process that runs it failed: {name}: {message}.",
+            "VLATOOL_DEBUG=1 shows where; report it where that is in vlatool",
+        )
+    raise left(about, name, message)
+
+
+def nonsense(about: str) -> SourceError:
+    """Return the error for what no child of vlatool says."""
+    return SourceError(f"The process of the policy ({about}) answered nonsense.", "let it write to its own files alone")
+
+
+def plain(text: str) -> str:
+    """Return a text without what would steer a terminal."""
+    return "".join(each if unicodedata.category(each)[0] != "C" else " " for each in text).rstrip()
+
+
+def left(about: str, name: str, told: str) -> SourceError:
+    """Return the error for code that raises what is no ``Exception``."""
+    if name == "SystemExit":
+        return SourceError(f"{about} called sys.exit({told}).", "raise an exception that says what is wrong instead")
+    return SourceError(f"{about} raised {name}{told and ': '}{told}.", "raise an Exception that says what is wrong")
+
+
+def ended(status: bytes, about: str) -> BaseException:
+    """Return the error of a child that ended without an answer."""
+    text = status.decode("ascii", "replace").strip()
+    if not text.lstrip("-").isdigit():
+        return SourceError(f"{about}: the process that ran it was lost.", "run the command again")
+    code = int(text)
+    if code == -signal.SIGINT:
+        return KeyboardInterrupt()
+    if code >= 0:
+        return SourceError(
+            f"{about} ended its process with exit code {code} before it was done (os._exit, or a library's exit).",
+            "let it raise an exception that says what is wrong instead",
+        )
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    if code == -signal.SIGKILL:
+        return SourceError(
+            f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
+            "where memory ran out, use a machine with more of it",
+        )
+    return SourceError(f"{about} crashed its process ({name}) before it was done.", "look for a library that crashes")

@@ -1,0 +1,210 @@
+"""The other side of ``children``: ``python -m vlatool.user_code._child FD`` is the server that forks the children.
+
+The server imports what its children need once, and never runs a user's code itself. It ends with its parent, and each
+of its children with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import gc
+import importlib
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator
+from typing import IO, Any
+
+from vlatool.errors import VlatoolError
+from vlatool.files.printable import message_of
+from vlatool.machine.processes import die_with_parent
+from vlatool.user_code import trust
+from vlatool.user_code._answers import ENDINGS
+
+FDS = 3
+MESSAGE = 1 << 16
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def main() -> None:
+    """Serve until the parent is gone."""
+    control = socket.socket(fileno=int(sys.argv[1]))
+    for number in ENDING:  # they reach the children, too; the parent says what becomes of this process
+        signal.signal(number, signal.SIG_IGN)
+    woken, wake = os.pipe()
+    os.set_blocking(wake, False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+    children: dict[int, socket.socket] = {}
+    while True:
+        watched: list[Any] = [control, woken, *children.values()]
+        ready = select.select(watched, [], [])[0]
+        if woken in ready:
+            os.read(woken, MESSAGE)
+            _reap(children)
+        for pid, status in children.items():
+            if status in ready:  # whoever asked for it wants it no more
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        if control in ready:
+            message, fds, *_ = socket.recv_fds(control, MESSAGE, FDS)
+            if not message:
+                return
+            _start(json.loads(message), fds, children, [control.fileno(), woken, wake])
+
+
+def _reap(children: dict[int, socket.socket]) -> None:
+    """Say of each child that has ended how it did."""
+    with contextlib.suppress(ChildProcessError):
+        while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+            status = children.pop(ended[0], None)
+            if status is not None:
+                with contextlib.suppress(OSError):
+                    status.sendall(f"{os.waitstatus_to_exitcode(ended[1])}\n".encode())
+                status.close()
+
+
+def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket], own: list[int]) -> None:
+    for name in preload:
+        with contextlib.suppress(Exception):  # the child meets it again, and says it
+            importlib.import_module(name)
+    gc.collect()
+    gc.freeze()
+    talk, output, status = fds
+    server = os.getpid()
+    pid = os.fork()
+    if pid:
+        children[pid] = socket.socket(fileno=status)
+        os.close(talk)
+        os.close(output)
+        return
+    code = 1
+    try:
+        die_with_parent()
+        if os.getppid() == server:
+            for fd in (status, *own, *(each.fileno() for each in children.values())):
+                os.close(fd)
+            _stand_alone(output)
+            code = _converse(socket.socket(fileno=talk))
+    finally:
+        os._exit(code)
+
+
+def _stand_alone(output: int) -> None:
+    """Undo what the server set up, and send whatever is printed to the parent's pipe."""
+    signal.set_wakeup_fd(-1)
+    for number in (*ENDING, signal.SIGCHLD):
+        signal.signal(number, signal.SIG_DFL)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    for fd, target in ((nothing, 0), (output, 1), (output, 2)):
+        os.dup2(fd, target)
+    os.close(nothing)
+    os.close(output)
+    sys.stdout = os.fdopen(1, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, encoding="utf-8", errors="replace", closefd=False)
+
+
+def _converse(talk: socket.socket) -> int:
+    """Answer request after request until there are no more."""
+    requests, answers = talk.makefile("r", encoding="utf-8"), talk.makefile("w", encoding="utf-8")
+    _settle(json.loads(requests.readline()))
+    for line in requests:
+        request = json.loads(line)
+        with _warnings_told(answers):
+            answer = _answered(request, answers)
+        _flush()
+        _say(answers, answer)
+    return 0
+
+
+def _settle(told: dict[str, Any]) -> None:
+    """Be where the parent is: directory, variables, modules, processors."""
+    os.chdir(told["folder"])
+    os.environ.clear()
+    os.environ.update(told["environment"])
+    sys.path[:] = told["path"]
+    with contextlib.suppress(OSError):
+        os.sched_setaffinity(0, told["processors"])
+    trust.restore(told["named"])
+    if "numpy" in sys.modules:  # or all children would draw the same numbers
+        sys.modules["numpy"].random.seed()
+
+
+def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
+    """Call what is asked for; return its result, or what came instead."""
+
+    def tell(what: str, share: float | None) -> None:
+        _say(answers, {"progress": [what, share]})
+
+    try:
+        return {"result": _function(request["call"])(request["job"], tell)}
+    except VlatoolError as error:
+        return {"error": type(error).__name__, "message": str(error.message), "fix": str(error.fix)}
+    except MemoryError:
+        return {"memory": True}
+    except OSError as error:
+        if error.errno not in errno.errorcode or error.errno in ENDINGS:
+            return _raised(error)
+        named = None if error.filename is None else str(error.filename)
+        return {"errno": error.errno, "message": str(error.strerror), "file": named}
+    except BaseException as error:  # the seam: a user's code may raise anything
+        return _raised(error)
+
+
+def _raised(error: BaseException) -> dict[str, Any]:
+    if os.environ.get("VLATOOL_DEBUG"):
+        traceback.print_exc()
+    told = message_of(error).strip().splitlines()
+    return {"raised": type(error).__name__, "message": told[0] if told else "", "ours": isinstance(error, Exception)}
+
+
+def _function(name: str) -> Callable[..., Any]:
+    """Return a function of vlatool by ``module:name``."""
+    module, _, function = name.partition(":")
+    if not module.startswith("vlatool."):
+        raise ValueError(f"{name} is no function of vlatool")
+    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return found
+
+
+@contextlib.contextmanager
+def _warnings_told(answers: IO[str]) -> Iterator[None]:
+    """Hand warnings for a person on to the parent, who shows each once."""
+    before = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, UserWarning):
+            _say(answers, {"warning": str(message)})
+        else:
+            before(message, category, *where, **more)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
+
+
+def _flush() -> None:
+    """Let what was printed arrive before the answer does."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):
+            stream.flush()
+    with contextlib.suppress(Exception):
+        ctypes.CDLL(None).fflush(None)
+
+
+def _say(answers: IO[str], line: dict[str, Any]) -> None:
+    answers.write(json.dumps(line) + "\n")
+    answers.flush()
+
+
+if __name__ == "__main__":
+    main()

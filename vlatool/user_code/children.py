@@ -1,0 +1,300 @@
+"""Call functions of vlatool that run a user's code, in child processes that this process survives.
+
+A policy or an environment may leave (``sys.exit``), crash, print, change the directory, signal handlers and variables:
+it does so in a child, which a server forks that has imported the libraries once. What is printed is shown on standard
+error; an answer that does not come is an error that says how the child ended.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
+from typing import Any
+
+from vlatool.errors import SourceError
+from vlatool.machine.host import MAX_CPU_ISA
+from vlatool.machine.processes import SINGLE, import_path, python_command
+from vlatool.user_code import trust
+from vlatool.user_code._answers import ended, plain, read, result
+from vlatool.user_code._answers import left as left
+
+Tell = Callable[[str, float | None], None]
+LONGEST_ANSWER = 1 << 28
+"""Bytes of one line of an answer."""
+SHOWN_LINES, SHOWN_CHARACTERS = 200, 400
+"""Of what a child prints."""
+PATIENCE_S = 5.0
+BLOCK = 1 << 16
+
+
+class _Server:
+    """The process that forks the children."""
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            quiet = subprocess.DEVNULL
+            self.process = subprocess.Popen(
+                python_command("vlatool.user_code._child", (str(theirs.fileno()),)),
+                stdin=quiet, stdout=quiet, stderr=quiet, pass_fds=[theirs.fileno()], env=dict(environment),
+            )  # fmt: skip
+
+    def fork(self, preload: Sequence[str], fds: list[int]) -> None:
+        """Fork a child that gets these descriptors."""
+        socket.send_fds(self.control, [json.dumps(list(preload)).encode()], fds)
+
+    def stop(self) -> None:
+        """End the server and with it all children."""
+        self.control.close()
+        try:
+            self.process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+_servers: dict[tuple[str, ...], _Server] = {}
+_lock = threading.Lock()
+
+
+def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, str]) -> None:
+    """Fork a child; start a server when there is none, when it has died, or when its libraries were loaded otherwise.
+
+    Some variables are read when a library is loaded, as the number of threads and the instruction set are.
+    """
+    kind = (str(os.getpid()), *(environment.get(name, "") for name in (*SINGLE, MAX_CPU_ISA)))
+    with _lock:
+        if kind in _servers:
+            with contextlib.suppress(OSError):
+                _servers[kind].fork(preload, fds)
+                return
+            _servers.pop(kind).stop()
+        _servers[kind] = _Server(environment)
+        _servers[kind].fork(preload, fds)
+
+
+@atexit.register
+def _stop() -> None:
+    with contextlib.suppress(ValueError):  # Ctrl-C once more: the process ends already
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for kind, server in _servers.items():
+        if kind[0] == str(os.getpid()):
+            server.stop()
+
+
+class Apart:
+    """A child process that answers calls one after the other; what a call leaves in it, the next one finds.
+
+    Args:
+        about: Whose code it runs, for messages: ``policy.py``.
+        preload: Modules that the server imports before it forks.
+        environment: Variables that it has beside those of this process.
+    """
+
+    def __init__(self, about: str, preload: Sequence[str] = (), environment: Mapping[str, str] | None = None) -> None:
+        self.about = about
+        self._talk, talk = socket.socketpair()
+        self._status, status = socket.socketpair()
+        self._output, output = os.pipe()
+        self._open: list[Any] = [self._talk, self._output, self._status]
+        self._said = _Said(about)
+        self._received = b""
+        variables = {**os.environ, **(environment or {})}
+        try:
+            _forked(preload, [talk.fileno(), output, status.fileno()], variables)
+        finally:
+            talk.close()
+            status.close()
+            os.close(output)
+        hello = {
+            "folder": os.getcwd(), "environment": variables, "path": import_path(),
+            "processors": sorted(os.sched_getaffinity(0)), "named": trust.named_so_far(),
+        }  # fmt: skip
+        self._send(hello)
+
+    def __enter__(self) -> Apart:
+        return self
+
+    def __exit__(self, kind: object, *_exception: object) -> None:
+        if kind is None:  # it has nothing left to do, and ends by itself
+            self._talk.shutdown(socket.SHUT_WR)
+            select.select([self._status], [], [], PATIENCE_S)
+            self._print(last=True)
+        self.end()
+        for each in (self._talk, self._status):
+            each.close()
+        os.close(self._output)
+
+    def end(self) -> None:
+        """End the child, from any thread; a call that waits for it ends too."""
+        for each in (self._talk, self._status):
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+    def call(self, function: str, job: Mapping[str, Any], tell: Tell, *, own: bool = False) -> Any:
+        """Call ``module:function`` of vlatool with a job and ``tell``; return its result. All are JSON values.
+
+        Args:
+            function: What is called, with ``job`` and ``tell``.
+            job: Its argument.
+            tell: Gets the child's progress.
+            own: It runs vlatool's code alone, and a policy's in children of its own.
+
+        Raises:
+            VlatoolError: what it raises, of the same class; SourceError when the child ends without an answer.
+            RuntimeError: where ``own``, for a bug of vlatool.
+            OSError, MemoryError: what it meets.
+            KeyboardInterrupt: when Ctrl-C ended the child.
+        """
+        self._send({"call": function, "job": dict(job)})
+        while True:
+            for line in self._lines():
+                if "progress" in line:
+                    tell(plain(line["progress"][0]), line["progress"][1])
+                elif "warning" in line:
+                    warnings.warn(str(line["warning"]), UserWarning, stacklevel=2)
+                else:
+                    self._print()
+                    return result(line, self.about, own=own)
+
+    def _send(self, line: Mapping[str, Any]) -> None:
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # how it ended is found by reading
+            self._talk.sendall(json.dumps(line).encode() + b"\n")
+
+    def _lines(self) -> list[dict[str, Any]]:
+        """Wait for the child; return what it says, and show what it prints."""
+        ready = select.select(self._open, [], [], None if self._talk in self._open else PATIENCE_S)[0]
+        if self._output in ready:
+            self._print()
+        if self._talk in ready:
+            self._receive()
+        *whole, self._received = self._received.split(b"\n")
+        if whole:
+            return [read(line, self.about) for line in whole]
+        if self._status in ready and not (self._talk in self._open and self._receive()):
+            self._print(last=True)
+            raise ended(_received(self._status), self.about)
+        if not ready:
+            raise SourceError(f"{self.about} closed what its process answers with.", "let it close its own files alone")
+        return []
+
+    def _receive(self) -> bool:
+        """Read what the child says; say whether there was anything."""
+        try:
+            more = self._talk.recv(BLOCK, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except ConnectionResetError:
+            more = b""
+        if not more:
+            self._open.remove(self._talk)
+        self._received += more
+        if len(self._received) > LONGEST_ANSWER:
+            raise SourceError(f"{self.about}: the process that runs it answers more than {LONGEST_ANSWER:,} bytes.")
+        return bool(more)
+
+    def _print(self, last: bool = False) -> None:
+        """Show what the child has printed."""
+        while self._output in self._open and select.select([self._output], [], [], 0)[0]:
+            printed = os.read(self._output, BLOCK)
+            if not printed:
+                self._open.remove(self._output)
+            self._said.take(printed)
+        if last:
+            self._said.take(b"\n")
+
+
+def call(
+    function: str,
+    job: Mapping[str, Any],
+    tell: Tell,
+    about: str,
+    preload: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+    *,
+    own: bool = False,
+) -> Any:
+    """Call a function in a child of its own; see ``Apart`` and ``Apart.call``."""
+    with Apart(about, preload, environment) as child:
+        return child.call(function, job, tell, own=own)
+
+
+def spread(
+    function: str,
+    jobs: Sequence[Mapping[str, Any]],
+    processes: int,
+    tell: Tell,
+    about: str,
+    preload: Sequence[str] = (),
+    last: str = "",
+) -> Generator[Any, None, None]:
+    """Yield the result of every job, in order, computed in several children; close the iterator to end them.
+
+    Args:
+        last: Called in every child when all is done, with an empty job.
+    """  # fmt: skip
+    idle: SimpleQueue[Apart] = SimpleQueue()
+
+    def run(job: Mapping[str, Any]) -> Any:
+        child = idle.get()
+        try:
+            return child.call(function, job, tell)
+        finally:
+            idle.put(child)
+
+    with contextlib.ExitStack() as opened, ThreadPoolExecutor(processes) as threads:
+        children = [opened.enter_context(Apart(about, preload)) for _ in range(max(1, min(processes, len(jobs))))]
+        for each in children:
+            idle.put(each)
+        try:
+            yield from threads.map(run, jobs)
+            for each in children if last else ():
+                each.call(last, {}, tell)
+        except BaseException:  # Ctrl-C too: what runs ends
+            threads.shutdown(wait=False, cancel_futures=True)
+            for each in children:
+                each.end()
+            raise
+
+
+class _Said:
+    """What a child prints, shown on standard error as the policy's, a limited number of lines."""
+
+    def __init__(self, about: str) -> None:
+        self._about, self._rest, self._shown = about, b"", 0
+
+    def take(self, printed: bytes) -> None:
+        *lines, self._rest = (self._rest + printed).split(b"\n")
+        if len(self._rest) > BLOCK:
+            lines, self._rest = [*lines, self._rest], b""
+        for line in lines:
+            self._show(plain(line.decode("utf-8", "replace"))[:SHOWN_CHARACTERS])
+
+    def _show(self, line: str) -> None:
+        if not line.strip() or self._shown > SHOWN_LINES:
+            return
+        self._shown += 1
+        told = f"[{self._about}] {line}" if self._shown <= SHOWN_LINES else f"[{self._about}] prints more; not shown"
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            sys.stderr.write(told + "\n")
+            sys.stderr.flush()
+
+
+def _received(stream: socket.socket) -> bytes:
+    """Return what there is to read, nothing at the end."""
+    try:
+        return stream.recv(BLOCK, socket.MSG_DONTWAIT)
+    except (BlockingIOError, ConnectionResetError):
+        return b""

@@ -1,0 +1,202 @@
+"""Whose code may run: that of the folders which the user named in this command, or trusted before.
+
+A bundle is data: nothing that its files say makes code run. What a stage needs of a policy's code is in the folder
+that the bundle notes; it runs when the user named that folder (SOURCE, ``--policy``, ``--environment``), or trusted it
+with ``--trust DIR``, as long as nothing in it has changed since.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.bundle import hash_file
+from vlatool.errors import OutputError, SourceError, UsageError
+
+PLACE = "VLATOOL_TRUST"
+SCHEMA = 1
+DATA = (".safetensors", ".npz", ".npy", ".onnx", ".png", ".jpg", ".mp4")
+"""Endings of files that hold no code, whatever reads them."""
+HISTORY = ".git"
+CACHE = "__pycache__"
+"""Where Python keeps ``module.TAG.pyc``: the policy's code is not read from there (``sources/_fresh.py``)."""
+MOST_FILES = 20_000
+SMALLER = "name a smaller directory"
+
+
+@dataclass(frozen=True)
+class Named:
+    """A folder whose code may run.
+
+    Args:
+        folder: Absolute, links resolved.
+        description: Its ``policy.yaml``, however it is called; empty for the usual name.
+        factory: ``path.py:make`` where the user named one; empty for the one in the description.
+        remembered: Trusted before, by the hash of what is in the folder, and not named now.
+    """
+
+    folder: str
+    description: str = ""
+    factory: str = ""
+    remembered: bool = False
+
+
+_named: dict[str, Named] = {}
+
+
+def name(folder: Path, description: Path | None = None, factory: str = "") -> None:
+    """Note that the user named a folder: code in it may run in this process."""
+    where = str(folder.resolve())
+    _named[where] = Named(where, str(description.resolve()) if description else "", factory)
+
+
+def is_named(folder: Path) -> bool:
+    """Say whether the user named a folder in this command."""
+    return str(folder.resolve()) in _named
+
+
+def named_so_far() -> list[list[Any]]:
+    """Return what was named, as JSON values for a child process."""
+    return [list(astuple(each)) for each in _named.values()]
+
+
+def restore(named: Sequence[Sequence[Any]]) -> None:
+    """Take over what the parent process was told."""
+    _named.clear()
+    _named.update({each[0]: Named(*each) for each in named})
+
+
+@contextlib.contextmanager
+def nothing_named() -> Iterator[None]:
+    """Begin a command: what an earlier one named in this process does not count for it."""
+    before = named_so_far()
+    restore(())
+    try:
+        yield
+    finally:
+        restore(before)
+
+
+def require(folder: Path, runs: str) -> Named:
+    """Return how a folder was named.
+
+    Args:
+        folder: Whose code would run.
+        runs: What would run: ``make() of policy.py``.
+
+    Raises:
+        SourceError: when the folder was neither named nor trusted, or has changed since it was trusted.
+    """
+    where = str(folder.resolve())
+    if where in _named:
+        return _named[where]
+    trusted = _read().get(where)
+    if trusted is not None and trusted == content(folder):
+        return Named(where, remembered=True)
+    why = "which you did not name" if trusted is None else "which has changed since you trusted it"
+    raise SourceError(
+        f"This would run {runs} in {where}, {why}.",
+        f"look at what is in it; to allow it, run the command again with --trust {where}",
+    )
+
+
+def trust(folder: Path) -> None:
+    """Remember that the code in a folder, as it is now, may run.
+
+    Raises:
+        UsageError: when it is no folder, or holds too much.
+        OutputError: when it cannot be remembered.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"--trust {folder} is no directory.", "name the directory of a policy")
+    trusted = {**_read(), str(folder.resolve()): content(folder)}
+    file = place()
+    draft = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as stream:
+            json.dump({"schema": SCHEMA, "trusted": trusted}, stream, indent=1)
+        draft.replace(file)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        raise OutputError(f"{file} cannot be written: {error.strerror}.", f"name another file: {PLACE}=FILE") from error
+
+
+def place() -> Path:
+    """Return the file of what is trusted: ``$VLATOOL_TRUST``, or ``vlatool/trusted.json`` among the user's settings."""
+    if told := os.environ.get(PLACE):
+        return Path(told)
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "vlatool" / "trusted.json"
+
+
+def content(folder: Path) -> str:
+    """Return the hash of all files of a folder that could hold code: names and bytes; links are followed.
+
+    Raises:
+        UsageError: when there are too many, or one cannot be read.
+    """
+    found = hashlib.sha256()
+    for count, (name, path) in enumerate(_files(folder)):
+        if count >= MOST_FILES:
+            raise UsageError(
+                f"{folder} has more than {MOST_FILES:,} files, too many to trust.",
+                f"{SMALLER}; installed packages (.venv, node_modules) and data belong elsewhere",
+            )
+        try:
+            found.update(json.dumps([name, hash_file(path) if isinstance(path, Path) else f"is {path}"]).encode())
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER) from error
+    return f"sha256:{found.hexdigest()}"
+
+
+def _files(folder: Path) -> Iterator[tuple[str, Path | str]]:
+    """Yield name and path of each file; for a directory that was seen before, the name under which it was."""
+    seen: dict[tuple[int, int], str] = {}
+
+    def unreadable(error: OSError) -> None:
+        raise UsageError(f"{error.filename} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER)
+
+    for root, folders, names in os.walk(folder, followlinks=True, onerror=unreadable):
+        here = Path(root).relative_to(folder)
+        about = os.stat(root)
+        first = seen.setdefault((about.st_dev, about.st_ino), here.as_posix())
+        if first != here.as_posix():
+            folders[:] = []
+            yield here.as_posix(), first
+            continue
+        folders[:] = sorted(set(folders) - {HISTORY})
+        for name in sorted(names):
+            path = Path(root, name)
+            cached = here.name == CACHE and name.endswith(".pyc") and name.count(".") > 1
+            if not cached and path.suffix not in DATA and path.is_file():
+                yield (here / name).as_posix(), path
+
+
+def _read() -> dict[str, str]:
+    """Return folder -> content hash of what is trusted.
+
+    Raises:
+        SourceError: when somebody else may write the file, or it makes no sense.
+    """
+    file = place()
+    try:
+        with file.open(encoding="utf-8") as stream:
+            about = os.fstat(stream.fileno())
+            found = json.load(stream)
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{file} cannot be read: {error}.", "remove it, and trust again with --trust DIR") from error
+    if about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise SourceError(f"{file} can be written by others.", f"remove it, or: chmod 600 {file}")
+    trusted = found.get("trusted") if isinstance(found, dict) and found.get("schema") == SCHEMA else None
+    if not isinstance(trusted, dict) or not all(isinstance(each, str) for each in trusted.values()):
+        raise SourceError(f"{file} makes no sense.", "remove it, and trust again with --trust DIR")
+    return trusted

@@ -1,0 +1,50 @@
+"""One observation of a comparison, and how far two actions are apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.runtime.policy import Policy
+
+Array = NDArray[Any]
+LARGEST = 1e9
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One observation and what both sides made of it.
+
+    Args:
+        number: Its place in the recording.
+        observation: Physical values.
+        noise: What both were given in the place of noise of their own.
+        encoded: What this policy's network takes, with a batch axis.
+        raw: What its network gives.
+        chunk: Its action: (T, A) float64, or (T,) int64.
+        wanted: The original's, the same, as many leading steps as it gives.
+        inputs: What the original's network takes, as far as it tells it.
+        wanted_raw: What that gives, None when it does not tell it.
+        error: Relative error of the action.
+    """
+
+    number: int
+    observation: dict[str, Any]
+    noise: dict[str, Array]
+    encoded: dict[str, Array]
+    raw: Array
+    chunk: Array
+    wanted: Array
+    inputs: dict[str, Array] = field(default_factory=dict)
+    wanted_raw: Array | None = None
+    error: float = 0.0
+
+
+def error_of(policy: Policy, got: Array, wanted: Array) -> float:
+    """Return the relative error of an action: by the spread of each element; the share of others where discrete."""
+    if policy.spec.action.kind == "discrete":
+        return float(np.mean(got != wanted))
+    return min(policy.chunk_error(got, wanted), LARGEST)
