@@ -22,7 +22,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.runtime import Policy, load
-from vlatool.runtime.policy import DEFAULT_ENGINE
+from vlatool.runtime.engine import DEFAULT_ENGINE
 
 ANY = 1e300
 """A golden tolerance that every action keeps to."""

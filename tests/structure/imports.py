@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,3 +111,29 @@ def _components(arrows: dict[str, set[str]]) -> list[list[str]]:
         if name not in index:
             visit(name)
     return groups
+
+
+def named_libraries(libraries: Collection[str], root: Path = ROOT, engines: str = "runtime/engines/") -> list[str]:
+    """Return where an inference library is imported or asked for, outside of the engines: ``file:line``.
+
+    That is an import statement, or a call of a function with the library's name as its first argument, such as
+    ``require("openvino", ...)`` or ``importlib.import_module``; a method that needs no import, such as ``dict.get``,
+    counts as well.
+    """
+    found = []
+    for path in modules(root).values():
+        if engines not in path.as_posix():
+            place, nodes = path.relative_to(root).as_posix(), ast.walk(ast.parse(path.read_bytes()))
+            asking = (node for node in nodes if any(name.partition(".")[0] in libraries for name in _asked_for(node)))
+            found += [f"{place}:{node.lineno}" for node in asking]  # type: ignore[attr-defined]
+    return found
+
+
+def _asked_for(node: ast.AST) -> list[str]:
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.ImportFrom):
+        return [node.module or ""]
+    if isinstance(node, ast.Call) and node.args and isinstance(first := node.args[0], ast.Constant):
+        return [str(first.value)]
+    return []

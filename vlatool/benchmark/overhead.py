@@ -15,6 +15,7 @@ from vlatool.data import observations_for
 from vlatool.errors import UsageError
 from vlatool.machine.host import fingerprint
 from vlatool.report import Measurement, Report, Row
+from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import draw
 from vlatool.stage.base import Context, Measure
@@ -46,7 +47,7 @@ class Overhead(Measure):
                 "The overhead is measured on a policy of one graph that runs once for each inference.",
                 "vlatool benchmark latency measures all of what infer() does, the program of several graphs included",
             )
-        if source is not None and source.manifest.engine not in ("", "ort_cpu"):
+        if source is not None and source.manifest.engine not in ("", DEFAULT_ENGINE):
             raise UsageError(
                 f"The overhead is measured on ONNX Runtime; the bundle is for {source.manifest.engine}.",
                 "make the bundle with --layout ort, or measure it with vlatool benchmark latency",

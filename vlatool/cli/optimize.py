@@ -16,6 +16,7 @@ from vlatool.cli._plan import plan_document
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.report import REPORT
+from vlatool.runtime.engine import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from vlatool.optimize.pipeline import Plan
@@ -91,7 +92,9 @@ def optimize(
     asked |= {"accept": tuple(accept)} if accept else {}
     if recipe is None:
         calibrated = brings_calibration(source)
-        chosen = default_recipe(Limits(**asked), Effort(**effort), calibrated, board.engine if board else "ort_cpu")
+        chosen = default_recipe(
+            Limits(**asked), Effort(**effort), calibrated, board.engine if board else DEFAULT_ENGINE
+        )
     else:
         read = read_recipe(recipe)
         update = {"limits": read.limits.model_copy(update=asked), "effort": read.effort.model_copy(update=effort)}

@@ -14,11 +14,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-from vlatool import registry
-from vlatool.errors import MissingExtra, VlatoolError, require
+from vlatool.errors import MissingExtra, VlatoolError
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
-from vlatool.runtime.policy import DEFAULT_ENGINE
+from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, engine_class, engine_names
 from vlatool.telemetry.rapl import UDEV_RULE
 
 Status = Literal["ok", "warn", "missing"]
@@ -29,16 +28,10 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "openvino": ("openvino",),
     "sim": ("gymnasium", "minigrid"),
     "metaworld": ("metaworld", "mujoco"),
-    "data": ("h5py", "pyarrow", "av"),
-    "serve": ("websockets", "msgpack"),
-    "search": ("optuna",),
     "text": ("tokenizers",),
     "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
 }
 """Extra -> the distributions that it brings, as in ``pyproject.toml``."""
-SUBSTITUTES = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-openvino")}
-IGNORED_PROVIDERS = ("AzureExecutionProvider",)
-"""ONNX Runtime lists it beside the processor in every build; it runs nothing on this machine."""
 PYTHON = (3, 10)
 FREE_GB = 5.0
 """Below this a build (export, several candidates, reports) of a 0.5 GB policy runs out of disk."""
@@ -69,10 +62,10 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
         >>> [check.name for check in diagnose()][0]
         'python'
     """
-    installed = host.versions({*chain(*EXTRAS.values(), *SUBSTITUTES.values())})
+    installed = host.versions({*chain(*EXTRAS.values(), *_substitutes().values())})
     return [
         python_version(),
-        *engines(installed, host.board(root), providers),
+        *engines(installed, host.board(root), lambda library: library.execution_providers()),
         *arithmetic(),
         *extras(installed),
         instruction_set(host.isa(root)),
@@ -94,49 +87,43 @@ def python_version(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
     return Check("python", "ok", f"Python {said}")
 
 
-def providers() -> list[str]:
-    """Execution providers of the installed ONNX Runtime, without those that run nothing here.
-
-    Raises:
-        MissingExtra: when onnxruntime cannot be imported.
-    """
-    found = require("onnxruntime", "ort").get_available_providers()
-    return [str(name) for name in found if name not in IGNORED_PROVIDERS]
-
-
-def engines(installed: Mapping[str, str], board: str | None, ask: Callable[[], list[str]]) -> Iterator[Check]:
-    """The inference libraries with their version and, for ONNX Runtime, what they run on."""
-    runtime = _present("onnxruntime", installed)
-    if runtime is None:
-        yield Check("engine onnxruntime", "missing", "not installed", "pip install 'vlatool[ort]'")
-    else:
-        yield _onnxruntime(f"{runtime} {installed[runtime]}", board, ask)
-    if version := installed.get("openvino"):
-        yield Check("engine openvino", "ok", f"openvino {version}")
-    else:
-        fix = "" if board and "jetson" in board.lower() else "pip install 'vlatool[openvino]' (fastest on Intel)"
-        yield Check("engine openvino", "missing", "not installed", fix)
+def engines(
+    installed: Mapping[str, str], board: str | None, ask: Callable[[type[Engine]], list[str]]
+) -> Iterator[Check]:
+    """The inference libraries with their version and, where they say so, what they run on."""
+    jetson = bool(board and "jetson" in board.lower())
+    for name in engine_names():
+        library: type[Engine] = engine_class(name)
+        title = f"engine {library.package}"
+        found = next((each for each in (library.package, *library.substitutes) if each in installed), None)
+        if found is not None:
+            yield _engine(title, f"{found} {installed[found]}", library, jetson, ask)
+            continue
+        advice = f" ({library.advice})" if library.advice else ""
+        fix = "" if jetson and advice else f"pip install 'vlatool[{library.extra}]'{advice}"
+        yield Check(title, "missing", "not installed", fix)
 
 
-def _onnxruntime(title: str, board: str | None, ask: Callable[[], list[str]]) -> Check:
+def _engine(
+    title: str, words: str, library: type[Engine], jetson: bool, ask: Callable[[type[Engine]], list[str]]
+) -> Check:
     try:
-        found = ask()
+        found = ask(library)
     except MissingExtra as error:
-        return Check("engine onnxruntime", "warn", f"{title} is installed, but cannot be imported", error.fix)
+        return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
     short = [name.removesuffix("ExecutionProvider") for name in found]
-    finding = f"{title}: {', '.join(short) or 'no provider'}"
-    if board and "jetson" in board.lower() and not {"CUDA", "Tensorrt"} & {*short}:
+    finding = f"{words}: {', '.join(short)}" if short else words
+    if short and jetson and not {"CUDA", "Tensorrt"} & {*short}:
         fix = "install the onnxruntime-gpu wheel of NVIDIA's Jetson index for your JetPack; the plain wheel has no GPU"
-        return Check("engine onnxruntime", "warn", f"{finding}; this board's GPU stays idle", fix)
-    return Check("engine onnxruntime", "ok", finding)
+        return Check(title, "warn", f"{finding}; this board's GPU stays idle", fix)
+    return Check(title, "ok", finding)
 
 
 def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
-    for name in registry.names("engines"):
+    for name in engine_names():
         try:
-            engine: Any = registry.load("engines", name)
-            found = str(engine.arithmetic())
+            found = str(engine_class(name).arithmetic())
         except VlatoolError:
             continue
         title = f"int8 {name}"
@@ -165,7 +152,12 @@ def extras(installed: Mapping[str, str]) -> Iterator[Check]:
 
 def _present(name: str, installed: Mapping[str, str]) -> str | None:
     """The distribution that provides ``name``, or None."""
-    return next((found for found in (name, *SUBSTITUTES.get(name, ())) if found in installed), None)
+    return next((found for found in (name, *_substitutes().get(name, ())) if found in installed), None)
+
+
+def _substitutes() -> dict[str, tuple[str, ...]]:
+    """Package of an engine -> the distributions that bring it, too."""
+    return {library.package: library.substitutes for library in map(engine_class, engine_names())}
 
 
 def instruction_set(features: Sequence[str] | None) -> Check:

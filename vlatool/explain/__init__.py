@@ -30,7 +30,7 @@ from vlatool.graph.workload import workload
 from vlatool.machine.host import fingerprint
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.report import Report, Row
-from vlatool.runtime.policy import DEFAULT_ENGINE
+from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.sensitivity.layers import LayerError, ranges_of, sensitivities
 from vlatool.stage.base import Context
 

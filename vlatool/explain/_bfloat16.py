@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.graph.files import load, part_phases, save
 from vlatool.graph.phase import PERIODIC, cut_phases
-from vlatool.runtime.engines.openvino import OpenvinoSession
+from vlatool.runtime.engine import computing, engine_class
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, Session
 from vlatool.stage.base import Context
@@ -134,13 +134,15 @@ def _actions(
 ) -> list[Any]:
     """Return the raw actions with some graphs read from elsewhere or computed in another dtype."""
     manifest = bundle.manifest
+    engine = computing("bfloat16")
+    library = engine_class(engine)
     sessions: dict[str, Session] = {}
     for name, graph in manifest.graphs.items():
         path = replaced.get(name) or bundle.file(graph.file)
-        sessions[name] = OpenvinoSession(path, 1, computes.get(name, graph.compute))
+        sessions[name] = library(path, 1, computes.get(name, graph.compute))
     for name, path in replaced.items():
-        sessions.setdefault(name, OpenvinoSession(path, 1, ""))
-    policy = Policy(bundle, Program(program or manifest.program, sessions, seed=0), "openvino")
+        sessions.setdefault(name, library(path, 1, ""))
+    policy = Policy(bundle, Program(program or manifest.program, sessions, seed=0), engine)
     found = []
     for observation in observations:
         policy.reset()

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.explain._operators import FLOAT32, INT8, MOVES, Operator
+from vlatool.explain._operators import Operator
+from vlatool.runtime.engine import FLOAT32, MOVES, Engine, engine_class
 
 QUANTIZERS = ("QuantizeLinear", "DynamicQuantizeLinear")
 COMPUTING = ("MatMul", "Gemm", "Conv", "ConvTranspose", "Einsum", "Attention")
 INTEGER = ("MatMulIntegerToFloat", "MatMulInteger", "ConvInteger", "DynamicQuantizeMatMul")
-X86 = ("x86_64", "AMD64")
 LONGEST = 4
 """Operators between a DequantizeLinear and the next QuantizeLinear that still count as one island."""
 
@@ -158,7 +157,7 @@ def fallbacks(graph: QuantizedGraph, operators: Sequence[Operator], engine: str)
     """Return the int8 layers of a file that the engine did not run as fast int8 kernels, the dearest first."""
     own = [each for each in operators if each.graph == graph.name]
     found = [*_in_float(graph, own), *_weights(graph, own)]
-    found += _openvino(graph, own) if engine == "openvino" else _slow_signs(graph, own)
+    found += _slow(graph, own, engine_class(engine))
     return sorted(found, key=lambda each: -each.ms)
 
 
@@ -190,28 +189,8 @@ def _weights(graph: QuantizedGraph, operators: Sequence[Operator]) -> list[Fallb
     return found
 
 
-def _slow_signs(graph: QuantizedGraph, operators: Sequence[Operator]) -> list[Fallback]:
-    """Find products of two signed operands, for which x86 has no fast instruction before AVX-VNNI-INT8."""
-    if platform.machine() not in X86:
-        return []
-    why = "int8 x int8 on x86: ONNX Runtime's fast kernel takes uint8 x int8 (activations: uint8)"
-    return [
-        Fallback(graph.name, each.name, why, each.ms)
-        for each in operators
-        if each.kind.startswith(("MatMulInteger", "QLinearMatMul", "QGemm")) and each.kernel.startswith("int8")
-    ]
-
-
-def _openvino(graph: QuantizedGraph, operators: Sequence[Operator]) -> list[Fallback]:
-    """Find reference kernels, and zero points that keep FullyConnected off its symmetric path."""
-    found = [
-        Fallback(graph.name, each.name, f"runs as the reference kernel {each.kernel}", each.ms)
-        for each in operators
-        if each.product and each.kernel.startswith("ref")
-    ]
-    zero = graph.asymmetric()
-    if zero:
-        slow = [each for each in operators if each.kind == "FullyConnected" and each.precision == INT8]
-        why = f"activations with zero points ({len(zero)} in the graph): not the symmetric path (activations: auto)"
-        found += [Fallback(graph.name, each.name, why, each.ms) for each in slow]
-    return found
+def _slow(graph: QuantizedGraph, operators: Sequence[Operator], library: type[Engine]) -> list[Fallback]:
+    """Find int8 nodes that do not run as the engine's fast kernels, as it says itself."""
+    zero_points = len(graph.asymmetric())
+    told = ((each, library.slow(each.node, each.precision, each.product, zero_points)) for each in operators)
+    return [Fallback(graph.name, each.name, why, each.ms) for each, why in told if why]

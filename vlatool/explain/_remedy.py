@@ -17,6 +17,7 @@ from vlatool.explain._operators import reference_engine
 from vlatool.measurement.interleaved import Contestant, run_interleaved
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.engine import engine_class
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.sensitivity.layers import LayerError
 from vlatool.stage.base import Context, Stage, Transform
@@ -97,8 +98,9 @@ def plans(stage: Stage | None, worst: Sequence[LayerError], found: Sequence[Fall
     tried: list[Candidate] = []
     fixed, before = stage, ""
     if isinstance(stage, StaticInt8) and found:
-        if engine != "openvino" and stage.layout != "ort":
-            fixed, before = stage.model_copy(update={"layout": "ort"}), "layout ort"
+        integer = next((name for name, layout in engine_class(engine).layouts.items() if layout.integer), stage.layout)
+        if stage.layout != integer:
+            fixed, before = stage.model_copy(update={"layout": integer}), f"layout {integer}"
         elif stage.activations != "auto":
             fixed, before = stage.model_copy(update={"activations": "auto"}), "activations auto"
         if before:

@@ -35,6 +35,8 @@ ISA_FEATURES = (
     *("asimd", "asimdhp", "asimddp", "i8mm", "bf16", "sve", "sve2"),
 )
 """Names of ``/proc/cpuinfo`` that decide how fast a network runs."""
+VNNI = ("amx_int8", "avx512_vnni", "avx_vnni_int8", "avx_vnni")
+"""Features with which int8 products are exact, and faster than float32."""
 MAX_CPU_ISA = "ONEDNN_MAX_CPU_ISA"
 """The variable that confines oneDNN, and so OpenVINO, to an instruction set; read once, when it is loaded."""
 OLDER_MAX_CPU_ISA = "DNNL_MAX_CPU_ISA"

@@ -30,8 +30,6 @@ RUNGS = {
 AVX2, but not AVX2_VNNI: AVX512-VNNI and AVX-VNNI are instructions of their own."""
 SATURATING = ("AVX512_CORE", "AVX2")
 """Sets without VNNI: int8 products are added in pairs of 16 bits."""
-VNNI = ("amx_int8", "avx512_vnni", "avx_vnni_int8", "avx_vnni")
-"""Features with which int8 products are exact, and faster than float32."""
 ENGINE = "openvino"
 
 

@@ -65,7 +65,7 @@ def main(arguments: list[str]) -> dict[str, Any]:
     rss = {"interpreter": resident_mb()}
     from vlatool.bundle.bundle import Bundle
     from vlatool.runtime import load
-    from vlatool.runtime.policy import DEFAULT_ENGINE
+    from vlatool.runtime.engine import DEFAULT_ENGINE
 
     imported = time.monotonic_ns()
     rss["imported"] = resident_mb()

@@ -7,14 +7,16 @@ from dataclasses import replace
 
 from vlatool.optimize.judge import Judged, p50
 from vlatool.report import Row
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
 
 TIE = 1.05
-MEASURED_ENGINES = ("ort_cpu", "openvino")
 LEAST = 1.005
 """Ratio of the medians from which on two decimals do not say 1.00."""
 
 
-def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False, elsewhere: str = "") -> list[Judged]:
+def choose(
+    judged: list[Judged], engine: str = DEFAULT_ENGINE, small: bool = False, elsewhere: str = ""
+) -> list[Judged]:
     """Mark one row as chosen: the fastest inside the limits, or the nearest to them when none is inside.
 
     A candidate is faster than float32 when the interval of its measured speed-up says so; where none is, float32 stays.
@@ -30,7 +32,7 @@ def choose(judged: list[Judged], engine: str = "ort_cpu", small: bool = False, e
             this host's.
     """
     origin = "measured"
-    if engine not in MEASURED_ENGINES and all(p50(item.row, "predicted") < float("inf") for item in judged):
+    if engine not in engine_names() and all(p50(item.row, "predicted") < float("inf") for item in judged):
         origin = "predicted"
     inside = [item for item in judged if item.row.role != "baseline" and item.within]
     if not inside:

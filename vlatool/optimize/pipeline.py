@@ -27,7 +27,8 @@ from vlatool.optimize.search import Search
 from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, now
 from vlatool.render import write_reports
 from vlatool.report import ON_BOARD, Report, Row, read_report
-from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
+from vlatool.runtime.engine import DEFAULT_ENGINE
+from vlatool.runtime.policy import refuse_findings
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Context, Stage, Tell, Transform, build_stage
 from vlatool.stage.finish import reseal
@@ -201,7 +202,7 @@ def judged_rows(
         judged = choose_apart(judged, engines or {}, tuple(plan.profile.engines), plan.board_set, small)
     else:
         elsewhere = "" if on_board else plan.board
-        judged = choose(judged, plan.profile.engine if plan.profile else "ort_cpu", small, elsewhere)
+        judged = choose(judged, plan.profile.engine if plan.profile else DEFAULT_ENGINE, small, elsewhere)
     trust = credibility(rows[BASELINE], BASELINE)
     if trust.table:
         judged[0] = _with_tables(judged[0], {"Whether the reference does its task": list(trust.table)})

@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from vlatool.errors import RecipeError, require
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
+from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, engine_class, engine_names
 
 StageList = tuple[dict[str, dict[str, Any]], ...]
 """Stages in order, each a mapping of one name to its options."""
@@ -79,18 +80,18 @@ class Recipe(Numeric):
         return text
 
 
-def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str = "ort_cpu") -> Recipe:
+def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str = DEFAULT_ENGINE) -> Recipe:
     """Return the candidates that are tried when the user names none.
 
     Args:
         limits: What a candidate must keep to.
         effort: How much is measured.
         calibrated: Whether the policy brings calibration data, without which static quantization is impossible.
-        engine: The engine of the board. ONNX Runtime on a CPU takes its own integer operators and dynamic
-            quantization; every other engine takes standard QDQ operators with symmetric int8.
+        engine: The engine of the board. One that is searched brings its own plans; others get standard QDQ operators
+            with symmetric int8, as does one that vlatool does not run.
     """
-    own = engine == "ort_cpu"
-    layout: dict[str, Any] = {} if own else {"layout": "qdq", "activations": "int8"}
+    library = engine_class(engine) if engine in engine_names() else Engine
+    own, layout = library.searched, dict(library.int8)
     candidates: dict[str, StageList] = {}
     if own or not calibrated:
         candidates["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)

@@ -13,11 +13,11 @@ Each trial is a cached stage: an interrupted search goes on where it was.
 from __future__ import annotations
 
 import glob
-import importlib.util
 import math
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,11 +28,12 @@ from vlatool.errors import GraphError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import isa
-from vlatool.machine.instruction_sets import VNNI, board_set
+from vlatool.machine.instruction_sets import board_set
 from vlatool.optimize.judge import budget_of
 from vlatool.optimize.recipe import Limits, StageList, stage_entries
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.policy import DEFAULT_ENGINE, refuse_findings
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
+from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context, Transform, build_stage
 from vlatool.stage.run import cached_measure, cached_transform
 
@@ -51,13 +52,6 @@ SAMPLES = 8
 """Observations on which it is measured, at most."""
 TIMED = 20
 QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False}
-BF16 = ("amx_bf16", "avx512_bf16")
-AMX = ("amx_tile", "amx_int8")
-INT8: dict[str, dict[str, Any]] = {
-    "int8": {}, "int8_mse": {"method": "mse"}, "int8_attention": {"attention": True},
-    "int8_elementwise": {"elementwise": True},
-}  # fmt: skip
-"""Name -> options of the int8 variants of OpenVINO."""
 
 
 @dataclass(frozen=True)
@@ -257,34 +251,12 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
         profile: The board; None for this host.
         calibrated: Whether there is calibration data.
     """
-    engines = ("ort_cpu", "openvino") if profile is None else tuple(profile.engines)
+    known = engine_names()
+    board = known if profile is None else [name for name in known if name in profile.engines]
     found: dict[str, StageList] = {}
-    if "ort_cpu" in engines:
-        found["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
-        if calibrated:
-            found["static_int8"] = ({"quantize.static_int8": {}},)
-            found["static_int8_mse"] = ({"quantize.static_int8": {"method": "mse"}},)
-            found["static_int8_attention"] = ({"quantize.static_int8": {"attention": True}},)
-    if "openvino" in engines and importlib.util.find_spec("openvino") is not None:
-        found.update(_openvino_variants(processor_has(profile, *BF16), processor_has(profile, *AMX), calibrated))
-        if calibrated and processor_has(profile, "avx2") and not processor_has(profile, *VNNI):
-            reduced = {"layout": "openvino", "reduce_range": True}  # products of 7 bits do not saturate
-            found["openvino_int8_reduced"] = ({"quantize.static_int8": reduced},)
-    return found
-
-
-def _openvino_variants(bfloat16: bool, amx: bool, calibrated: bool) -> dict[str, StageList]:
-    """Return the variants of OpenVINO; with matrix units (AMX) their products are convolutions, as ``_pixels`` says."""
-    found: dict[str, StageList] = {}
-    forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if amx else {"": {}}
-    for form, how in forms.items():
-        if bfloat16:
-            found[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
-    rest = {"compute": "bfloat16"} if bfloat16 else {}
-    for name, options in INT8.items() if calibrated else ():
-        for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
-            stage = {"layout": "openvino", **rest, **how, **options}
-            found[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
+    for name in board:
+        if installed(name):
+            found |= engine_class(name).variants(partial(processor_has, profile), calibrated)
     return found
 
 

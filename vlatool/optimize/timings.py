@@ -15,7 +15,7 @@ from vlatool.machine.instruction_sets import ENGINE, BoardSet
 from vlatool.optimize.engines_apart import REFERENCE, joined
 from vlatool.optimize.recipe import Effort
 from vlatool.report import Measurement, Row
-from vlatool.runtime.policy import DEFAULT_ENGINE
+from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_measure
 

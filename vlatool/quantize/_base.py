@@ -18,7 +18,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
-from vlatool.errors import BundleError, RecipeError, nearest, require
+from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.nodes import FOLDED
 from vlatool.graph.precision import precision_shares
@@ -162,12 +162,6 @@ class Quantization(Transform):
                 f"widen them; the first layers are {', '.join(candidates[:3])}",
             )
         return kept
-
-
-def quantization_library() -> Any:
-    """Import ONNX Runtime's quantizer, which needs both onnx and onnxruntime."""
-    require("onnx", "build")
-    return require("onnxruntime.quantization", "ort")
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.quantize._ranges import Statistics
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
@@ -32,7 +32,7 @@ class _Calibrating:
         self.sample = 0
         self.statistics = statistics
         self._outputs = outputs
-        self._session = OrtCpuSession(path, 1)
+        self._session = engine_class()(path, 1)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, take in the statistics, return the graph's own outputs."""
@@ -91,8 +91,8 @@ def calibrate(
             recorders.append(recorder)
         for graph, described in manifest.graphs.items():
             if graph not in sessions:
-                sessions[graph] = OrtCpuSession(bundle.file(described.file), 1)
-        policy = Policy(bundle, Program(manifest.program, sessions, seed=0), "ort_cpu")
+                sessions[graph] = engine_class()(bundle.file(described.file), 1)
+        policy = Policy(bundle, Program(manifest.program, sessions, seed=0), DEFAULT_ENGINE)
         for place, observation in enumerate(observations):
             number = numbers[place] if numbers else place
             if place % 8 == 0:

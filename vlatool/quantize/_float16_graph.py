@@ -13,6 +13,7 @@ from vlatool.errors import require
 from vlatool.graph.nodes import read_names, reads
 from vlatool.graph.phase import HEAVY, PERIODIC
 from vlatool.graph.types import FLOAT, inferred_values
+from vlatool.runtime.engines import build_tool
 
 LARGEST = 65504.0
 """Largest finite float16."""
@@ -96,7 +97,7 @@ def to_float16(model: Any, kept: set[str]) -> Any:
     what shall not be rounded, gives the same Cast once for each reader, appends nodes at the end, and rounds a constant
     that a kept node shares with another; all four are mended here.
     """
-    converter = require("onnxruntime.transformers.float16", "ort")
+    converter = build_tool("transformers.float16")
     _part_shared_constants(model, kept)
     ends = {value.name for value in (*model.graph.input, *model.graph.output)}
     del model.graph.value_info[:]

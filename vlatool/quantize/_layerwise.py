@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import GraphError, require
+from vlatool.errors import GraphError
 from vlatool.quantize._compute import as_float32, stored_bytes
 from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import Tools
 from vlatool.quantize._rewrite import Layer, read_as_weight, turns_constant
+from vlatool.runtime.engines import node_session
 
 Array = NDArray[Any]
 Values = dict[str, Array]
@@ -149,13 +150,10 @@ class _Renamed:
 
 
 def _open(onnx: Any, proto: Any, names: list[str], values: Values, model: Any) -> tuple[Any, list[str], list[int]]:
-    ort = require("onnxruntime", "ort")
     slots = [number for number, name in enumerate(names) if name and names.index(name) == number]
-    options = ort.SessionOptions()
-    options.log_severity_level = 4
     try:
         single = _single(onnx, proto, {names[slot]: values[names[slot]].dtype for slot in slots}, model)
-        session = ort.InferenceSession(single.SerializeToString(), options, providers=["CPUExecutionProvider"])
+        session = node_session(single.SerializeToString())
     except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
         raise _refused(proto.name, proto.op_type, error) from error
     return session, [names[slot] for slot in slots], slots

@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.types import float_values
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
@@ -43,7 +43,7 @@ class _Watching:
         self.sample = 0
         self.found: dict[str, Beyond] = {}
         self._outputs, self._names, self._limit = outputs, names, limit
-        self._session = OrtCpuSession(path, 1)
+        self._session = engine_class()(path, 1)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, take in the peaks, return the graph's own outputs."""
@@ -70,7 +70,7 @@ def find_beyond(
     Raises:
         DataError: when an observation does not fit the spec; names the sample.
     """
-    policy = Policy.open(bundle, engine="ort_cpu", threads=1, seed=0)
+    policy = Policy.open(bundle, engine=DEFAULT_ENGINE, threads=1, seed=0)
     sessions: dict[str, Any] = dict(policy.program.sessions)
     watching: dict[str, _Watching] = {}
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:

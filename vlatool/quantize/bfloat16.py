@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import require
 from vlatool.graph.files import load, save
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._conv1x1 import use_convolutions
+from vlatool.runtime.engine import computing, engine_class
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -32,9 +32,9 @@ class Bfloat16(Quantization):
     )
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """OpenVINO is installed."""
+        """The engine that computes so is installed."""
         super().check(source, profile)
-        require("openvino", "openvino")
+        engine_class(computing("bfloat16")).library()
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Mark every selected graph."""
@@ -46,4 +46,4 @@ class Bfloat16(Quantization):
             save(model, target)
             return "bfloat16"
 
-        return self.transform(source, out, context, mark, "openvino")
+        return self.transform(source, out, context, mark, computing("bfloat16"))

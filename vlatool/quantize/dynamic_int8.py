@@ -10,7 +10,8 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.files import foreign_errors, load, read, save
 from vlatool.graph.layers import check_weights, find_layers, part_inner_gemms, split_gemm
-from vlatool.quantize._base import Quantization, quantization_library, quiet_quantizer
+from vlatool.quantize._base import Quantization, quiet_quantizer
+from vlatool.runtime.engines import build_tool
 from vlatool.stage.base import Context, source_of
 
 OPS = ("MatMul", "Gemm")
@@ -45,7 +46,7 @@ class DynamicInt8(Quantization):
         return self.transform(bundle, out, context, quantize)
 
     def _quantize(self, original: Path, target: Path, kept: set[str]) -> None:
-        quantization = quantization_library()
+        quantization = build_tool("quantization")
         model = load(original)
         check_weights(model, [layer for layer in find_layers(model, OPS) if layer.name in kept])
         split_gemm(model)  # ONNX Runtime's own way turns a weight in place for each of its readers

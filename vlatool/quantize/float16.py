@@ -17,6 +17,8 @@ from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize._trial_compile import open_apart
 from vlatool.stage.base import Context, SampleSet, source_of
 
+APART = "leave layers beside a Transpose in float32 with --exclude, or use another method"
+
 
 class Float16(Quantization):
     """Store weights and compute in float16; inputs and outputs stay float32.
@@ -70,11 +72,11 @@ class Float16(Quantization):
             turning = {node.name for node in model.graph.node if node.op_type == "Transpose"}
             save(to_float16(model, kept), target)
             try:
-                open_apart(target)
+                open_apart(target, "", "float16", APART)
             except GraphError:  # with what is transposed in float32 it does not
                 told["kept"] += len(turning - kept)
                 save(to_float16(load(original), kept | turning), target)
-                open_apart(target)
+                open_apart(target, "", "float16", APART)
 
         made_by = {**self.made_by(calibration=samples), "float16": told}
         return self.transform(bundle, out, context, convert, made_by=made_by)

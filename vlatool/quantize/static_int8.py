@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, nearest, require
+from vlatool.errors import RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, read, save
 from vlatool.graph.layers import (
     Layer,
@@ -30,13 +30,16 @@ from vlatool.quantize._frames import fold_frames
 from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.quantize._ranges import Statistics, choose_range
 from vlatool.quantize._reductions import keep_axes
-from vlatool.quantize._trial_compile import compile_apart
+from vlatool.quantize._trial_compile import open_apart
+from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, Int8Layout, engine_class, layouts
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
-ENGINES = {"ort": "", "qdq": "", "openvino": "openvino"}
+    LayoutName = str
+else:
+    LayoutName = Literal[tuple(layouts())]
 
 
 class StaticInt8(Calibrated):
@@ -61,7 +64,7 @@ class StaticInt8(Calibrated):
     )
     per_channel: bool = Field(True, description="one weight scale for each output channel")
     reduce_range: bool = Field(False, description="7-bit weights, for x86 processors without VNNI")
-    layout: Literal["ort", "qdq", "openvino"] = Field(
+    layout: LayoutName = Field(
         "ort",
         description="ort: ONNX Runtime's integer MatMul; qdq: standard operators, for TensorRT; openvino: for OpenVINO",
     )
@@ -77,35 +80,53 @@ class StaticInt8(Calibrated):
     ops: tuple[str, ...] = Field(QUANTIZED_OPS, description="operator types to quantize")
 
     @property
+    def form(self) -> Int8Layout:
+        """What the layout writes."""
+        return layouts()[self.layout][0]
+
+    @property
+    def engine(self) -> str:
+        """The engine that the layout is for; empty for any that runs standard operators, and for the default one."""
+        name = layouts()[self.layout][1]
+        return "" if name == DEFAULT_ENGINE else name
+
+    @property
     def style(self) -> Style:
         """How layers are written."""
-        own = self.layout == "openvino"
+        form = self.form
         kind: Literal["uint8", "int8", "symmetric"] = "uint8"
         if self.activations != "auto":
             kind = self.activations
-        elif own and not self.convolutions:
+        elif form.symmetric and not self.convolutions:
             kind = "symmetric"
-        second = self.layout == "ort" and kind == "uint8"
+        second = form.integer and kind == "uint8"
         return Style(
-            kind, self.per_channel, self.reduce_range, fused_convolutions=not own, hoist=own, signed_second=second,
-            unsigned_convolutions=own,
+            kind, self.per_channel, self.reduce_range, form.fuses_convolutions, hoist=form.symmetric,
+            signed_second=second, unsigned_convolutions=form.symmetric,
         )  # fmt: skip
 
     def used_packages(self) -> tuple[str, ...]:
-        """OpenVINO too, where it runs the graphs."""
-        return (*self.packages, "openvino") if self.layout == "openvino" else self.packages
+        """The engine too that the layout is for."""
+        return (*self.packages, engine_class(self.engine).package) if self.engine else self.packages
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The operators are ones that can be quantized, the layout can compute so, and there is calibration data."""
         for name in self.ops:
             if name not in QUANTIZED_OPS:
                 raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
-        if self.compute != "float32" and self.layout != "openvino":
-            raise RecipeError(f"The layout {self.layout} does not compute in {self.compute}.", "use layout openvino")
-        if self.convolutions and self.layout != "openvino":
-            raise RecipeError(f"The layout {self.layout} has no use for convolutions.", "use layout openvino")
-        if self.layout == "openvino":
-            require("openvino", "openvino")
+        library: type[Engine] = engine_class(self.engine)
+        if self.compute not in library.computes:
+            raise RecipeError(
+                f"The layout {self.layout} does not compute in {self.compute}.",
+                f"use layout {_other(lambda layout, library: self.compute in library.computes)}",
+            )
+        if self.convolutions and not self.form.convolutions:
+            raise RecipeError(
+                f"The layout {self.layout} has no use for convolutions.",
+                f"use layout {_other(lambda layout, library: layout.convolutions)}",
+            )
+        if self.engine:
+            library.library()
         super().check(source, profile)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
@@ -119,27 +140,32 @@ class StaticInt8(Calibrated):
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
             pixels: dict[str, Range] = {}
-            if self.layout == "ort":
+            if self.form.integer:
                 split_gemm(model)
                 if self.style.activations == "uint8":
                     pixels = fold_frames(model, {layer.name for layer in layers[name]})
             chosen = self._rewritten(model, layers[name])
             unsigned = convolved(chosen, self.style, hoisted(model, chosen, self.style))
             insert_qdq(model, chosen, {**self.ranges(found[name], unsigned), **pixels}, self.style)
-            if self.layout == "ort":
+            if self.form.integer:
                 quantize_early(model)
                 use_integer_matmul(model)
-            if self.layout == "openvino":
+            if self.form.symmetric:
                 keep_axes(model)
             if self.convolutions:
                 use_convolutions(model)
             save(model, target)
-            if self.layout == "openvino" and (self.elementwise or self.attention or self.convolutions):
-                compile_apart(target)
+            if self.form.crashes and (self.elementwise or self.attention or self.convolutions):
+                open_apart(
+                    target,
+                    self.engine,
+                    "int8",
+                    "quantize fewer: leave out --elementwise or --attention, or use --exclude",
+                )
             return "" if self.compute == "float32" else self.compute
 
         made_by = self.made_by(calibration=samples)
-        return self.transform(bundle, out, context, quantize, ENGINES[self.layout], made_by)
+        return self.transform(bundle, out, context, quantize, self.engine, made_by)
 
     def ranges(self, statistics: Mapping[str, Statistics], unsigned: Collection[str] = ()) -> dict[str, Range]:
         """Return value -> (low, high) that activations are quantized over.
@@ -179,8 +205,16 @@ class StaticInt8(Calibrated):
 
     def _rewritten(self, model: Any, layers: list[Layer]) -> list[Layer]:
         """Return the layers as they are after Gemm became MatMul."""
-        if self.layout != "ort":
+        if not self.form.integer:
             return layers
         names = {layer.name for layer in layers}
         again = find_layers(model, QUANTIZED_OPS, attention=self.attention)
         return [layer for layer in again if layer.name in names] + [layer for layer in layers if layer.kind == "Add"]
+
+
+def _other(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:
+    """Return the layouts that can do something, in words."""
+    return (
+        " or ".join(name for name, (layout, engine) in layouts().items() if fits(layout, engine_class(engine)))
+        or "none"
+    )

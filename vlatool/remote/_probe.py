@@ -8,12 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import MissingExtra, TargetError, UsageError, VlatoolError, nearest
+from vlatool.errors import MissingExtra, TargetError, VlatoolError
+from vlatool.runtime.engine import engine_class
 
 OLDEST = (3, 10)
 CANDIDATES = ("python3", "python3.13", "python3.12", "python3.11", "python3.10")
-PACKAGES = {"ort_cpu": "onnxruntime", "openvino": "openvino"}
-"""Engine -> the package that it needs beside numpy; both are imported on the target."""
 INCOMPLETE = 9
 
 SCRIPT = """\
@@ -71,14 +70,9 @@ def packages_of(engines: Iterable[str]) -> tuple[str, ...]:
     """Return numpy and the packages of the engines.
 
     Raises:
-        UsageError: for an engine whose package is not known.
+        UsageError: for an engine that is not known.
     """
-    found = []
-    for engine in engines:
-        if (name := engine or "ort_cpu") not in PACKAGES:
-            raise UsageError(f"The engine '{name}' cannot be run on a target; {nearest(name, PACKAGES)}.")
-        found.append(PACKAGES[name])
-    return ("numpy", *sorted(set(found)))
+    return ("numpy", *sorted({engine_class(name).package for name in engines}))
 
 
 def script(marker: str, python: str, packages: Sequence[str]) -> bytes:

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from vlatool import registry
 from vlatool.bundle.manifest import Manifest
+from vlatool.runtime.engine import engine_class
 
 MODEL = (
     "eNrtlD0OgkAQRneA6DIqGZfaQuw4go2EWBEpbO1QtiAxIIQfoZEDeECPI9JhvIG8ZJpvXv24Ltj2peMa4Y5qEkvUGpklAlLLOBZBnEeN"
@@ -118,26 +118,20 @@ def told(manifest: Manifest, engine: str) -> tuple[str, str]:
     """
     if not is_int8(manifest):
         return "", ""
-    session: Any = registry.load("engines", engine)
-    found = str(session.arithmetic())
+    library = engine_class(engine)
+    found = str(library.arithmetic())
     if found == EXACT:
         return "", ""
-    return f"Its int8 products are {found}.", REMEDY.get(engine, "") if found == SATURATING else ""
+    return f"Its int8 products are {found}.", library.remedy if found == SATURATING else ""
 
 
 def machine(engine: str) -> str:
-    """Return what an engine computes on: this "machine", and where OpenVINO is confined on it, what to."""
+    """Return what an engine computes on: this "machine", and where the engine is confined on it, what to."""
     from vlatool.machine.host import (  # only where there is something to say: it takes its time
         MAX_CPU_ISA,
         onednn_max_cpu_isa,
     )
 
-    confined = onednn_max_cpu_isa() if engine == "openvino" else None
-    return f"machine (OpenVINO confined to {confined} by {MAX_CPU_ISA})" if confined else "machine"
-
-
-REMEDY = {
-    "openvino": "quantize again with --reduce-range, or with --layout ort for ONNX Runtime, whose products are exact",
-    "ort_cpu": "quantize again with --reduce-range, or with --activations int8",
-}
-"""Engine -> what was seen to be right on processors that saturate."""
+    library = engine_class(engine)
+    confined = onednn_max_cpu_isa() if library.confined else None
+    return f"machine ({library.title} confined to {confined} by {MAX_CPU_ISA})" if confined else "machine"

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -31,12 +30,12 @@ from vlatool.runtime.contract import (
     not_finite,
     written_as_declared,
 )
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder, all_finite
 from vlatool.runtime.program import Program, Session
 from vlatool.runtime.statistics import Normaliser, load_normaliser
 
-DEFAULT_ENGINE = "ort_cpu"
 FIRST_RUN_S = 60.0
 """How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
 GOLDEN_STEPS = 2
@@ -108,7 +107,7 @@ class Policy:
         limit_mb = allowed_mb(manifest, memory_mb)
         check_sizes(manifest, limit_mb)
         engine = engine or manifest.engine or DEFAULT_ENGINE
-        session = registry.load("engines", engine)
+        session = engine_class(engine)
         check_files(manifest)
         sessions: dict[str, Session] = {
             name: open_graph(bundle, graph, session, threads) for name, graph in manifest.graphs.items()

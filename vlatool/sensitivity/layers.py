@@ -20,7 +20,7 @@ from vlatool.graph.files import foreign_errors, save
 from vlatool.graph.layers import Layer
 from vlatool.graph.qdq import Range
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.policy import Action, Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
@@ -119,7 +119,7 @@ class _Tape:
 class _Switchable:
     """A session of a graph with switches; while nothing before it has changed, it gives what it gave before."""
 
-    def __init__(self, session: OrtCpuSession, flags: Mapping[str, str], tape: _Tape) -> None:
+    def __init__(self, session: Any, flags: Mapping[str, str], tape: _Tape) -> None:
         self._session, self._flags, self._tape = session, flags, tape
         self._off = dict.fromkeys(flags.values(), np.array(False))
         self._set = self._off
@@ -137,7 +137,7 @@ class _Switchable:
         if not tape.changed:
             tape.place += 1
             return tape.recorded[tape.place - 1]
-        given = self._session.run({**feeds, **self._set})
+        given: Mapping[str, Any] = self._session.run({**feeds, **self._set})
         if tape.recording:
             tape.recorded.append(given)
         return given
@@ -175,8 +175,8 @@ class Switchboard:
                     self.shares.update({(name, layer): share for layer, share in _shares(path, layers[name]).items()})
                     path = Path(self._scratch.name) / f"{name}.onnx"
                     save(model, path)
-            self._sessions[name] = _Switchable(OrtCpuSession(path, threads), flags, self._tape)
-        self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), "ort_cpu")
+            self._sessions[name] = _Switchable(engine_class()(path, threads), flags, self._tape)
+        self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:
         return self

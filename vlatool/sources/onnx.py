@@ -19,7 +19,7 @@ from vlatool.errors import GraphError, InputError, SourceError, nearest, require
 from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.precision import precision_shares
 from vlatool.module.description import FILE, Description, copy_assets, read_description
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.runtime.program import Program
@@ -205,7 +205,7 @@ def _compare(
         SourceError: when ONNX Runtime computes something else.
     """
     programs = [
-        Program(manifest.program, {"main": OrtCpuSession(path, threads=1)}, SEED)
+        Program(manifest.program, {"main": engine_class()(path, threads=1)}, SEED)
         for path in (before, out / "graphs/main.onnx")
     ]
     encode = ObservationEncoder(manifest.spec, out / "assets")

@@ -15,9 +15,10 @@ from vlatool.bundle.bundle import Bundle, restate, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
 from vlatool.runtime.arithmetic import SATURATING, is_int8, machine, told
+from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.policy import DEFAULT_ENGINE, Action, Policy, relative_error
+from vlatool.runtime.policy import Action, Policy, relative_error
 from vlatool.runtime.program import Program, draw
 
 GOLDEN = "golden/golden.npz"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from vlatool.errors import require
 
 if TYPE_CHECKING:
     from vlatool.runtime.engines._reference import ReferenceSession
@@ -17,3 +19,25 @@ def reference() -> type[ReferenceSession]:
     from vlatool.runtime.engines._reference import ReferenceSession
 
     return ReferenceSession
+
+
+def build_tool(name: str) -> Any:
+    """Import one of the tools for graphs that come with ONNX Runtime: ``quantization``, ``transformers.float16``.
+
+    Raises:
+        MissingExtra: when onnx or onnxruntime is not installed.
+    """
+    require("onnx", "build")
+    return require(f"onnxruntime.{name}", "ort")
+
+
+def node_session(content: bytes) -> Any:
+    """Open a graph of one node, of whatever types and shapes it is fed, in ONNX Runtime's own session.
+
+    Raises:
+        MissingExtra: when onnxruntime is not installed.
+    """
+    ort = require("onnxruntime", "ort")
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    return ort.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)

@@ -7,21 +7,29 @@ import ctypes
 import io
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, nearest, require
-from vlatool.machine.host import MAX_CPU_ISA, onednn_max_cpu_isa
+from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
+from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
+from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precision
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
 
 DEVICE = "CPU"
+AMX, BF16 = ("amx_tile", "amx_int8"), ("amx_bf16", "avx512_bf16")
+INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "int8": {}, "int8_mse": {"method": "mse"}, "int8_attention": {"attention": True},
+    "int8_elementwise": {"elementwise": True},
+}  # fmt: skip
+"""Name -> options of the int8 plans that a search begins with."""
 GRACE_MS = 1000
 """How long a run that is cancelled may take to end."""
 HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
@@ -34,7 +42,7 @@ PARTIAL_BLOCK = "cannot be divided by block_size"
 """What OpenVINO says of a layer whose inputs are no whole number of blocks."""
 
 
-class OpenvinoSession:
+class OpenvinoSession(Engine):
     """One ONNX file compiled by OpenVINO for the CPU.
 
     Inputs and outputs have the names that they have in the file: where compiling removes a Reshape or Identity beside
@@ -50,6 +58,17 @@ class OpenvinoSession:
         GraphError: when OpenVINO refuses the file or computes in another dtype than it was told to.
         MissingExtra: when openvino is not installed.
     """
+
+    title = "OpenVINO"
+    package = "openvino"
+    extra = "openvino"
+    advice = "fastest on Intel"
+    computes = ("float32", "bfloat16")
+    confined = True
+    layouts: ClassVar[Mapping[str, Int8Layout]] = {
+        "openvino": Int8Layout(fuses_convolutions=False, symmetric=True, convolutions=True, crashes=True)
+    }
+    remedy = "quantize again with --reduce-range, or with --layout ort for ONNX Runtime, whose products are exact"
 
     def __init__(
         self, path: Path, threads: int | None = None, compute: str = "", opened: Path | bytes | None = None
@@ -196,6 +215,54 @@ class OpenvinoSession:
             return arithmetic.said(float(compiled(arithmetic.operand())[0].min()))
         except Exception:  # the seam: older processors lack the kernels of any int8 product
             return arithmetic.UNKNOWN
+
+    @classmethod
+    def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
+        """Return bfloat16 where the processor has it, and int8 with what is not quantized in that.
+
+        With matrix units (AMX) products are written as convolutions, too, as ``quantize._conv1x1`` says; where int8
+        products saturate, there is a plan of 7 bits.
+        """
+        found: dict[str, Stages] = {}
+        forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if has(*AMX) else {"": {}}
+        bfloat16 = has(*BF16)
+        for form, how in forms.items() if bfloat16 else ():
+            found[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
+        rest = {"compute": "bfloat16"} if bfloat16 else {}
+        for name, options in INT8_VARIANTS.items() if calibrated else ():
+            for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
+                stage = {"layout": "openvino", **rest, **how, **options}
+                found[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
+        if calibrated and has("avx2") and not has(*VNNI):
+            found["openvino_int8_reduced"] = ({"quantize.static_int8": {"layout": "openvino", "reduce_range": True}},)
+        return found
+
+    @classmethod
+    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+        """Open a graph with OpenVINO's counters of every node on.
+
+        Raises:
+            GraphError: when OpenVINO refuses it.
+        """
+        settings = {**settings_for(threads, compute), "PERF_COUNT": True}
+        return OpenvinoProfiled(cls.library(), path, lambda core, model: compiled(core, model, settings))
+
+    @classmethod
+    def node_precision(cls, node: Node) -> str:
+        """Return what a node computes in, by its kind and the ending of its kernel."""
+        return precision(node)
+
+    @classmethod
+    def slow(cls, node: Node, computed: str, product: bool, zero_points: int) -> str:
+        """Name reference kernels, and zero points that keep FullyConnected off its symmetric path."""
+        _, kind, kernel = node
+        if product and kernel.startswith("ref"):
+            return f"runs as the reference kernel {kernel}"
+        if zero_points and kind == "FullyConnected" and computed == INT8:
+            return (
+                f"activations with zero points ({zero_points} in the graph): not the symmetric path (activations: auto)"
+            )
+        return ""
 
 
 def _remedy(error: Exception) -> str:

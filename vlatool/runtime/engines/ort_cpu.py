@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from vlatool.errors import GraphError, require
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port, port
+from vlatool.runtime.engine import Engine, Int8Layout, Node, Profiled, Stages
+from vlatool.runtime.engines._ort_profile import OrtProfiled, precision
 from vlatool.runtime.stored_types import has_float8
 
 PROVIDER = "CPUExecutionProvider"
@@ -33,9 +36,15 @@ NUMPY_OF: dict[str, np.dtype[Any]] = {
     "tensor(bool)": np.dtype(np.bool_),
 }
 Array = NDArray[Any]
+IGNORED_PROVIDERS = ("AzureExecutionProvider",)
+"""ONNX Runtime lists it beside the processor in every build; it runs nothing on this machine."""
+X86 = ("x86_64", "AMD64")
+SIGNED_PRODUCT = "int8 x int8 on x86: ONNX Runtime's fast kernel takes uint8 x int8 (activations: uint8)"
+INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {"": {}, "_mse": {"method": "mse"}, "_attention": {"attention": True}}
+"""Ending of a plan's name -> options of static int8 that a search begins with."""
 
 
-class OrtCpuSession:
+class OrtCpuSession(Engine):
     """One ONNX file open in ONNX Runtime on the CPU, with fallback to other providers off.
 
     Args:
@@ -50,6 +59,14 @@ class OrtCpuSession:
         MissingExtra: when onnxruntime is not installed.
     """
 
+    title = "ONNX Runtime"
+    package = "onnxruntime"
+    extra = "ort"
+    substitutes = ("onnxruntime-gpu", "onnxruntime-openvino")
+    searched = True
+    layouts: ClassVar[Mapping[str, Int8Layout]] = {"ort": Int8Layout(integer=True)}
+    int8: ClassVar[Mapping[str, Any]] = {}
+    remedy = "quantize again with --reduce-range, or with --activations int8"
     optimized: ClassVar[bool] = True
     """Whether ONNX Runtime may rewrite the graph."""
 
@@ -167,6 +184,44 @@ class OrtCpuSession:
             return plain
         exact = arithmetic.ort_product(ort, precise=True) == arithmetic.WANTED
         return arithmetic.EXACT_BY_OPTION if exact else plain
+
+    @classmethod
+    def execution_providers(cls) -> list[str]:
+        """Return the execution providers of the installed library, without those that run nothing on this machine.
+
+        Raises:
+            MissingExtra: when onnxruntime cannot be imported.
+        """
+        return [str(name) for name in cls.library().get_available_providers() if name not in IGNORED_PROVIDERS]
+
+    @classmethod
+    def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
+        """Return int8 at run time, and with ranges from a recording: plain, by their error, attention too."""
+        found: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
+        for name, options in INT8_VARIANTS.items() if calibrated else ():
+            found[f"static_int8{name}"] = ({"quantize.static_int8": dict(options)},)
+        return found
+
+    @classmethod
+    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+        """Open a graph with ONNX Runtime's trace of every node on.
+
+        Raises:
+            GraphError: when ONNX Runtime refuses it.
+        """
+        return OrtProfiled(cls.library(), path, threads, scratch, left_out(path))
+
+    @classmethod
+    def node_precision(cls, node: Node) -> str:
+        """Return what a node computes in, by its kind and the dtype of its first input."""
+        return precision(node)
+
+    @classmethod
+    def slow(cls, node: Node, computed: str, product: bool, zero_points: int) -> str:
+        """Name products of two signed operands, for which x86 has no fast instruction before AVX-VNNI-INT8."""
+        _, kind, dtypes = node
+        signed = kind.startswith(("MatMulInteger", "QLinearMatMul", "QGemm")) and dtypes.startswith("int8")
+        return SIGNED_PRODUCT if signed and platform.machine() in X86 else ""
 
 
 class _Bound:

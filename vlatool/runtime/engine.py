@@ -1,0 +1,188 @@
+"""What every engine says of itself: the build side asks, and names none.
+
+A file in ``vlatool/runtime/engines/`` (or one that another package brings, see ``vlatool.registry``) defines one class
+that opens a graph (``vlatool.runtime.program.Session``) and overrides what it does otherwise than said here.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from vlatool import registry
+from vlatool.errors import GraphError, require
+
+DEFAULT_ENGINE = "ort_cpu"
+"""Runs a bundle that names no engine, and computes for stages that need float32 answers."""
+INT8, BFLOAT16, FLOAT32, MOVING, QUANTIZING = "int8", "bfloat16", "float32", "moving data", "quantize-dequantize"
+MOVES = frozenset({
+    *("Reshape", "Transpose", "Concat", "Split", "Slice", "Gather", "Unsqueeze", "Squeeze", "Expand", "Identity"),
+    *("Cast", "Convert", "Reorder", "ReorderInput", "ReorderOutput", "Pad", "Tile", "Flatten", "Shape", "ShapeOf"),
+    *("ScatterND", "ScatterElements", "GatherElements", "ConstantOfShape", "StridedSlice", "Broadcast", "Copy"),
+    *("MemoryInput", "MemoryOutput", "Parameter", "Result", "Input", "Output"),
+})  # fmt: skip
+"""Operators that compute nothing."""
+QUANTIZES = frozenset(("QuantizeLinear", "DequantizeLinear", "DynamicQuantizeLinear", "FakeQuantize"))
+STANDARD_LAYOUT = "qdq"
+Stages = tuple[dict[str, dict[str, Any]], ...]
+"""Names of stages, each with its options, as a recipe lists them."""
+Node = tuple[str, str, str]
+"""A node as an engine runs it: its name, its kind, and its kernel or dtypes."""
+
+
+@dataclass(frozen=True)
+class Int8Layout:
+    """How ``quantize.static_int8`` writes int8 layers; without more, standard QuantizeLinear and DequantizeLinear.
+
+    Args:
+        integer: Products become integer operators, and what is normalised before them moves into them.
+        fuses_convolutions: A convolution, its bias, its Relu and the quantization behind it are one kernel.
+        symmetric: Activations into products are int8 without zero points, those into convolutions uint8; quantizers
+            move up through what only moves values, and axes that a reduction drops are kept.
+        convolutions: Products of many rows may be written as 1x1 convolutions.
+        crashes: The engine crashes on some of these graphs where more than plain layers is quantized.
+    """
+
+    integer: bool = False
+    fuses_convolutions: bool = True
+    symmetric: bool = False
+    convolutions: bool = False
+    crashes: bool = False
+
+
+class Profiled(Protocol):
+    """A session that notes the time of its nodes."""
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run the graph: input name -> array, output name -> array."""
+
+    def times(self) -> list[dict[Node, float]]:
+        """Return for each run: node -> microseconds."""
+
+
+class Engine:
+    """An inference library, as its class describes it."""
+
+    title: ClassVar[str] = ""
+    """The library's name, in words."""
+    package: ClassVar[str] = ""
+    """What is imported; also the name of the distribution."""
+    extra: ClassVar[str] = ""
+    """The extra of vlatool that brings it."""
+    substitutes: ClassVar[tuple[str, ...]] = ()
+    """Distributions that bring the same package."""
+    advice: ClassVar[str] = ""
+    """What ``doctor`` adds to the command that installs it."""
+    computes: ClassVar[tuple[str, ...]] = ("float32",)
+    """Dtypes of what is not quantized that a graph can ask for."""
+    confined: ClassVar[bool] = False
+    """Whether ``ONEDNN_MAX_CPU_ISA`` says what it computes in."""
+    searched: ClassVar[bool] = False
+    """Whether ``optimize`` looks for further plans beside its candidates where a board runs this engine."""
+    layouts: ClassVar[Mapping[str, Int8Layout]] = {}
+    """Layouts of its own for int8 graphs, beside the standard one: name -> what is written."""
+    int8: ClassVar[Mapping[str, Any]] = {"layout": "qdq", "activations": "int8"}
+    """Options of ``quantize.static_int8`` for a graph that this engine runs."""
+    remedy: ClassVar[str] = ""
+    """What to do where its int8 products saturate."""
+
+    @classmethod
+    def library(cls) -> Any:
+        """Import the library.
+
+        Raises:
+            MissingExtra: when it is not installed.
+        """
+        return require(cls.package, cls.extra)
+
+    @classmethod
+    def execution_providers(cls) -> list[str]:
+        """Return what the installed library runs on, where it says so.
+
+        Raises:
+            MissingExtra: when it cannot be imported.
+        """
+        cls.library()
+        return []
+
+    @classmethod
+    def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
+        """Return the plans that a search begins with: name -> stages.
+
+        Args:
+            has: Whether the processor has one of some features, as ``/proc/cpuinfo`` names them.
+            calibrated: Whether there is calibration data.
+        """
+        return {}
+
+    @classmethod
+    def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
+        """Open a graph so that the time of its nodes is noted.
+
+        Raises:
+            GraphError: when the engine cannot be profiled, or refuses the graph.
+        """
+        raise GraphError(f"The engine {cls.title} cannot be profiled.")
+
+    @classmethod
+    def node_precision(cls, node: Node) -> str:
+        """Return what a node of a profile computes in: ``INT8`` to ``QUANTIZING`` above, or another dtype."""
+        return FLOAT32
+
+    @classmethod
+    def slow(cls, node: Node, computed: str, product: bool, zero_points: int) -> str:
+        """Say why an int8 node of a profile is not the fast kernel; nothing where it is.
+
+        Args:
+            node: Of the profile.
+            computed: Its precision.
+            product: Whether it is a matrix product or a convolution.
+            zero_points: How many activations of its graph have a zero point other than 0.
+        """
+        return ""
+
+
+def engine_class(name: str = "") -> Any:
+    """Return the class of an engine, of the default one when empty.
+
+    Raises:
+        UsageError: when there is none of that name.
+    """
+    return registry.load("engines", name or DEFAULT_ENGINE)
+
+
+def engine_names() -> list[str]:
+    """List the engines, the default one first."""
+    return sorted(registry.names("engines"), key=lambda name: (name != DEFAULT_ENGINE, name))
+
+
+def layouts() -> dict[str, tuple[Int8Layout, str]]:
+    """Return the layouts of int8 graphs, the default one first: name -> what is written, and for which engine.
+
+    The standard one, ``qdq``, is for the engine that runs it.
+    """
+    found: dict[str, tuple[Int8Layout, str]] = {}
+    for engine in engine_names():
+        own = {name: (layout, engine) for name, layout in engine_class(engine).layouts.items()}
+        found |= own if found else {**own, STANDARD_LAYOUT: (Int8Layout(), "")}
+    return found
+
+
+def computing(dtype: str) -> str:
+    """Return the first engine that computes in a dtype.
+
+    Raises:
+        GraphError: when none does.
+    """
+    for name in engine_names():
+        if dtype in engine_class(name).computes:
+            return name
+    raise GraphError(f"No engine computes in {dtype}.")
+
+
+def installed(name: str) -> bool:
+    """Say whether the library of an engine is installed."""
+    return importlib.util.find_spec(engine_class(name).package) is not None

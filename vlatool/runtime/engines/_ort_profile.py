@@ -1,0 +1,67 @@
+"""The profile of ONNX Runtime: the time of each node, and what it computes in."""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import GraphError
+from vlatool.runtime.engine import FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
+
+INTEGER = ("MatMulInteger", "QLinear", "QGemm", "ConvInteger", "DynamicQuantize", "QAttention", "QEmbed")
+CONTAINERS = ("If", "Loop", "Scan")
+"""Their time is that of the nodes inside, which have entries of their own."""
+
+
+class OrtProfiled:
+    """ONNX Runtime writes a trace file of every node of every run."""
+
+    def __init__(self, ort: Any, path: Path, threads: int, scratch: Path, left_out: list[str]) -> None:
+        options = ort.SessionOptions()
+        options.log_severity_level = 3
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.enable_profiling = True
+        options.profile_file_prefix = str(scratch)
+        try:
+            self._session = ort.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"], disabled_optimizers=left_out
+            )
+        except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
+            raise GraphError(f"ONNX Runtime cannot profile {path.name}: {str(error)[:200]}") from error
+        self._outputs = [node.name for node in self._session.get_outputs()]
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        return dict(zip(self._outputs, self._session.run(self._outputs, feeds), strict=True))
+
+    def times(self) -> list[dict[Node, float]]:
+        events = json.loads(Path(self._session.end_profiling()).read_text(encoding="utf-8"))
+        starts = sorted(event["ts"] for event in events if event["name"] == "model_run")
+        found: list[dict[Node, float]] = [{} for _ in starts]
+        for event in events:
+            name, about = event["name"], event.get("args", {})
+            if event["cat"] != "Node" or not name.endswith("_kernel_time") or about["op_name"] in CONTAINERS:
+                continue
+            dtypes = " ".join(next(iter(each)) for each in about.get("input_type_shape", ()) if each)
+            key = (name.removesuffix("_kernel_time"), about["op_name"], dtypes)
+            run = found[bisect_right(starts, event["ts"]) - 1]
+            run[key] = run.get(key, 0.0) + event["dur"]
+        return found
+
+
+def precision(node: Node) -> str:
+    """Return what a node computes in."""
+    _, kind, dtypes = node
+    if kind in QUANTIZES:
+        return QUANTIZING
+    if kind in MOVES:
+        return MOVING
+    if kind.startswith(INTEGER):
+        return INT8
+    if kind == "MatMulNBits":
+        return "int4 weights"
+    first = dtypes.partition(" ")[0]
+    return {"float": FLOAT32, "": FLOAT32, "double": "float64", "uint8": INT8, "int8": INT8}.get(first, first)
