@@ -13,8 +13,9 @@ from vlatool.hardware.profile import load_profile
 from vlatool.optimize import search as search_module
 from vlatool.optimize.judge import Budget
 from vlatool.optimize.recipe import Limits
-from vlatool.optimize.search import BF16, Search, Trial, built, processor_has, variants_for
+from vlatool.optimize.search import Search, Trial, built, processor_has, variants_for
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime.engines.openvino import BF16
 from vlatool.sensitivity.layers import LayerError
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_transform
