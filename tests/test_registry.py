@@ -53,7 +53,7 @@ def test_a_plain_module_has_no_names():
 
 
 def test_a_wrong_name_gets_the_nearest_one():
-    with pytest.raises(UsageError, match="There is no quantize 'static_in8'; did you mean 'static_int8'"):
+    with pytest.raises(UsageError, match="Unknown quantization method 'static_in8'; did you mean 'static_int8'"):
         registry.load("quantize", "static_in8")
 
 

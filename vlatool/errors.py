@@ -11,7 +11,8 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── ProfileError             a hardware profile
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the place to write to: exists, read-only, full
-│   └── TargetError              the machine that a benchmark should run on: unreachable, or it ends
+│   ├── TargetError              the machine that a benchmark should run on: unreachable, or it ends
+│   └── PluginError              another package that adds something to vlatool
 ├── MissingExtra              4  an optional dependency is absent; names the extra
 ├── GateFailed                1  measured, and outside the limits
 └── Inconclusive              5  measured, and the samples cannot decide
@@ -96,6 +97,10 @@ class OutputError(InputError):
 
 class TargetError(InputError):
     """The machine that a benchmark should run on cannot be reached or used, or what runs there ends."""
+
+
+class PluginError(InputError):
+    """Another package that adds something to vlatool cannot be imported, or fails."""
 
 
 class MissingExtra(VlatoolError):

@@ -1,1 +1,1 @@
-"""Measurements of speed and memory; what is measured is what the robot runs."""
+"""Measure latency and memory through the runtime."""

@@ -12,30 +12,17 @@ from typing import Annotated, Any
 
 import typer
 
+from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, lost, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
-from vlatool.cli._stages import StageGroup
-from vlatool.cli.cache import app as cache
-from vlatool.cli.compare import compare
-from vlatool.cli.doctor import doctor
-from vlatool.cli.explain import explain
-from vlatool.cli.gate import app as gate
-from vlatool.cli.hwselect import app as hwselect
-from vlatool.cli.inspect import inspect
-from vlatool.cli.optimize import optimize
-from vlatool.cli.profiles import app as profiles
-from vlatool.cli.rebuild import rebuild
-from vlatool.cli.samples import app as samples
-from vlatool.cli.simulate import simulate
-from vlatool.cli.telemetry import telemetry
-from vlatool.cli.verify import verify
 from vlatool.files.printable import printable
 from vlatool.machine.version import VERSION
 from vlatool.user_code import trust
 
 app = typer.Typer(
     name="vlatool",
+    cls=Commands,
     help="Make a trained robot policy run, fast and safely, on the board that the robot carries.",
     no_args_is_help=True,
     add_completion=True,
@@ -71,29 +58,6 @@ def _root(
     ] = None,
 ) -> None:
     """Make a trained robot policy run, fast and safely, on the board that the robot carries."""
-
-
-app.command("optimize")(optimize)
-for _kind, _text in (
-    ("export", "Turn a policy into a bundle with graphs that ONNX Runtime was seen to run."),
-    ("quantize", "Make a bundle of lower precision."),
-    ("benchmark", "Measure latency and memory through the runtime."),
-    ("evaluate", "Measure accuracy, on recordings or in the closed loop."),
-):
-    app.add_typer(typer.Typer(cls=StageGroup, help=_text, rich_markup_mode=None), name=_kind)
-app.command("compare")(compare)
-app.command("inspect")(inspect)
-app.command("explain")(explain)
-app.command("rebuild")(rebuild)
-app.command("doctor")(doctor)
-app.command("simulate")(simulate)
-app.command("telemetry")(telemetry)
-app.command("verify")(verify)
-app.add_typer(cache, name="cache")
-app.add_typer(gate, name="gate")
-app.add_typer(hwselect, name="hwselect")
-app.add_typer(profiles, name="profiles")
-app.add_typer(samples, name="samples")
 
 
 def _standard_files() -> None:
@@ -204,7 +168,7 @@ def _tell(error: BaseException, found: Failure) -> None:
     if isinstance(error, CLICK_EXCEPTION):
         with contextlib.suppress(OSError, ValueError):
             error.show()
-    elif found.type == "InternalError" and os.environ.get("VLATOOL_DEBUG"):
+    elif found.type in ("InternalError", "PluginError") and os.environ.get("VLATOOL_DEBUG"):
         raise error
     elif found.exit_code:
         _say(str(found), found.fix)

@@ -82,7 +82,7 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
 
 def registry_name(stage: type[Stage]) -> str:
     """Return the method's name as typed on the command line."""
-    return stage.__module__.rpartition(".")[2].replace("_", "-")
+    return stage.name().partition(".")[2].replace("_", "-")
 
 
 def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:

@@ -1,1 +1,1 @@
-"""Measurements of accuracy: against recorded actions, and in the closed loop of an environment."""
+"""Measure accuracy, on recordings or in the closed loop."""

@@ -1,1 +1,1 @@
-"""Exporters: from a source bundle to a bundle with graphs."""
+"""Turn a policy into a bundle with graphs that ONNX Runtime was seen to run."""

@@ -6,13 +6,16 @@ Every figure says where it comes from. ``kind`` is ``vendor`` (a data sheet), ``
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
+from vlatool import registry
 from vlatool.errors import OutputError, ProfileError, nearest
 from vlatool.files.edited import unstamped, write_own
 from vlatool.files.numbers import Numeric
@@ -298,10 +301,20 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
         raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
 
 
+def _folder(entry: EntryPoint) -> Path | None:
+    """Return the folder of a package that another distribution brings profiles in."""
+    spec = importlib.util.find_spec(entry.module)
+    places = spec.submodule_search_locations if spec else None
+    return Path(next(iter(places))) if places else None
+
+
 def _found() -> dict[str, Path]:
     """Profile name -> file; the first directory that has it wins."""
     package = Path(__file__).resolve().parents[1]
     shipped = next((place for place in (package / "_profiles", package.parent / "profiles") if place.is_dir()), None)
     own = [Path(entry) for entry in os.environ.get(SEARCH_PATH, "").split(os.pathsep) if entry]
-    files = [path for folder in (*own, shipped) if folder and folder.is_dir() for path in sorted(folder.iterdir())]
+    brought = [_folder(entry) for entry in registry.plugins("profiles").values()]
+    files = [
+        path for folder in (*own, shipped, *brought) if folder and folder.is_dir() for path in sorted(folder.iterdir())
+    ]
     return {path.stem: path for path in reversed(files) if path.suffix in SUFFIXES}

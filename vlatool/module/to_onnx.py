@@ -9,9 +9,7 @@ import logging
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Any
-
-from torch import nn
+from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
@@ -20,6 +18,9 @@ from vlatool.graph.nodes import FOLDED
 from vlatool.module.factory import exits_told
 from vlatool.module.failures import export_error
 from vlatool.module.norms import divide_by_roots
+
+if TYPE_CHECKING:
+    from torch import nn
 
 EXTERNAL_DATA_BYTES = 1_500_000_000
 """Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""

@@ -1,1 +1,1 @@
-"""Quantization methods: from a bundle to a bundle of lower precision."""
+"""Make a bundle of lower precision."""

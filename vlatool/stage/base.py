@@ -104,12 +104,12 @@ class Stage(Numeric):
     @classmethod
     def kind(cls) -> str:
         """Folder of the stage, for example ``quantize``."""
-        return cls.__module__.split(".")[-2]
+        return registry.entry_of(cls).partition(".")[0]
 
     @classmethod
     def name(cls) -> str:
         """Name in a recipe, for example ``quantize.static_int8``."""
-        return ".".join(cls.__module__.split(".")[-2:])
+        return registry.entry_of(cls)
 
     def options(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, as JSON values."""

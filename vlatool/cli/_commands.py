@@ -1,0 +1,65 @@
+"""The commands: one file each, one for each kind of stage, those of other packages; imported when they are named."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from vlatool import registry
+from vlatool.cli._stages import StageGroup
+from vlatool.errors import PluginError, UsageError, nearest
+from vlatool.stage.base import stage_kinds
+
+FIRST = "optimize"
+"""What most people want stands first in the help."""
+HIDDEN = ("sources",)
+"""Kinds of stages that are no command: a source is an argument of every command."""
+
+
+class Commands(TyperGroup):
+    """The group of all commands."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the commands: the one for everything, then the others by name."""
+        kinds = [kind for kind in stage_kinds() if kind not in HIDDEN and registry.names(kind)]
+        found = {name.replace("_", "-") for name in (*registry.names("commands"), *kinds)}
+        return sorted(found, key=lambda name: (name != FIRST, name))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command that is named; where there is none, say which is nearest."""
+        if args and args[0] not in (known := self.list_commands(ctx)) and not ctx.resilient_parsing:
+            raise UsageError(f"Unknown command '{args[0]}'; {nearest(args[0], known)}.", "vlatool --help")
+        return super().resolve_command(ctx, args)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Build the command of one file, or of one kind of stage."""
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        if cmd_name in stage_kinds():
+            package = importlib.import_module(registry.package_of(cmd_name))
+            text = (package.__doc__ or "").strip().splitlines()[0]
+            group = typer.main.get_group(typer.Typer(cls=StageGroup, help=text, rich_markup_mode=None))
+            group.name = cmd_name
+            return group
+        source = registry.module("commands", cmd_name)
+        found = getattr(source, "app", None) or getattr(source, cmd_name.replace("-", "_"), None)
+        if not isinstance(found, typer.Typer) and not callable(found):
+            who = registry.owner(source.__name__)
+            raise PluginError(f"The package {who} adds the command '{cmd_name}', but neither a function of that name "
+                              f"nor a Typer 'app' is in {source.__name__}.", "tell its authors")  # fmt: skip
+        return _built(found, cmd_name)
+
+
+def _built(found: Any, name: str) -> Any:
+    """Return the click command of a Typer application or of a function."""
+    if not isinstance(found, typer.Typer):
+        single = typer.Typer(add_completion=False, rich_markup_mode=None)
+        single.command(name)(found)
+        found = single
+    found._add_completion = False
+    command = typer.main.get_command(found)
+    command.name = name
+    return command
