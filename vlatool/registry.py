@@ -101,6 +101,15 @@ def entry_of(found: type) -> str:
     return _FOREIGN.get(found) or ".".join(found.__module__.split(".")[-2:])
 
 
+def all_plugins() -> dict[str, list[str]]:
+    """Return other package (``acme 1.2``) -> what it adds, as ``kind.name``."""
+    found: dict[str, list[str]] = {}
+    for group in sorted(metadata.entry_points().groups):
+        for entry in plugins(group.partition(".")[2]).values() if group.startswith("vlatool.") else ():
+            found.setdefault(_title(entry), []).append(f"{group.partition('.')[2]}.{entry.name}")
+    return found
+
+
 def owner(module_name: str) -> str:
     """Return which other package brings a module (``acme 1.2``); empty for vlatool's own, and for any that brings none.
 
@@ -108,11 +117,9 @@ def owner(module_name: str) -> str:
         module_name: Of any module of that package.
     """
     top = module_name.partition(".")[0]
-    for group in metadata.entry_points().groups if top != "vlatool" else ():
-        for entry in metadata.entry_points(group=group) if group.startswith("vlatool.") else ():
-            if entry.module.partition(".")[0] == top:
-                return _title(entry)
-    return ""
+    groups = (group for group in metadata.entry_points().groups if group.startswith("vlatool.") and top != "vlatool")
+    entries = (entry for group in groups for entry in metadata.entry_points(group=group))
+    return next((_title(entry) for entry in entries if entry.module.partition(".")[0] == top), "")
 
 
 def _own(kind: str) -> list[str]:

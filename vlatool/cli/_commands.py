@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.cli._stages import StageGroup
+from vlatool.cli._stages import StageGroup, built, failing
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import stage_kinds
 
@@ -44,21 +44,22 @@ class Commands(TyperGroup):
             group = typer.main.get_group(typer.Typer(cls=StageGroup, help=text, rich_markup_mode=None))
             group.name = cmd_name
             return group
-        source = registry.module("commands", cmd_name)
+        try:
+            source = registry.module("commands", cmd_name)
+        except PluginError as error:
+            return failing(cmd_name, error)
         found = getattr(source, "app", None) or getattr(source, cmd_name.replace("-", "_"), None)
         if not isinstance(found, typer.Typer) and not callable(found):
-            who = registry.owner(source.__name__)
-            raise PluginError(f"The package {who} adds the command '{cmd_name}', but neither a function of that name "
-                              f"nor a Typer 'app' is in {source.__name__}.", "tell its authors")  # fmt: skip
+            missing = f"neither a function of that name nor a Typer 'app' is in {source.__name__}"
+            words = f"The package {registry.owner(source.__name__)} adds the command '{cmd_name}', but {missing}."
+            return failing(cmd_name, PluginError(words, "tell its authors"))
         return _built(found, cmd_name)
 
 
 def _built(found: Any, name: str) -> Any:
     """Return the click command of a Typer application or of a function."""
     if not isinstance(found, typer.Typer):
-        single = typer.Typer(add_completion=False, rich_markup_mode=None)
-        single.command(name)(found)
-        found = single
+        return built(found, name)
     found._add_completion = False
     command = typer.main.get_command(found)
     command.name = name

@@ -8,7 +8,7 @@ import types
 import typing
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from pydantic.fields import FieldInfo
@@ -17,7 +17,7 @@ from typer.core import TyperGroup
 
 from vlatool import registry
 from vlatool.cli import _complete, _run
-from vlatool.errors import UsageError, nearest
+from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import Measure, Stage, validated
 
 DEFAULTS = {"export": "onnx", "quantize": "static-int8", "benchmark": "latency", "evaluate": "recorded"}
@@ -35,12 +35,11 @@ class StageGroup(TyperGroup):
         """Build the command of one method."""
         if cmd_name.replace("_", "-") not in self.list_commands(ctx):
             return None
-        stage = registry.load(self.name or "", cmd_name)
-        single = typer.Typer(add_completion=False, rich_markup_mode=None)
-        single.command(cmd_name, help=stage.__doc__)(stage_function(stage))
-        command = typer.main.get_command(single)
-        command.name = cmd_name
-        return command
+        try:
+            stage = registry.load(self.name or "", cmd_name)
+        except PluginError as error:
+            return failing(cmd_name, error)
+        return built(stage_function(stage), cmd_name, stage.__doc__)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the default method when the first word is not a method."""
@@ -55,6 +54,24 @@ class StageGroup(TyperGroup):
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Return methods, and what the default method takes in their place."""
         return [*super().shell_complete(ctx, incomplete), *_complete.items(_complete.sources(incomplete))]
+
+
+def built(function: Callable[..., Any], name: str, text: str | None = None, **settings: Any) -> Any:
+    """Return the click command of a function."""
+    single = typer.Typer(add_completion=False, rich_markup_mode=None)
+    single.command(name, help=text, context_settings=settings)(function)
+    command = typer.main.get_command(single)
+    command.name = name
+    return command
+
+
+def failing(name: str, error: PluginError) -> Any:
+    """Return a command of another package that says why it is none; so that ``--help`` lists all others."""
+
+    def fails(words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
+        raise error
+
+    return built(fails, name, f"Does not work: {error.message}", ignore_unknown_options=True)
 
 
 def stage_function(stage: type[Stage]) -> Callable[..., None]:

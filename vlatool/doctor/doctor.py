@@ -14,7 +14,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
-from vlatool.errors import MissingExtra, VlatoolError
+from vlatool import registry
+from vlatool.errors import MissingExtra, PluginError, VlatoolError
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, engine_class, engine_names
@@ -68,6 +69,7 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
         *engines(installed, host.board(root), lambda library: library.execution_providers()),
         *arithmetic(),
         *extras(installed),
+        *plugins(),
         instruction_set(host.isa(root)),
         *confined(host.onednn_max_cpu_isa()),
         *telemetry(root),
@@ -153,6 +155,21 @@ def extras(installed: Mapping[str, str]) -> Iterator[Check]:
 def _present(name: str, installed: Mapping[str, str]) -> str | None:
     """The distribution that provides ``name``, or None."""
     return next((found for found in (name, *_substitutes().get(name, ())) if found in installed), None)
+
+
+def plugins() -> Iterator[Check]:
+    """What other packages add to vlatool."""
+    for title, added in registry.all_plugins().items():
+        name, broken = f"plugin {title.partition(' ')[0]}", []
+        for each in added:
+            try:
+                registry.module(*each.split(".", 1))
+            except PluginError as error:
+                broken.append(error.message)
+        finding = f"{title} adds {', '.join(added)}"
+        yield (
+            Check(name, "warn", f"{finding}; {' '.join(broken)}", "update it") if broken else Check(name, "ok", finding)
+        )
 
 
 def _substitutes() -> dict[str, tuple[str, ...]]:

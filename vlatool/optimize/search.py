@@ -21,10 +21,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vlatool import registry
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.errors import GraphError, VlatoolError
+from vlatool.errors import GraphError, PluginError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import isa
@@ -34,7 +35,7 @@ from vlatool.optimize.recipe import Limits, StageList, stage_entries
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
 from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform, build_stage, stage_class
 from vlatool.stage.run import cached_measure, cached_transform
 
 if TYPE_CHECKING:
@@ -257,6 +258,12 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
     for name in board:
         if installed(name):
             found |= engine_class(name).variants(partial(processor_has, profile), calibrated)
+    for name in registry.names("quantize"):
+        try:
+            method = stage_class(f"quantize.{name}")
+        except PluginError:  # doctor says so; nobody asked for it here
+            continue
+        found |= {f"{name}{ending}": ({method.name(): dict(how)},) for ending, how in method.tried.items()}
     return found
 
 

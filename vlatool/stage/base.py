@@ -98,6 +98,8 @@ class Stage(Numeric):
     """Base of every stage: options as fields, extra keys refused, frozen."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    tried: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    """Options with which a search of ``optimize`` tries the stage: ending of the plan's name -> options."""
     packages: ClassVar[tuple[str, ...]] = ()
     """Distributions whose versions change the result whatever the options; part of the cache key and the record."""
 

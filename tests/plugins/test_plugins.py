@@ -1,0 +1,146 @@
+"""A package outside of vlatool adds a method, an engine, a source, a profile and a command by entry points alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+ENTRY_POINTS = """\
+[vlatool.quantize]
+rounded = acme_robotics.rounded:Rounded
+broken = acme_robotics.broken
+static-int8 = acme_robotics.broken
+absent = acme_robotics.no_such_file
+
+[vlatool.engines]
+acme = acme_robotics.engine
+
+[vlatool.sources]
+acme = acme_robotics.source
+
+[vlatool.profiles]
+acme = acme_robotics.boards
+
+[vlatool.commands]
+acme = acme_robotics.hello
+"""
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def wheel(folder: Path) -> Path:
+    """Write the wheel of the package; a build backend would need packages that are not here."""
+    info = "acme_robotics-1.2.dist-info"
+    files = {path.relative_to(HERE).as_posix(): path.read_text() for path in (HERE / "acme_robotics").rglob("*.*")
+             if "__pycache__" not in path.parts}  # fmt: skip
+    files[f"{info}/METADATA"] = "Metadata-Version: 2.1\nName: acme-robotics\nVersion: 1.2\n"
+    files[f"{info}/WHEEL"] = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    files[f"{info}/entry_points.txt"] = ENTRY_POINTS
+    files[f"{info}/RECORD"] = "".join(f"{name},,\n" for name in [*files, f"{info}/RECORD"])
+    made = folder / "acme_robotics-1.2-py3-none-any.whl"
+    with zipfile.ZipFile(made, "w") as archive:
+        for name, text in files.items():
+            archive.writestr(name, text)
+    return made
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A function that runs vlatool in a fresh environment in which the package is installed."""
+    place = tmp_path_factory.mktemp("plugin")
+    python = place / "venv/bin/python"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place / "venv")], check=True)
+    library = next((place / "venv/lib").glob("python*")) / "site-packages"
+    (library / "here.pth").write_text(
+        "\n".join([str(ROOT), *(each for each in sys.path if each.endswith("site-packages"))])
+    )
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-index", "--no-deps"]
+    subprocess.run([*install, str(wheel(place))], check=True)
+    environment = {**os.environ, "VLATOOL_CACHE": str(place / "cache"), "COLUMNS": "200"}
+
+    def call(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [str(python), "-W", "ignore", *([] if words[0] == "-c" else ["-m", "vlatool"]), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=place, env=environment)
+
+    return call
+
+
+def ok(done: subprocess.CompletedProcess[str]) -> str:
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_help_lists_its_method_and_its_command(run: Run):
+    assert "rounded " in ok(run("quantize", "--help"))
+    assert "Round every weight to a few bits" in ok(run("quantize", "rounded", "--help"))
+    assert "  acme " in ok(run("--help"))
+    assert ok(run("acme", "robot")) == "hello robot\n"
+
+
+def test_doctor_says_what_it_adds(run: Run):
+    told = {each["name"]: each for each in json.loads(run("doctor", "--json").stdout)}
+    assert (
+        "acme-robotics 1.2 adds commands.acme, engines.acme, profiles.acme" in told["plugin acme-robotics"]["finding"]
+    )
+    assert "quantize.rounded" in told["plugin acme-robotics"]["finding"]
+    assert "'absent' (vlatool.quantize), cannot be imported" in told["plugin acme-robotics"]["finding"]
+    assert told["engine acme_robotics"]["status"] == "ok"
+
+
+def test_its_profile_is_found_by_name(run: Run):
+    assert "acme-board" in ok(run("profiles", "list"))
+    assert "acme-board" in ok(run("profiles", "show", "acme-board"))
+
+
+def test_its_method_its_source_and_its_engine_run(run: Run, onnx_file: Path, tmp_path: Path):
+    (tmp_path / "tiny.acme").write_text(f"{onnx_file.name}\n")
+    ok(run("quantize", "rounded", str(tmp_path / "tiny.acme"), "-o", str(tmp_path / "out"), "--bits", "8"))
+    made = json.loads((tmp_path / "out/manifest.json").read_text())["made_by"]
+    assert (made["stage"], made["options"]) == ("quantize.rounded", {"bits": 8})
+    told = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20"))
+    assert "latency_p50" in told or "p50" in told
+
+
+def test_optimize_chooses_its_method(run: Run, policy_dir: Path, tmp_path: Path):
+    recipe = {"schema": 1, "candidates": {"theirs": [{"quantize.rounded": {"bits": 12}}]}, "search": False}
+    (tmp_path / "recipe.yaml").write_text(json.dumps(recipe))
+    limits = ["--max-drop", "50%", "--max-memory-mb", "4000", "--episodes", "0", "--iterations", "40"]
+    done = run(
+        "optimize", str(policy_dir), "--recipe", str(tmp_path / "recipe.yaml"), "-o", str(tmp_path / "o"), *limits
+    )
+    assert (tmp_path / "o/manifest.json").is_file(), done.stdout + done.stderr
+    report = json.loads((tmp_path / "o/reports/report.json").read_text())
+    assert {row["name"]: row["role"] for row in report["rows"]}["theirs"] == "chosen", done.stdout
+
+
+def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
+    code = "from vlatool.optimize.search import variants_for; print(sorted(variants_for(None, False)))"
+    found = ok(run("-c", code))
+    assert "'rounded'" in found
+    assert "'acme_float16'" in found
+
+
+def test_its_bug_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
+    done = run("quantize", "broken", str(onnx_file), "-o", str(tmp_path / "out"))
+    assert done.returncode == 3
+    assert "The package acme-robotics 1.2, which adds to vlatool, fails: ZeroDivisionError" in done.stderr
+    assert "bug in vlatool" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_imported_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
+    done = run("quantize", "absent", str(onnx_file), "-o", str(tmp_path / "out"))
+    assert done.returncode == 3
+    assert "acme-robotics 1.2, which brings 'absent' (vlatool.quantize), cannot be imported" in done.stderr
+
+
+def test_it_replaces_nothing_of_vlatools_own(run: Run):
+    assert "activation ranges" in ok(run("quantize", "static-int8", "--help"))
