@@ -58,7 +58,7 @@ def test_a_wrong_name_gets_the_nearest_one():
 
 
 def test_a_shared_file_cannot_be_loaded():
-    with pytest.raises(UsageError, match="no quantize '_graphs'"):
+    with pytest.raises(UsageError, match="Unknown quantization method '_graphs'"):
         registry.load("quantize", "_graphs")
 
 

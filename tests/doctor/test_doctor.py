@@ -262,3 +262,11 @@ def test_disk() -> None:
     assert doctor.disk(host.ROOT, lambda path: SimpleNamespace(free=80e9)) == Check("disk", "ok", "80.0 GB free")
     found = doctor.disk(Path("/elsewhere"), lambda path: SimpleNamespace(free=1e9))
     assert (found.status, found.finding) == ("warn", "1.0 GB free")
+
+
+def test_a_library_that_fails_is_a_warning() -> None:
+    def broken(_: object) -> list[str]:
+        raise AttributeError("no such function")
+
+    found = named(doctor.engines({"onnxruntime": "1.31"}, None, broken), "engine onnxruntime")
+    assert (found.status, found.finding) == ("warn", "onnxruntime 1.31 fails: AttributeError: no such function")

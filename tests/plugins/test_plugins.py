@@ -86,13 +86,13 @@ def test_the_help_lists_its_method_and_its_command(run: Run):
 
 
 def test_doctor_says_what_it_adds(run: Run):
-    told = {each["name"]: each for each in json.loads(run("doctor", "--json").stdout)}
+    told = {each["name"]: each for each in json.loads(ok(run("doctor", "--json")))}
     assert (
         "acme-robotics 1.2 adds commands.acme, engines.acme, profiles.acme" in told["plugin acme-robotics"]["finding"]
     )
     assert "quantize.rounded" in told["plugin acme-robotics"]["finding"]
     assert "'absent' (vlatool.quantize), cannot be imported" in told["plugin acme-robotics"]["finding"]
-    assert told["engine acme_robotics"]["status"] == "ok"
+    assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Acme"
 
 
 def test_its_profile_is_found_by_name(run: Run):

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from vlatool import registry
 from vlatool.errors import MissingExtra, PluginError, VlatoolError
+from vlatool.files.printable import message_of
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, engine_class, engine_names
@@ -113,6 +114,8 @@ def _engine(
         found = ask(library)
     except MissingExtra as error:
         return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
+    except Exception as error:  # the seam: a library, or another package's engine, raises what it likes
+        return Check(title, "warn", f"{words} fails: {type(error).__name__}: {message_of(error)}", "update it")
     short = [name.removesuffix("ExecutionProvider") for name in found]
     finding = f"{words}: {', '.join(short)}" if short else words
     if short and jetson and not {"CUDA", "Tensorrt"} & {*short}:
@@ -166,14 +169,12 @@ def plugins() -> Iterator[Check]:
                 registry.module(*each.split(".", 1))
             except PluginError as error:
                 broken.append(error.message)
-        finding = f"{title} adds {', '.join(added)}"
-        yield (
-            Check(name, "warn", f"{finding}; {' '.join(broken)}", "update it") if broken else Check(name, "ok", finding)
-        )
+        finding = "; ".join([f"{title} adds {', '.join(added)}", *broken])
+        yield Check(name, "warn", finding, "update it") if broken else Check(name, "ok", finding)
 
 
 def _substitutes() -> dict[str, tuple[str, ...]]:
-    """Package of an engine -> the distributions that bring it, too."""
+    """Package of an engine -> the distributions of other names that bring it."""
     return {library.package: library.substitutes for library in map(engine_class, engine_names())}
 
 

@@ -73,7 +73,7 @@ class Engine:
     extra: ClassVar[str] = ""
     """The extra of vlatool that brings it."""
     substitutes: ClassVar[tuple[str, ...]] = ()
-    """Distributions that bring the same package."""
+    """Distributions of other names that bring the same package."""
     advice: ClassVar[str] = ""
     """What ``doctor`` adds to the command that installs it."""
     computes: ClassVar[tuple[str, ...]] = ("float32",)

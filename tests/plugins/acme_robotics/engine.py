@@ -12,6 +12,11 @@ class AcmeSession(OrtCpuSession):
     layouts = {}
 
     @classmethod
+    def execution_providers(cls):
+        """Run on one thing alone."""
+        return ["AcmeExecutionProvider"]
+
+    @classmethod
     def variants(cls, has, calibrated):
         """Try what it is good at."""
         return {"acme_float16": ({"quantize.float16": {}},)}
