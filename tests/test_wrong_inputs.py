@@ -312,7 +312,7 @@ def unsupported_compression(data: bytes) -> bytes:
 WORDS = ("go", "to", "the", "red", "blue", "ball", "box")
 MAKE = "import torch\ndef make(layers=1):\n    "
 COMMANDS = [
-    Row("an unknown command", "Did you mean 'quantize'", 2, lambda at: ["quantise", at.float]),
+    Row("an unknown command", "did you mean 'quantize'", 2, lambda at: ["quantise", at.float]),
     Row("an unknown method", "did you mean 'static-int8'", 2, lambda at: ["quantize", "static-in8", at.float, *at.to]),
     Row("an unknown option", "--percentile", 2, lambda at: ["quantize", at.float, *at.to, "--percentil", 99]),
     Row("no output", "Missing option '-o'", 2, lambda at: ["quantize", at.float]),

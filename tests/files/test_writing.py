@@ -40,7 +40,7 @@ with writing(Path(sys.argv[1])) as draft:
 KILLED_LATE = """
 import os, sys
 from pathlib import Path
-from vlatool import writing as module
+from vlatool.files import writing as module
 def kill(*_args, **_options):
     os.kill(os.getpid(), 9)
 replace = module._replace

@@ -332,7 +332,7 @@ def test_a_copy_is_the_same_board_under_another_name(like: str, tmp_path: Path) 
     copy_profile(like, "robot-arm-2", tmp_path / "mine.yaml")
     made = load_profile(tmp_path / "mine.yaml")
     assert made.name == "robot-arm-2"
-    assert made.model_copy(update={"name": like}) == load_profile(like)
+    assert made == load_profile(like).model_copy(update={"name": "robot-arm-2", "aliases": ()})
 
 
 def test_a_copy_of_a_file_of_ones_own(tmp_path: Path, valid: dict[str, Any]) -> None:
@@ -384,3 +384,39 @@ def test_listing_and_reading_load_no_inference_library() -> None:
         "print(sorted({'torch', 'onnx', 'onnxruntime'} & {*sys.modules}))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize(("typed", "board"), [
+    ("thor", "jetson-agx-thor"), ("orin-nano", "jetson-orin-nano"), ("agx-orin", "jetson-agx-orin-64gb"),
+    ("jetson-agx-orin", "jetson-agx-orin-64gb"), ("nuc", "intel-nuc-13-pro"), ("pi5", "raspberry-pi-5"),
+    ("pi-5", "raspberry-pi-5"), ("rpi5", "raspberry-pi-5"), ("Raspberry Pi 5", "raspberry-pi-5"),
+    ("Jetson_Orin_Nano", "jetson-orin-nano"), ("orin-nx", "jetson-orin-nx-16gb"), ("rpi4", "raspberry-pi-4"),
+])  # fmt: skip
+def test_a_board_has_other_names(typed: str, board: str) -> None:
+    assert load_profile(typed).name == board
+
+
+def test_no_two_boards_have_one_name() -> None:
+    listed = [alias for name in names() for alias in (name, *load_profile(name).aliases)]
+    assert len(listed) == len(set(listed))
+
+
+@pytest.mark.parametrize(("typed", "board"), [
+    ("jetson-agx-orinn", "jetson-agx-orin-64gb"), ("rpi-55", "raspberry-pi-5"),
+])  # fmt: skip
+def test_a_suggestion_is_the_board_that_has_the_nearest_name(typed: str, board: str) -> None:
+    with pytest.raises(ProfileError, match=f"did you mean '{board}'"):
+        load_profile(typed)
+
+
+def test_a_copy_does_not_take_the_other_names(tmp_path: Path) -> None:
+    copy_profile("pi5", "my-board", tmp_path / "my-board.yaml")
+    assert load_profile(tmp_path / "my-board.yaml").aliases == ()
+
+
+def test_a_users_profile_may_have_the_name_that_a_board_goes_by(
+    tmp_path: Path, valid: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, valid | {"name": "thor"}, "thor")
+    monkeypatch.setenv("VLATOOL_PROFILES", str(tmp_path))
+    assert load_profile("thor").name == "thor"

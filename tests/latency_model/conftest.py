@@ -1,5 +1,5 @@
-"""Fixtures of latency models, shared with tests of boards."""
+"""Fixtures of latency models, which the tests of boards and of the latency model share."""
 
-from _latency_models import load, model, points, sample
+from _latency_models import certain, load, model, points, sample
 
-__all__ = ["load", "model", "points", "sample"]
+__all__ = ["certain", "load", "model", "points", "sample"]

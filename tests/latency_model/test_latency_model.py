@@ -11,6 +11,7 @@ import pytest
 from vlatool.errors import DataError
 from vlatool.graph.workload import Workload
 from vlatool.hardware.profile import load_profile, names
+from vlatool.latency_model import model as module
 from vlatool.latency_model.features import Place, Question, Work
 from vlatool.latency_model.model import WIDEST, LatencyModel, crowds, no_ground, part_of, read_model, shipped, write
 from vlatool.latency_model.published import Point, known_devices
@@ -32,7 +33,7 @@ def reread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
 
     def through(model: LatencyModel) -> LatencyModel:
         write(model, tmp_path)
-        monkeypatch.setattr(model, "DATA", tmp_path)
+        monkeypatch.setattr(module, "DATA", tmp_path)
         read_model.cache_clear()
         return shipped()
 
@@ -134,7 +135,7 @@ def test_a_runtime_with_very_many_figures_counts_where_it_is_asked_about(
     crowded, other = ask(place=orin, runtime="tensorrt", precision="float16"), ask()
     with_all = {each: model.predict([each])[0].ms for each in (crowded, other)}
     assert crowds(known.rows) == set()
-    monkeypatch.setattr(model, "CROWD", 17)  # three devices with TensorRT have 18 figures
+    monkeypatch.setattr(module, "CROWD", 17)  # three devices with TensorRT have 18 figures
     (crowd,) = crowds(known.rows)
     assert len(known.without([]).rows) == 42
     assert len(known.without([crowd]).rows) == 42 - 18
@@ -174,7 +175,7 @@ def test_an_npu_that_was_never_published_is_unknown(model: LatencyModel) -> None
     other = replace(HAILO, device="hailo-99")
     asked = ask(place=other, runtime="hailort", precision="int8")
     (found,) = model.predict([asked])
-    assert (found.regime, found.why) == ("unseen", model.OTHER_NPU)
+    assert (found.regime, found.why) == ("unseen", module.OTHER_NPU)
     assert model.predict([replace(asked, place=HAILO)])[0].known
     told = model.conditioned([(asked, 20.0)])
     assert told.predict([asked])[0].known, "once it was measured"

@@ -5,11 +5,11 @@ import sys
 
 ENDING = """
 import os, signal
-from vlatool import apart
+from vlatool.user_code import children
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
-server = apart._Server(dict(os.environ))
-apart._servers[(str(os.getpid()),)] = server
+server = children._Server(dict(os.environ))
+children._servers[(str(os.getpid()),)] = server
 wait = server.process.wait
 
 def interrupted(patience=None):

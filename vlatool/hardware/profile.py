@@ -6,9 +6,12 @@ Every figure says where it comes from. ``kind`` is ``vendor`` (a data sheet), ``
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import importlib.util
 import os
 import re
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated, Literal
@@ -160,6 +163,7 @@ class Profile(_Strict):
 
     Args:
         name: As on the command line; lower case, digits and hyphens.
+        aliases: Other names that people type for it.
         model_strings: What the board's firmware or processor calls itself (see ``vlatool.machine.host.matches``).
         memory_gb: Memory in GB (10^9 bytes), shared by CPU and GPU where ``unified``.
         usable_memory_gb: What is left for a policy beside system, desktop and drivers.
@@ -179,6 +183,7 @@ class Profile(_Strict):
     """
 
     name: str = Field(pattern=NAME)
+    aliases: tuple[Annotated[str, Field(pattern=NAME)], ...] = ()
     title: str
     architecture: Literal["aarch64", "x86_64"]
     model_strings: tuple[str, ...] = Field(min_length=1)
@@ -253,7 +258,7 @@ def names() -> list[str]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
-    """Read a profile by name, or from a YAML file of the user.
+    """Read a profile by its name or another name of it, or from a YAML file of the user.
 
     Directories named in ``VLATOOL_PROFILES`` (separated by ``:``) come before the profiles that are shipped.
 
@@ -264,14 +269,7 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
         >>> load_profile("raspberry-pi-5").units["cpu"].cores.value
         4.0
     """
-    wanted = os.fspath(name_or_path)
-    if wanted.endswith(SUFFIXES) or os.sep in wanted:
-        path = Path(wanted)
-    elif wanted in (found := _found()):
-        path = found[wanted]
-    else:
-        fix = f"name one of these or a YAML file, or add a directory to {SEARCH_PATH}"
-        raise ProfileError(f"There is no profile '{wanted}'; {nearest(wanted, found)}.", fix)
+    path = _file_of(os.fspath(name_or_path))
     data = read_mapping(path, f"The profile {path}", ProfileError)
     try:
         return Profile.model_validate(data)
@@ -291,14 +289,47 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
         OutputError: when the file exists and ``force`` is not given, was changed by hand, or cannot be written.
     """
     load_profile(like)
-    path = Path(like) if like.endswith(SUFFIXES) or os.sep in like else _found()[like]
+    path = _file_of(like)
     if not re.fullmatch(NAME, name):
         raise ProfileError(f"'{name}' is no name of a profile; allowed: lower-case letters, digits and hyphens.")
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
+    text = re.sub(r"(?m)^aliases: .*\n", "", text, count=1)
     try:
         write_own(target, text, force=force)
     except OSError as error:
         raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
+
+
+def _file_of(wanted: str) -> Path:
+    """Return the file of a profile: a path, a name, or another name that a profile has.
+
+    Raises:
+        ProfileError: when there is none; names the nearest board, by whatever name of it.
+    """
+    if wanted.endswith(SUFFIXES) or os.sep in wanted:
+        return Path(wanted)
+    found = _found()
+    if wanted in found:
+        return found[wanted]
+    typed = re.sub(r"[\s_]+", "-", wanted.strip().lower())
+    boards = {**_aliases(found), **{name: name for name in found}}
+    if typed in boards:
+        return found[boards[typed]]
+    near = difflib.get_close_matches(typed, boards, n=1)
+    listing = f"known: {', '.join(sorted(found))}"
+    fix = f"name one of these or a YAML file, or add a directory to {SEARCH_PATH}"
+    told = f"did you mean '{boards[near[0]]}'? {listing}" if near else listing
+    raise ProfileError(f"There is no profile '{wanted}'; {told}.", fix)
+
+
+def _aliases(found: Mapping[str, Path]) -> dict[str, str]:
+    """Return other name -> name of a profile; files that cannot be read have none."""
+    known: dict[str, str] = {}
+    for name, path in found.items():
+        with contextlib.suppress(ProfileError):
+            listed = read_mapping(path, f"The profile {path}", ProfileError).get("aliases")
+            known |= {str(each): name for each in listed if each not in known} if isinstance(listed, list) else {}
+    return known
 
 
 def _folder(entry: EntryPoint) -> Path | None:

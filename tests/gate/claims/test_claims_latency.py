@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from vlatool.gate import timed as timed_module
 from vlatool.gate.claims.latency import change, examine, examine_all, slower, told
 from vlatool.gate.config import LatencyClaim
 from vlatool.measurement.pairs import Pairs
@@ -33,7 +34,7 @@ def test_a_few_slow_observations_fail_by_the_mean(timed, monkeypatch) -> None:
         return Pairs(tuple(base), tuple(mine), tuple(places))
 
     processes = timed()
-    monkeypatch.setattr(timed, "measure_pairs", measured)
+    monkeypatch.setattr(timed_module, "measure_pairs", measured)
     found = examine(processes, LatencyClaim())
     assert found.verdict == "fail"
     assert found.sentence.startswith("the mean over observations is 7.2% slower")
@@ -47,7 +48,7 @@ def test_one_observation_that_is_slow_each_time_fails(timed, monkeypatch, slow: 
         return Pairs((5.0,) * 60, (5.0,) * 60, slow=further if job.seed == 3 else (), slow_input="recorded: 3x")
 
     processes = timed()
-    monkeypatch.setattr(timed, "measure_pairs", measured)
+    monkeypatch.setattr(timed_module, "measure_pairs", measured)
     found = examine(processes, LatencyClaim())
     assert found.verdict == verdict
     assert ("1 of 10 processes found an observation that is slower by more than 50% each time: recorded: 3x"
@@ -64,7 +65,7 @@ def test_each_number_of_threads_is_a_claim_of_its_own(timed, monkeypatch, slow: 
         return Pairs(tuple(base), tuple(base * (1.3 if job.threads == slow else 1.0)))
 
     processes = timed()
-    monkeypatch.setattr(timed, "measure_pairs", measured)
+    monkeypatch.setattr(timed_module, "measure_pairs", measured)
     found = examine_all(processes, LatencyClaim(also_threads=(4,)))
     assert [each.verdict for each in found] == verdicts
     assert [each.claim for each in found] == ["latency", "latency, 4 threads"]
