@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-RECORDED = 32
-"""Observations for calibration: with 8, those that come after left the ranges seen by half."""
+RECORDED = 64
+"""Observations for calibration, as many as a stage reads; with 8, those that come after leave the ranges by half."""
 WORDS = ("go", "to", "the", "red", "blue", "ball", "box")
 TEXTS = ("go to red ball", "blue box", "ball to the box", "go")
 BODIES = {
