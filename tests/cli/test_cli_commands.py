@@ -162,6 +162,7 @@ def test_a_method_may_be_named_with_hyphen_or_underscore_and_prints_json(vlatool
             "bytes": made.size_bytes,
             "precision": {"main": made.manifest.graphs["main"].precision},
             "findings": [],
+            "board": None,
         }
         assert made.manifest.made_by["options"] == {"per_channel": False}
 

@@ -15,6 +15,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
+from vlatool.cli._made import for_board, graph_bytes
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.machine.host import MAX_CPU_ISA
@@ -48,6 +49,14 @@ _FORCE = _flag("force", bool, False, "--force", help="replace an output that exi
 _JSON = _flag("as_json", bool, False, "--json", help="print JSON on stdout")
 TRANSFORM_FLAGS = (
     _flag("out", Path, ..., "-o", "--output", help="directory of the new bundle", show_default=False),
+    _flag(
+        "profile",
+        str | None,
+        None,
+        "--profile",
+        help="make it as this board takes it, and say what to expect there (see: vlatool profiles list)",
+        autocompletion=_complete.profiles,
+    ),
     _FORCE,
     _JSON,
 )
@@ -75,12 +84,15 @@ MEASURE_FLAGS = (
 )
 
 
-def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool) -> None:
+def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool, profile: str | None = None) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
+    from vlatool.hardware.profile import load_profile
     from vlatool.sources import exported, is_bundle, source_stage, sourced
 
     bundle: Bundle | None
-    refuse_existing(out, force, source, *named_files(stage), kind=BUNDLE)
+    refuse_existing(out, force, source, file_or_none(profile), *named_files(stage), kind=BUNDLE)
+    board = load_profile(profile) if profile else None
+    stage = stage.on(board) if board else stage
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)
@@ -91,16 +103,16 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         made = run_transform(stage, bundle, out, context, force=force)
+        there = for_board(made, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""
     summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
     precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
     findings = made.manifest.findings
     if as_json:
-        document({**summary, "precision": precision, "findings": findings})
+        document({**summary, "precision": precision, "findings": findings, "board": there.values() if there else None})
         _refuse(made, baseline)
         return
-    graphs = sum(record.bytes for file, record in made.manifest.files.items() if file.startswith("graphs/"))
-    sizes = f"graphs {graphs / 1e6:.2f} MB, in all {made.size_bytes / 1e6:.1f} MB"
+    sizes = f"graphs {graph_bytes(made) / 1e6:.2f} MB, in all {made.size_bytes / 1e6:.1f} MB"
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {sizes}")
     for line in stage.lines(made):
         typer.echo(f"  {line}")
@@ -109,6 +121,8 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
             typer.echo(f"  {name}: no matrix product or convolution")
             continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
+    for line in there.lines() if there else ():
+        typer.echo(f"  {line}")
     _refuse(made, baseline)
 
 

@@ -120,6 +120,11 @@ def _documents() -> dict[str, Schema]:
         "made": a(
             "A bundle that was written; precision: graph -> dtype -> share of its multiply-accumulates.",
             bundle=TEXT, hash=TEXT, bytes=INTEGER, precision=by_name(by_name(NUMBER)), findings=many(ANYTHING),
+            board={"anyOf": [record(
+                board=TEXT, graphs_before={"type": ["integer", "null"]}, graphs_after=INTEGER,
+                predictions=by_name(record(value=NUMBER, low=NUMBER, high=NUMBER, unit=TEXT, note=TEXT)),
+                actions={"anyOf": [record(name=TEXT, value=NUMBER), {"type": "null"}]},
+            ), {"type": "null"}]},
         ),
         "manifest": {
             "type": "object", "description": "manifest.json of the bundle, byte by byte, when there is no error.",

@@ -81,8 +81,9 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
     common = _run.MEASURE_FLAGS if measures else _run.TRANSFORM_FLAGS
 
     def command(**given: Any) -> None:
+        context: typer.Context = given.pop("context")
         options = {name: given.pop(name) for name in own}
-        chosen = {name: value for name, value in options.items() if not _unset(value, stage.model_fields[name])}
+        chosen = {name: value for name, value in options.items() if _typed(context, name)}
         built = validated(stage, chosen, f"vlatool {stage.kind()} {registry_name(stage)}")
         if measures:
             _run.measure(typing.cast(Measure, built), **given)
@@ -91,7 +92,8 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
 
     if issubclass(stage, Measure) and stage.remotely:
         common = (*common, *_run.REMOTE_FLAGS)
-    parameters = [_run.SOURCE_FLAG, *own.values(), *common]
+    typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    parameters = [typed, _run.SOURCE_FLAG, *own.values(), *common]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
@@ -123,6 +125,7 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
 
 
-def _unset(value: Any, field: FieldInfo) -> bool:
-    """An empty list means that a repeatable flag was not given."""
-    return isinstance(value, list) and not value and not field.is_required()
+def _typed(context: typer.Context, name: str) -> bool:
+    """Say whether an option was given, here or by a variable, so that a board's wishes do not count."""
+    source = context.get_parameter_source(name)
+    return source is not None and "DEFAULT" not in source.name

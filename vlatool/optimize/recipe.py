@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from vlatool.errors import RecipeError, require
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
-from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, engine_class, engine_names
+from vlatool.runtime.engine import DEFAULT_ENGINE, class_for
 
 StageList = tuple[dict[str, dict[str, Any]], ...]
 """Stages in order, each a mapping of one name to its options."""
@@ -90,7 +90,7 @@ def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str
         engine: The engine of the board. One that is searched brings its own plans; others get standard QDQ operators
             with symmetric int8, as does one that vlatool does not run.
     """
-    library = engine_class(engine) if engine in engine_names() else Engine
+    library = class_for(engine)
     own, layout = library.searched, dict(library.int8)
     candidates: dict[str, StageList] = {}
     if own or not calibrated:

@@ -31,10 +31,12 @@ from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.quantize._ranges import Statistics, choose_range
 from vlatool.quantize._reductions import keep_axes
 from vlatool.quantize._trial_compile import open_apart
-from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, Int8Layout, engine_class, layouts
+from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, Int8Layout, class_for, engine_class, layouts
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from vlatool.hardware.profile import Profile
 
     LayoutName = str
@@ -104,6 +106,11 @@ class StaticInt8(Calibrated):
             kind, self.per_channel, self.reduce_range, form.fuses_convolutions, hoist=form.symmetric,
             signed_second=second, unsigned_convolutions=form.symmetric,
         )  # fmt: skip
+
+    def on(self, profile: Profile) -> Self:
+        """Write the layout and the activations that the board's preferred engine takes."""
+        wanted = class_for(profile.engine).int8
+        return self.model_copy(update={name: how for name, how in wanted.items() if name not in self.model_fields_set})
 
     def used_packages(self) -> tuple[str, ...]:
         """The engine too that the layout is for."""

@@ -22,10 +22,13 @@ from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shard
 from vlatool.quantize._stream import Written, forget, work_directory, work_root, write_records
 from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan, make_plan
+from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
 from vlatool.stage.base import Context, SampleSet, source_of
 from vlatool.stage.finish import SEED, carry_over, finish, history
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from vlatool.hardware.profile import Profile
 
 WEIGHTS = "graphs/weights.data"
@@ -48,6 +51,12 @@ class WeightOnly(WeightOptions):
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnx-ir", "onnxscript", "numpy")
     streams: ClassVar[bool] = True
     """Takes a source bundle whose policy describes its shards, without an export before."""
+
+    def on(self, profile: Profile) -> Self:
+        """Write standard operators where the board's preferred engine takes those alone."""
+        standard = class_for(profile.engine).int8.get("layout") == STANDARD_LAYOUT
+        change = {"layout": STANDARD_LAYOUT} if standard and "layout" not in self.model_fields_set else {}
+        return self.model_copy(update=change)
 
     def inputs(self) -> tuple[Path, ...]:
         """The calibration file, when one is given."""

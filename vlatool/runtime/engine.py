@@ -154,6 +154,11 @@ def engine_class(name: str = "") -> Any:
     return registry.load("engines", name or DEFAULT_ENGINE)
 
 
+def class_for(name: str) -> type[Engine]:
+    """Return the class of an engine of a board; what is said of any engine for one that vlatool does not run."""
+    return engine_class(name) if name in engine_names() else Engine
+
+
 def engine_names() -> list[str]:
     """List the engines, the default one first."""
     return sorted(registry.names("engines"), key=lambda name: (name != DEFAULT_ENGINE, name))

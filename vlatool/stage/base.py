@@ -24,6 +24,8 @@ from vlatool.machine.version import VERSION
 from vlatool.report import Report
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from vlatool.hardware.profile import Profile
 
 Tell = Callable[[str, float | None], None]
@@ -146,6 +148,10 @@ class Transform(Stage):
 
     streams: ClassVar[bool] = False
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
+
+    def on(self, profile: Profile) -> Self:
+        """Return the stage as a board takes what it makes; options that were given stay."""
+        return self
 
     def runs(self, source: Bundle | None) -> str:
         """Return whose code this stage runs on that source (``policy.py``); empty when only vlatool's own.

@@ -1,0 +1,74 @@
+"""``export`` and ``quantize`` for a board: made as it takes it, and what to expect there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.cli import main
+from vlatool.cli._made import for_board
+from vlatool.hardware.profile import load_profile
+from vlatool.quantize.dynamic_int8 import DynamicInt8
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.quantize.weight_only import WeightOnly
+from vlatool.stage.base import Context
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> str:
+    with pytest.raises(SystemExit) as left:
+        main([*words])
+    told = capsys.readouterr()
+    assert left.value.code == code, told.err
+    return told.out if code == 0 else told.err
+
+
+def test_the_layout_and_the_activations_follow_the_board() -> None:
+    orin, pi, nuc = (load_profile(name) for name in ("orin-nano", "pi5", "nuc"))
+    assert (StaticInt8().on(orin).layout, StaticInt8().on(orin).activations) == ("qdq", "int8")
+    for board in (pi, nuc):
+        assert (StaticInt8().on(board).layout, StaticInt8().on(board).activations) == ("ort", "auto")
+    assert (WeightOnly().on(orin).layout, WeightOnly().on(pi).layout) == ("qdq", "ort")
+    assert DynamicInt8().on(orin) == DynamicInt8()
+
+
+def test_what_was_typed_stays_as_typed() -> None:
+    typed = StaticInt8(layout="ort", activations="uint8").on(load_profile("orin-nano"))
+    assert (typed.layout, typed.activations) == ("ort", "uint8")
+    assert WeightOnly(layout="ort").on(load_profile("thor")).layout == "ort"
+
+
+def test_a_bundle_for_a_board_ends_with_what_to_expect(float_bundle: Bundle, tmp_path: Path, capsys) -> None:
+    told = run(capsys, "quantize", str(float_bundle.path), "-o", str(tmp_path / "out"), "--profile", "orin-nano")
+    lines = [line.strip() for line in told.splitlines()]
+    assert any(line.startswith("graphs ") and " -> " in line and "smaller" in line for line in lines), told
+    assert any(line.startswith("latency p50 on jetson-orin-nano, predicted: ") and " ms (" in line for line in lines)
+    assert any(line.startswith("memory on jetson-orin-nano, predicted: ") for line in lines)
+    assert any(line.startswith("relative error of the actions: 0.0") for line in lines)
+    assert json.loads((tmp_path / "out/manifest.json").read_text())["made_by"]["options"]["layout"] == "qdq"
+
+
+def test_as_json(float_bundle: Bundle, tmp_path: Path, capsys) -> None:
+    words = ["quantize", str(float_bundle.path), "-o", str(tmp_path / "out"), "--json"]
+    found = json.loads(run(capsys, *words, "--profile", "pi5"))["board"]
+    assert found["board"] == "raspberry-pi-5"
+    assert found["graphs_before"] > found["graphs_after"] > 0
+    latency = found["predictions"]["latency_p50"]
+    assert latency["low"] < latency["value"] < latency["high"]
+    assert (found["actions"]["name"], 0 < found["actions"]["value"] < 0.1) == ("relative_error", True)
+    assert json.loads(run(capsys, *words, "--force"))["board"] is None
+
+
+def test_an_export_says_it_too_and_an_unknown_board_is_refused(onnx_file: Path, tmp_path: Path, capsys) -> None:
+    told = run(capsys, "export", str(onnx_file), "-o", str(tmp_path / "out"), "--profile", "rpi5")
+    assert "latency p50 on raspberry-pi-5, predicted: " in told
+    assert "smaller" not in told
+    told = run(capsys, "export", str(onnx_file), "-o", str(tmp_path / "no"), "--profile", "jetson-agx-orinn", code=3)
+    assert "did you mean 'jetson-agx-orin-64gb'" in told
+    assert not (tmp_path / "no").exists()
+
+
+def test_without_recordings_or_a_source_nothing_is_compared(float_bundle: Bundle, onnx_file: Path) -> None:
+    assert for_board(float_bundle, None, load_profile("pi5"), Context()).error is None

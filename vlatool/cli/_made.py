@@ -1,0 +1,93 @@
+"""What ``export`` and ``quantize`` say of a bundle for a board: its size, what is predicted, what its actions lose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.hardware.profile import Profile
+from vlatool.report import Measurement
+from vlatool.stage.base import Context
+
+SAMPLES = 64
+"""Recorded observations that the actions are compared on."""
+SHOWN = {"latency_p50": "latency p50", "memory": "memory"}
+
+
+@dataclass(frozen=True)
+class ForBoard:
+    """A new bundle beside the one that it was made from.
+
+    Args:
+        board: Name of the profile.
+        before, after: Bytes of the graphs; before is None where the source has no graphs.
+        predictions: For the board, with their intervals.
+        error: How the actions differ from the source's on recorded observations, None where that cannot be said.
+    """
+
+    board: str
+    before: int | None
+    after: int
+    predictions: tuple[Measurement, ...]
+    error: Measurement | None
+
+    def lines(self) -> list[str]:
+        """Return what a person wants to know."""
+        size = f"graphs {self.after / 1e6:.2f} MB"
+        if self.before is not None and self.after:
+            before = f"graphs {self.before / 1e6:.2f} MB"
+            size = f"{before} -> {self.after / 1e6:.2f} MB, {self.before / self.after:.1f}x smaller"
+        predicted = [f"{SHOWN[each.name]} on {self.board}, predicted: {_number(each)}" for each in self.predictions]
+        return [size, *predicted, *([_words(self.error)] if self.error is not None else [])]
+
+    def values(self) -> dict[str, Any]:
+        """Return the same as JSON values."""
+        numbers = {each.name: {"value": _known(each.value), "low": each.low, "high": each.high, "unit": each.unit,
+                               "note": each.note} for each in self.predictions}  # fmt: skip
+        error = None if self.error is None else {"name": self.error.name, "value": _known(self.error.value)}
+        return {"board": self.board, "graphs_before": self.before, "graphs_after": self.after, "predictions": numbers,
+                "actions": error}  # fmt: skip
+
+
+def for_board(made: Bundle, source: Bundle | None, profile: Profile, context: Context) -> ForBoard:
+    """Compare a new bundle with its source, and predict it on a board."""
+    from vlatool.boards.predict import predictions
+
+    context.tell(f"predicting for {profile.name}", None)
+    found = tuple(each for each in predictions(profile, made) if each.name in SHOWN)
+    before = graph_bytes(source) if source is not None and source.manifest.graphs else None
+    return ForBoard(profile.name, before, graph_bytes(made), found, _error(made, source, context))
+
+
+def graph_bytes(bundle: Bundle) -> int:
+    """Return the size of the graphs and of the weights beside them."""
+    return sum(record.bytes for file, record in bundle.manifest.files.items() if file.startswith("graphs/"))
+
+
+def _error(made: Bundle, source: Bundle | None, context: Context) -> Measurement | None:
+    from vlatool.evaluate.recorded import Recorded, carries_recordings
+
+    if source is None or not source.manifest.graphs or not carries_recordings(made):
+        return None
+    row = Recorded(baseline=source.path, samples=SAMPLES).run(made, context).rows[-1]
+    found = row.get("agreement_baseline") or row.get("relative_error")
+    return found if found is not None and found.known else None
+
+
+def _words(error: Measurement) -> str:
+    of = f"{error.samples} recorded observations"
+    if error.name.startswith("agreement"):
+        return f"the same actions as the source: {error.value:.1%} of {of}"
+    return f"relative error of the actions: {error.value:.3g} against the source, on {of}"
+
+
+def _number(each: Measurement) -> str:
+    if not each.known:
+        return each.note or "not known"
+    interval = f" ({each.low:.3g} to {each.high:.3g})" if each.low is not None and each.high is not None else ""
+    return f"{each.value:.3g} {each.unit}{interval}"
+
+
+def _known(value: float) -> float | None:
+    return value if value == value else None
