@@ -144,3 +144,9 @@ def test_what_cannot_be_imported_is_told_as_its_own(run: Run, onnx_file: Path, t
 
 def test_it_replaces_nothing_of_vlatools_own(run: Run):
     assert "activation ranges" in ok(run("quantize", "static-int8", "--help"))
+
+
+def test_the_guide_shows_these_files():
+    guide = (ROOT / "docs/guides/add-a-method.md").read_text()
+    for name in ("rounded", "engine", "source"):
+        assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide
