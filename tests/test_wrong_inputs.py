@@ -470,7 +470,7 @@ SOURCES = [
         lambda at: ["export", at.policy(statistics={"proprio": {"mean": [0, np.nan, 0], "std": [1] * 3}}), *at.to]),
     Row("no tokenizer", "names vocabulary.json, which is not in", 3,
         lambda at: ["export", at.policy(drop="vocabulary.json"), *at.to]),
-    Row("a tokenizer that is none", "is no tokenizer", 3, lambda at: ["export", at.policy(vocabulary={}), *at.to]),
+    Row("a tokenizer that is none", "is not a tokenizer", 3, lambda at: ["export", at.policy(vocabulary={}), *at.to]),
     Row("a vocabulary whose ids are words", "vocabulary", 3,
         lambda at: ["export", at.policy(vocabulary={"kind": "words", "pad": 0, "unknown": 1,
                     "words": dict.fromkeys(WORDS, "two")}), *at.to]),

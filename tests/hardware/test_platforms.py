@@ -44,7 +44,7 @@ def test_a_platform_may_be_a_file(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_gets_the_nearest() -> None:
-    with pytest.raises(ProfileError, match="no platform 'quadcoptre'; did you mean 'quadcopter'"):
+    with pytest.raises(ProfileError, match="Unknown platform 'quadcoptre'; did you mean 'quadcopter'"):
         load_platform("quadcoptre")
 
 

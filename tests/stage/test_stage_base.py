@@ -35,10 +35,10 @@ def test_every_file_of_a_stage_folder_holds_a_stage_whose_options_have_descripti
     ("name", "message"),
     [
         ("quantize.static_in8", "did you mean 'quantize.static_int8'"),
-        ("static_int8", "There is no stage 'static_int8'"),
-        ("data.npz", "There is no stage 'data.npz'"),
-        ("quantize._graphs", "There is no stage"),
-        ("", "There is no stage ''"),
+        ("static_int8", "Unknown stage 'static_int8'"),
+        ("data.npz", "Unknown stage 'data.npz'"),
+        ("quantize._graphs", "Unknown stage"),
+        ("", "Unknown stage ''"),
     ],
 )
 def test_an_unknown_stage_gets_the_nearest_name(name, message):

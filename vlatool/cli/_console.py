@@ -27,7 +27,7 @@ from vlatool.report import Report
 from vlatool.stage.base import Context, Tell
 
 PLACES = ("-o", "--output", "--cache", "--junit")
-"""Options that name a place to write to: where it is on this machine is nobody's business."""
+"""Options that name a place to write to: paths are not recorded."""
 
 
 def command_line() -> str:

@@ -63,7 +63,7 @@ def run(
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
     raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
-    """Measure the baseline anew beside the candidate, and leave with 0 (pass), 1 (fail) or 5 (inconclusive).
+    """Measure the baseline anew beside the candidate, and exit with 0 (pass), 1 (fail) or 5 (inconclusive).
 
     In a job of GitHub Actions it also prints annotations and writes the step summary.
     """

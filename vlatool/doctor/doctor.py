@@ -1,4 +1,4 @@
-"""What is in order on this machine, what is missing, and the command that mends it.
+"""What is in order on this machine, what is missing, and the command that fixes it.
 
 Every check takes the root of the file system, or what was found, and returns ``Check`` values; nothing is changed.
 """

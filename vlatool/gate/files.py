@@ -8,7 +8,7 @@ import shlex
 from vlatool.machine.version import VERSION
 
 GATE = """\
-# What a change may cost. `vlatool gate CANDIDATE` runs the baseline anew beside the candidate and leaves with
+# What a change may cost. `vlatool gate CANDIDATE` runs the baseline anew beside the candidate and exits with
 # 0 (pass), 1 (fail) or 5 (inconclusive: the samples cannot decide). A claim that is null is not examined.
 schema: 1
 baseline: {baseline}    # a bundle, kept in the repository or fetched before the gate runs

@@ -55,7 +55,7 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
     own = wanted.endswith(SUFFIXES) or os.sep in wanted
     path = Path(wanted) if own else _folder() / f"{wanted}.yaml"
     if not own and wanted not in platform_names():
-        raise ProfileError(f"There is no platform '{wanted}'; {nearest(wanted, platform_names())}.")
+        raise ProfileError(f"Unknown platform '{wanted}'; {nearest(wanted, platform_names())}.")
     try:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:

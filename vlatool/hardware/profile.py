@@ -319,7 +319,7 @@ def _file_of(wanted: str) -> Path:
     listing = f"known: {', '.join(sorted(found))}"
     fix = f"name one of these or a YAML file, or add a directory to {SEARCH_PATH}"
     told = f"did you mean '{boards[near[0]]}'? {listing}" if near else listing
-    raise ProfileError(f"There is no profile '{wanted}'; {told}.", fix)
+    raise ProfileError(f"Unknown profile '{wanted}'; {told}.", fix)
 
 
 def _aliases(found: Mapping[str, Path]) -> dict[str, str]:

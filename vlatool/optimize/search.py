@@ -1,4 +1,4 @@
-"""The search of ``optimize``: engines, methods and mixed-precision plans race each other; losers cost little.
+"""The search of ``optimize``: engines, methods and mixed-precision plans; slow candidates are dropped early.
 
 1. Every **variant** (an engine, a method, a compute dtype) is built and tried: a few timed inferences in turns with
    float32, and its error on calibration observations.

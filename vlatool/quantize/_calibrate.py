@@ -110,7 +110,7 @@ def calibrate(
         if idle:
             raise GraphError(
                 f"The graph '{graph}' was never run on calibration data, so '{idle[0]}' has no range.",
-                "leave that graph out with --graphs, or mend the program",
+                "leave that graph out with --graphs, or fix the program",
             )
     return found
 

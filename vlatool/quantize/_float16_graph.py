@@ -1,4 +1,4 @@
-"""Turn a float32 graph into float16 with ONNX Runtime's converter, and mend what that leaves."""
+"""Turn a float32 graph into float16 with ONNX Runtime's converter, and repair what that leaves."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def to_float16(model: Any, kept: set[str]) -> Any:
 
     ONNX Runtime's converter writes a Cast to float16 and one back between two nodes that are both kept, which rounds
     what shall not be rounded, gives the same Cast once for each reader, appends nodes at the end, and rounds a constant
-    that a kept node shares with another; all four are mended here.
+    that a kept node shares with another; all four are repaired here.
     """
     converter = build_tool("transformers.float16")
     _part_shared_constants(model, kept)

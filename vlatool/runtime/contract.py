@@ -16,7 +16,7 @@ from vlatool.errors import GraphError, SpecError, nearest
 from vlatool.runtime.observation import all_finite
 
 Array = NDArray[Any]
-AGAIN = "declare in the spec what the policy gives, or mend the policy, and export it again"
+AGAIN = "declare in the spec what the policy gives, or fix the policy, and export it again"
 BASE_MB = 2000.0
 TIMES_GRAPHS = 8.0
 """A policy may take ``BASE_MB`` and this many times the size of its graphs: an engine unpacks them."""

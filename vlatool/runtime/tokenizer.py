@@ -52,7 +52,7 @@ class Tokenizer:
             self.pad, self._encode = _library(content, path, name)
         else:
             raise SpecError(
-                f"{path} is no tokenizer: it has neither 'model' (tokenizers library) nor kind 'words' (vocabulary)."
+                f"{path} is not a tokenizer: it has neither 'model' (tokenizers library) nor kind 'words' (vocabulary)."
             )
 
     def __call__(self, text: str) -> NDArray[np.int64]:

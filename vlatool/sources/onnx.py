@@ -192,7 +192,7 @@ def _told_of(model: Path, copy: Path) -> Iterator[None]:
     except InputError as error:
         error.message = error.message.replace(str(copy), str(model))
         if isinstance(error, GraphError) and not error.fix:
-            error.fix = "mend the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
+            error.fix = "fix the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
         raise
 
 

@@ -169,7 +169,7 @@ class Transform(Stage):
         raise NotImplementedError(self.name())
 
     def _told_options(self) -> dict[str, Any]:
-        """Return the options with files named by name and content: where they were is nobody's business."""
+        """Return the options with files named by name and content: paths are not recorded."""
         told = self.options()
         for name in told:
             value = getattr(self, name)
@@ -244,7 +244,7 @@ def stage_class(name: str) -> type[Stage]:
     kind, _, entry = name.partition(".")
     known = [f"{each}.{found}" for each in stage_kinds() for found in registry.names(each)]
     if name.replace("-", "_") not in known:
-        raise RecipeError(f"There is no stage '{name}'; {nearest(name, known)}.")
+        raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.")
     found: type[Stage] = registry.load(kind, entry)
     return found
 
