@@ -100,7 +100,7 @@ def test_names_of_other_things_are_completed(completed) -> None:
 
 
 def test_a_method_that_is_misspelt_is_no_error_while_completing(completed) -> None:
-    assert completed("quantize", "statc-int8", "--profil") == []
+    assert completed("quantize", "statc-int8", "--nothing") == []
 
 
 def test_completing_imports_no_library_that_takes_long() -> None:

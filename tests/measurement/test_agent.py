@@ -39,7 +39,7 @@ def test_what_does_not_fit_fails(float_bundle):
 def test_errors_of_the_worker_come_back(tmp_path, float_bundle):
     with pytest.raises(BundleError, match="There is no bundle at"):
         measure(Job((str(tmp_path / "none"),)), quiet)
-    with pytest.raises(UsageError, match="There is no engine 'foo'"):
+    with pytest.raises(UsageError, match="Unknown engine 'foo'"):
         measure(Job((str(float_bundle.path),), engine="foo"), quiet)
 
 

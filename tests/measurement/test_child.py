@@ -26,7 +26,7 @@ def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_real_process_says_what_is_wrong(float_bundle: Bundle) -> None:
-    with pytest.raises(UsageError, match="There is no engine 'foo'") as caught:
+    with pytest.raises(UsageError, match="Unknown engine 'foo'") as caught:
         ask("vlatool.measurement.cold_start", (str(float_bundle.path), "foo", "1"), "", "x")
     assert caught.value.exit_code == 2
 

@@ -148,7 +148,7 @@ def test_a_source_has_nothing_to_run(source_bundle):
 
 
 def test_an_unknown_engine_gets_the_nearest_name(float_bundle):
-    with pytest.raises(UsageError, match="no engine 'ort-cup'; did you mean 'ort_cpu'"):
+    with pytest.raises(UsageError, match="Unknown engine 'ort-cup'; did you mean 'ort_cpu'"):
         load(float_bundle.path, engine="ort-cup")
 
 
