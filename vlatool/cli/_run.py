@@ -96,9 +96,11 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)
-        elif stage.kind() == "export":
+        elif stage.takes_modules:
             bundle = sourced(source, cache_directory(), context)
-            if bundle.manifest.graphs:  # an ONNX file: its source stage is all the export that there is
+            if (
+                bundle.manifest.graphs and stage.kind() == "export"
+            ):  # an ONNX file: its source stage is all the export that there is
                 stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
@@ -112,7 +114,8 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         document({**summary, "precision": precision, "findings": findings, "board": there.values() if there else None})
         _refuse(made, baseline)
         return
-    sizes = f"graphs {graph_bytes(made) / 1e6:.2f} MB, in all {made.size_bytes / 1e6:.1f} MB"
+    graphs = f"graphs {graph_bytes(made) / 1e6:.2f} MB, " if made.manifest.graphs else ""
+    sizes = f"{graphs}in all {made.size_bytes / 1e6:.1f} MB"
     typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {sizes}")
     for line in stage.lines(made):
         typer.echo(f"  {line}")

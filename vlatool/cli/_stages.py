@@ -20,7 +20,14 @@ from vlatool.cli import _complete, _run
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import Measure, Stage, validated
 
-DEFAULTS = {"export": "onnx", "quantize": "static-int8", "benchmark": "latency", "evaluate": "recorded"}
+DEFAULTS = {
+    "export": "onnx",
+    "quantize": "static-int8",
+    "benchmark": "latency",
+    "prune": "magnitude",
+    "distill": "weights",
+    "evaluate": "recorded",
+}
 """The method that is meant when a command names none."""
 
 

@@ -33,6 +33,7 @@ class ExportOnnx(Transform):
     on calibration observations.
     """
 
+    takes_modules: ClassVar[bool] = True
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
 
     opset: int = Field(20, ge=18, le=23, description="opset of the default ONNX domain")

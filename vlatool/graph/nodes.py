@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -79,3 +80,9 @@ def free_name(wanted: str, number: int, taken: set[str]) -> str:
 
 FOLDED = "vlatool.folded"
 """Key of a node's metadata: the module that was folded into it."""
+
+
+def matches(name: str, patterns: tuple[str, ...]) -> bool:
+    """Say whether a glob meets a node's name (``blocks.0.mlp.fc1/MatMul``), or its module's (before the slash)."""
+    part = name.rpartition("/")[0] or name
+    return any(fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(part, pattern) for pattern in patterns)

@@ -12,6 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import SourceError, require
+from vlatool.module.edits import edited
 from vlatool.module.factory import exits_told
 from vlatool.module.modules import modules_of
 from vlatool.module.origin import origin_of
@@ -74,6 +75,7 @@ def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
     with _parameters_on_meta(torch):
         made = origin.made()
     modules = modules_of(made, (step.graph for step in bundle.manifest.program))
+    modules = edited(modules, bundle, weights=False)
     return {name: module.float() for name, module in modules.items()}
 
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
+from vlatool.module.edits import edited, load_tensors
 from vlatool.module.factory import exits_told
 from vlatool.module.failures import remedy_for
 from vlatool.module.modules import modules_of
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 def load_modules(source: Bundle) -> dict[str, nn.Module]:
     """Build the modules of a source bundle, in evaluation mode: graph name -> module.
 
+    They are what the factory makes, changed by the edits of the bundle, with the weights of the bundle.
+
     Raises:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
@@ -37,7 +40,7 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     if origin.weights:
         for name, module in modules.items():
             _load_weights(name, module, origin.folder, origin.weights)
-    return modules
+    return edited(modules, source)
 
 
 def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:
@@ -51,17 +54,7 @@ def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> 
     for file in shard_files(folder, pattern):
         read_header(file)
         stored.update(safetensors.load_file(str(file)))
-    own = module.state_dict()
-    found = {}
-    for name, value in own.items():
-        tensor = stored.get(f"{graph}.{name}", stored.get(name))
-        if tensor is None:
-            raise SourceError(f"No shard of {folder / pattern} has '{name}' of '{graph}'; {nearest(name, stored)}.")
-        if tensor.shape != value.shape:
-            got, want = list(tensor.shape), list(value.shape)
-            raise SourceError(f"'{name}' has the shape {got} in the shards; the module's is {want}.")
-        found[name] = tensor.to(value.dtype)
-    module.load_state_dict(found)
+    load_tensors(graph, module, stored, str(folder / pattern))
 
 
 def torch_policy(source: Bundle, seed: int | None = None) -> Policy:

@@ -119,7 +119,13 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
     stage.check(None, profile)
     export = () if stage.has_graphs else _transforms(recipe.export)
     candidates = {name: _transforms(stages) for name, stages in recipe.candidates.items()}
-    for name in candidates:
+    for name, stages in candidates.items():
+        changing = [stage.takes_modules for stage in stages]
+        if changing != sorted(changing, reverse=True) or any(stage.kind() == "export" for stage in stages):
+            raise RecipeError(
+                f"The candidate '{name}' changes modules after a graph was made, or exports.",
+                "put the stages of prune and distill first, and options of the export under 'export'",
+            )
         if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
             raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
     return Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
@@ -168,7 +174,7 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     baseline = _chain(plan.export, source, plan, context)
     _check_metric(plan, baseline, context)
     plan, searched = _searched(plan, baseline, context)
-    bundles, failures = _candidates(plan, baseline, context)
+    bundles, failures = _candidates(plan, source, baseline, context)
     rows, warnings = _measure(plan, source, {BASELINE: baseline, **bundles}, context)
     engines = {name: engine_of(bundle) for name, bundle in bundles.items()}
     judged, trust = judged_rows(plan, rows, engines)
@@ -298,12 +304,17 @@ def _chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: C
     return bundle
 
 
-def _candidates(plan: Plan, baseline: Bundle, context: Context) -> tuple[dict[str, Bundle], list[Row]]:
-    """Make every candidate; one that cannot be made becomes a row that says why."""
+def _candidates(plan: Plan, source: Bundle, baseline: Bundle, context: Context) -> tuple[dict[str, Bundle], list[Row]]:
+    """Make every candidate; one that cannot be made becomes a row that says why.
+
+    What changes the policy's modules starts at the source, and is exported after that.
+    """
     bundles, failures = {}, []
     for name, stages in plan.candidates.items():
         try:
-            bundles[name] = _chain(stages, baseline, plan, context)
+            changed = stages[: sum(stage.takes_modules for stage in stages)]
+            start = _chain((*changed, *plan.export), source, plan, context) if changed else baseline
+            bundles[name] = _chain(stages[len(changed) :], start, plan, context)
         except VlatoolError as error:
             if error.exit_code not in (3, 4):
                 raise

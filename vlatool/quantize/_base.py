@@ -20,7 +20,7 @@ from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
-from vlatool.graph.nodes import FOLDED
+from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import precision_shares
 from vlatool.stage.base import Context, Transform, source_of
 from vlatool.stage.finish import TRIALS, carry_over, finish
@@ -142,7 +142,7 @@ class Quantization(Transform):
         folded = _folded(bundle) if self.include or self.exclude or self.parts else {}
 
         def meets(name: str, patterns: tuple[str, ...]) -> bool:
-            return _any(name, patterns) or (name in folded and _any(folded[name], patterns))
+            return matches(name, patterns) or (name in folded and matches(folded[name], patterns))
 
         for pattern in (*self.include, *self.exclude):
             if not any(meets(name, (pattern,)) for name in candidates):
@@ -192,8 +192,3 @@ def _folded(bundle: Bundle) -> dict[str, str]:
                 if FOLDED in noted:
                     found[node.name] = f"{noted[FOLDED]}/{node.op_type}"
     return found
-
-
-def _any(name: str, patterns: tuple[str, ...]) -> bool:
-    module = name.rpartition("/")[0] or name
-    return any(fnmatch.fnmatchcase(name, pattern) or fnmatch.fnmatchcase(module, pattern) for pattern in patterns)

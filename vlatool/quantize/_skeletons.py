@@ -8,6 +8,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
 from vlatool.graph.nodes import free_name
+from vlatool.module.edits import is_changed
 from vlatool.quantize._compute import as_float32
 from vlatool.quantize._fake_export import Skeleton, export_skeletons, policy_weights
 from vlatool.quantize._rewrite import INLINE
@@ -39,7 +40,8 @@ def skeletons_of(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
 
 def takes_shards(bundle: Bundle) -> bool:
     """Whether a source bundle's policy describes where its weights are, so that it needs no float32 export."""
-    return not bundle.manifest.graphs and "factory" in bundle.manifest.source and bool(policy_weights(bundle)[1])
+    torch = not bundle.manifest.graphs and "factory" in bundle.manifest.source and not is_changed(bundle)
+    return torch and bool(policy_weights(bundle)[1])
 
 
 def weights_fingerprint(bundle: Bundle) -> str:

@@ -146,6 +146,8 @@ class Stage(Numeric):
 class Transform(Stage):
     """A stage that makes a bundle."""
 
+    takes_modules: ClassVar[bool] = False
+    """Whether it starts from a source bundle without graphs, since it works on the policy's torch modules."""
     streams: ClassVar[bool] = False
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 

@@ -1,0 +1,64 @@
+"""Weights that were trained elsewhere replace the policy's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.distill.weights import Weights
+from vlatool.errors import SourceError
+from vlatool.export.onnx import ExportOnnx
+from vlatool.module.torch_policy import load_modules
+from vlatool.rebuild.rebuild import rebuild
+from vlatool.stage.base import Context
+from vlatool.stage.run import run_transform
+
+
+@pytest.fixture
+def tuned(source_bundle: Bundle, tmp_path: Path) -> Path:
+    """A file with the tiny policy's weights, all a little larger."""
+    state = load_modules(source_bundle)["main"].state_dict()
+    save_file({name: (value * 1.01).contiguous() for name, value in state.items()}, str(tmp_path / "tuned.safetensors"))
+    return tmp_path / "tuned.safetensors"
+
+
+def test_the_weights_are_those_of_the_file(source_bundle: Bundle, tuned: Path, policy_template: Path, tmp_path: Path):
+    made = run_transform(Weights(file=tuned), source_bundle, tmp_path / "made", Context())
+    old, new = load_modules(source_bundle)["main"].state_dict(), load_modules(made)["main"].state_dict()
+    for name, value in old.items():
+        torch.testing.assert_close(new[name], (value * 1.01).to(value.dtype))
+    assert "tuned.safetensors sha256:" in made.manifest.made_by["options"]["file"]
+    exported = run_transform(ExportOnnx(), made, tmp_path / "exported", Context())
+    again = rebuild(exported, Context(), source=str(policy_template), files=(tuned,), cache=tmp_path / "cache")
+    assert again.identical
+
+
+def test_another_file_is_another_bundle(source_bundle: Bundle, tuned: Path, tmp_path: Path):
+    first = run_transform(Weights(file=tuned), source_bundle, tmp_path / "one", Context())
+    state = load_modules(first)["main"].state_dict()
+    save_file({name: (value * 2).contiguous() for name, value in state.items()}, str(tuned))
+    assert run_transform(Weights(file=tuned), source_bundle, tmp_path / "two", Context()).hash != first.hash
+
+
+def test_what_does_not_fit_is_named(source_bundle: Bundle, tuned: Path, tmp_path: Path):
+    state = {
+        f"main.{name}": value.contiguous() for name, value in load_modules(source_bundle)["main"].state_dict().items()
+    }
+    save_file(state, str(tuned))
+    run_transform(Weights(file=tuned), source_bundle, tmp_path / "named-by-graph", Context())
+    name = next(iter(state))
+    save_file({key: value for key, value in state.items() if key != name}, str(tuned))
+    with pytest.raises(SourceError, match=f"No tensor of .* is '{name.removeprefix('main.')}'"):
+        run_transform(Weights(file=tuned), source_bundle, tmp_path / "a", Context())
+    save_file({**state, name: torch.zeros(1)}, str(tuned))
+    with pytest.raises(SourceError, match=r"has the shape \[1\] in"):
+        run_transform(Weights(file=tuned), source_bundle, tmp_path / "b", Context())
+    tuned.write_bytes(b"no safetensors")
+    with pytest.raises(SourceError, match="cannot be read as safetensors"):
+        run_transform(Weights(file=tuned), source_bundle, tmp_path / "c", Context())
+    with pytest.raises(SourceError, match="There is no file"):
+        run_transform(Weights(file=tmp_path / "none"), source_bundle, tmp_path / "d", Context())

@@ -1,0 +1,125 @@
+"""Structural edits: which channels of a module stay, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from vlatool.bundle.bundle import Bundle, seal
+from vlatool.errors import SourceError
+from vlatool.module.edits import EDITS, Edit, apply, edited, is_changed, read_edits, write_module
+
+
+def mlp() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(3, 6), nn.BatchNorm1d(6), nn.ReLU(), nn.Linear(6, 2)).eval()
+
+
+def test_kept_channels_compute_what_zeroed_ones_do():
+    whole, cut = mlp(), mlp()
+    keep = (4, 0, 1)
+    with torch.no_grad():
+        gone = [each for each in range(6) if each not in keep]
+        whole[3].weight[:, gone] = 0
+    edits = [Edit("main", "0", "outputs", keep), Edit("main", "1", "outputs", keep), Edit("main", "3", "inputs", keep)]
+    apply({"main": cut}, edits)
+    x = torch.randn(5, 3)
+    torch.testing.assert_close(cut(x), whole(x))
+    assert (cut[0].out_features, cut[1].num_features, cut[3].in_features) == (3, 3, 3)
+    assert cut[3].bias.shape == (2,)
+
+
+def test_convolutions_are_cut_too():
+    torch.manual_seed(0)
+    net = nn.Sequential(nn.Conv2d(2, 4, 3), nn.Conv2d(4, 1, 1)).eval()
+    x = torch.randn(1, 2, 5, 5)
+    with torch.no_grad():
+        net[1].weight[:, [0, 2]] = 0
+        wanted = net(x)
+    apply({"main": net}, [Edit("main", "0", "outputs", (1, 3)), Edit("main", "1", "inputs", (1, 3))])
+    torch.testing.assert_close(net(x), wanted)
+
+
+@pytest.mark.parametrize(("edit", "says"), [
+    (Edit("other", "0", "outputs", (0,)), "names the graph 'other'"),
+    (Edit("main", "7", "outputs", (0,)), "names the module '7'"),
+    (Edit("main", "2", "outputs", (0,)), r"outputs of '2' \(ReLU\) cannot be chosen"),
+    (Edit("main", "1", "inputs", (0,)), "inputs of '1'"),
+    (Edit("main", "0", "outputs", (6,)), "has 6 outputs; an edit keeps 6"),
+])  # fmt: skip
+def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):
+    with pytest.raises(SourceError, match=says):
+        apply({"main": mlp()}, [edit])
+
+
+def test_grouped_convolutions_are_refused():
+    with pytest.raises(SourceError, match="cannot be chosen from"):
+        apply({"main": nn.Sequential(nn.Conv2d(4, 4, 3, groups=2))}, [Edit("main", "0", "outputs", (0,))])
+
+
+@pytest.fixture
+def changed(source_bundle: Bundle, tmp_path: Path) -> Bundle:
+    """A bundle with an edited module of one MLP."""
+    module = mlp()
+    edits = (
+        Edit("main", "0", "outputs", (1, 2)),
+        Edit("main", "1", "outputs", (1, 2)),
+        Edit("main", "3", "inputs", (1, 2)),
+    )
+    apply({"main": module}, edits)
+    (tmp_path / "changed").mkdir()
+    write_module(tmp_path / "changed", edits, {"main": module})
+    return seal(tmp_path / "changed", source_bundle.manifest)
+
+
+def test_what_is_written_is_made_again(changed: Bundle):
+    assert is_changed(changed)
+    again = edited({"main": mlp()}, changed)["main"]
+    x = torch.randn(4, 3)
+    wanted = mlp()
+    apply({"main": wanted}, read_edits(changed))
+    torch.testing.assert_close(again(x), wanted(x))
+    structure = edited({"main": mlp()}, changed, weights=False)["main"]
+    assert structure[0].out_features == 2
+
+
+def test_a_bundle_without_changes_has_none(source_bundle: Bundle):
+    assert not is_changed(source_bundle)
+    assert read_edits(source_bundle) == ()
+    module = mlp()
+    assert edited({"main": module}, source_bundle)["main"] is module
+
+
+@pytest.mark.parametrize("edit", [
+    {"graph": "main", "module": "0", "axis": "outputs", "keep": []},
+    {"graph": "main", "module": "0", "axis": "outputs", "keep": [1, 1]},
+    {"graph": "main", "module": "0", "axis": "outputs", "keep": [-1]},
+    {"graph": "main", "module": "0", "axis": "outputs", "keep": [True]},
+    {"graph": "main", "module": "0", "axis": "sides", "keep": [0]},
+    {"graph": "main", "module": "0", "axis": "outputs", "keep": [0], "more": 1},
+    {"graph": "main"}, 7, None,
+])  # fmt: skip
+def test_a_file_of_edits_that_makes_no_sense_is_refused(changed: Bundle, edit: object):
+    (changed.path / EDITS).write_text(json.dumps([edit]))
+    with pytest.raises(SourceError, match="an edit that makes no sense"):
+        read_edits(changed)
+
+
+def test_a_file_that_is_no_list_is_refused(changed: Bundle):
+    for text, says in (("{}", "must hold a list"), ("[", "not valid JSON")):
+        (changed.path / EDITS).write_text(text)
+        with pytest.raises(SourceError, match=says):
+            read_edits(changed)
+
+
+def test_weights_of_another_shape_are_refused(changed: Bundle):
+    other = replace(
+        changed.manifest, files={name: each for name, each in changed.manifest.files.items() if name != EDITS}
+    )
+    with pytest.raises(SourceError, match=r"has the shape \[2, 3\] in .*main.safetensors; the module's is \[6, 3\]"):
+        edited({"main": mlp()}, Bundle(changed.path, other))

@@ -1,0 +1,1 @@
+"""Give a policy other weights, trained on what a teacher does."""

@@ -1,0 +1,56 @@
+"""Weights that were trained elsewhere, in the place of the policy's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import SourceError, require
+from vlatool.module.edits import Edit, load_tensors
+from vlatool.module.stage import ModuleStage
+from vlatool.stage.base import Context
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from vlatool.hardware.profile import Profile
+
+
+class Weights(ModuleStage):
+    """Replace a policy's weights by those of a safetensors file, such as a fine-tuned or distilled student's.
+
+    Tensors are named as in ``state_dict()``, with ``GRAPH.`` before that where a policy has several graphs. The
+    structure stays: that of the factory, or what pruning left of it.
+    """
+
+    file: Path = Field(description="safetensors file with every weight")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The file."""
+        return (self.file,)
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The file is there."""
+        if not self.file.is_file():
+            raise SourceError(f"There is no file {self.file}.")
+        super().check(source, profile)
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+        """Load the weights.
+
+        Raises:
+            SourceError: when the file is not safetensors, or a tensor is missing or has another shape.
+        """
+        safetensors = require("safetensors.torch", "build")
+        try:
+            stored = safetensors.load_file(str(self.file))
+        except Exception as error:  # the seam: safetensors raises its own kind
+            raise SourceError(f"{self.file} cannot be read as safetensors: {error}.") from error
+        for graph, module in modules.items():
+            context.tell(f"loading the weights of {graph}", None)
+            load_tensors(graph, module, stored, str(self.file))
+        return ()

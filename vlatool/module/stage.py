@@ -1,0 +1,80 @@
+"""A stage that changes a policy's torch modules: their structure, their weights, or both."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from vlatool.bundle.bundle import LOCATION, Bundle, seal
+from vlatool.data import observations_for
+from vlatool.errors import BundleError, require
+from vlatool.module.description import read_location
+from vlatool.module.edits import Edit, apply, read_edits, write_module
+from vlatool.module.origin import factory_of
+from vlatool.module.torch_policy import load_modules, torch_policy
+from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.finish import SEED, carry_over, history
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from vlatool.hardware.profile import Profile
+
+
+class ModuleStage(Transform):
+    """Takes a source bundle of a torch policy, or what such a stage made of it; runs before the export."""
+
+    packages: ClassVar[tuple[str, ...]] = ("torch", "safetensors", "numpy")
+    takes_modules: ClassVar[bool] = True
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The bundle has modules, and no graphs yet."""
+        if source is not None and (source.manifest.graphs or "factory" not in source.manifest.source):
+            raise BundleError(
+                f"{source.path} has no torch modules that {self.name()} could change: it is exported, or an ONNX file.",
+                "name the policy that it was made from",
+            )
+
+    def runs(self, source: Bundle | None) -> str:
+        """The policy's factory is called."""
+        return factory_of(source)
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+        """Change weights in place and return which channels are kept; the modules are cut by the caller.
+
+        Args:
+            modules: Graph name -> module, as the source has it.
+            source: For recordings.
+            context: For progress.
+        """
+        raise NotImplementedError(self.name())
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Say how large the modules are, and how to go on."""
+        size = sum(record.bytes for name, record in made.manifest.files.items() if name.endswith(".safetensors"))
+        folder = read_location(made.path)
+        return (
+            f"weights {size / 1e6:.2f} MB, {len(read_edits(made))} structural edits; not exported yet:",
+            f"vlatool export {made.path} -o BUNDLE --trust {folder}",
+        )
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Change the modules, write them, and run the policy once."""
+        require("torch", "build")
+        bundle = source_of(source, self.name())
+        self.check(bundle, None)
+        modules = load_modules(bundle)
+        edits = self.change(modules, bundle, context)
+        apply(modules, edits)
+        write_module(out, (*read_edits(bundle), *edits), modules)
+        carry_over(bundle, out)
+        shutil.copyfile(bundle.path / LOCATION, out / LOCATION)
+        made_by: dict[str, Any] = self.made_by()
+        build = (*history(bundle), {**made_by, "input": bundle.hash})
+        made = seal(out, replace(bundle.manifest, parent=bundle.hash, made_by=made_by, build=build))
+        context.tell("running the changed policy", None)
+        torch_policy(made, SEED).infer(observations_for(made, 1)[0])
+        return made

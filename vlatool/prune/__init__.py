@@ -1,0 +1,1 @@
+"""Remove what a policy can do without, before it is exported."""
