@@ -126,3 +126,8 @@ def test_without_calibration_data_it_says_so(float_bundle, copied, tmp_path: Pat
         path.unlink()
     with pytest.raises(DataError, match="carries no calibration data"):
         Float8().check(seal(bundle.path, bundle.manifest), None)
+
+
+def test_a_rounding_that_falls_the_other_way_is_no_other_action(eighth):
+    """A step of float8 is an eighth of a value: two threads add up in another order than one."""
+    assert eighth.manifest.golden_tolerance == eighth.manifest.golden_chunk_tolerance == 0.06

@@ -41,11 +41,12 @@ REDRAWN = 1.5
 """How many times that difference is allowed on other machines, where it is drawn again: of 18 observations, the largest
 was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
 LEAST_TOLERANCE = 0.01
-COARSE_TOLERANCE = 0.03
+COARSE_TOLERANCE = {"float16": 0.03, "int4": 0.03, "int4 weights": 0.03, "float8": 0.06}
 """The same for graphs whose kernels round otherwise by design from processor to processor: float16 is computed as such
 where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8 where
-there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72)."""
-COARSE = ("float16", "int4", "int4 weights")
+there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72). A sum that
+is added up in another order falls on the other side of a step of float8, which is an eighth of a value: between one and
+two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029."""
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")
@@ -132,10 +133,9 @@ def _tolerance(seen: float, made: Bundle, redrawn: bool) -> float:
     What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding, or one that is
     drawn again on each machine.
     """
-    coarse = any(name in graph.precision for graph in made.manifest.graphs.values() for name in COARSE)
-    wanted = max(
-        COARSE_TOLERANCE if coarse else LEAST_TOLERANCE, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING)
-    )
+    computed = {name for graph in made.manifest.graphs.values() for name in graph.precision}
+    least = max([LEAST_TOLERANCE, *(COARSE_TOLERANCE[name] for name in computed & set(COARSE_TOLERANCE))])
+    wanted = max(least, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING))
     return math.ceil(wanted * 1000) / 1000 if math.isfinite(wanted) else 1.0
 
 
