@@ -20,6 +20,8 @@ ERROR: Schema = {"$ref": "#/$defs/error"}
 COMMANDS: dict[str, tuple[str, ...]] = {
     "optimize": ("report", "plan"),
     "export": ("made",),
+    "prune": ("made",),
+    "distill": ("made",),
     "quantize": ("made",),
     "benchmark": ("report",),
     "evaluate": ("report",),
