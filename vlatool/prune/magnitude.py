@@ -82,7 +82,7 @@ def hidden_layers(module: nn.Module) -> Iterator[tuple[str, str, Any, Any]]:
     for name, part in module.named_modules():
         if type(part) is not torch.nn.Sequential:
             continue
-        first: tuple[str, Any, bool] | None = None
+        first: tuple[str, Any] | None = None
         for key, child in part._modules.items():
             place = f"{name}.{key}" if name else key
             if type(child) is torch.nn.Linear:
