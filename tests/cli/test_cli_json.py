@@ -37,6 +37,8 @@ QUICK = "--iterations 20 --duration 0"
 LINES = {
     "optimize": "{policy} -o {out} --episodes 0 --no-search --iterations 20",
     "export onnx": "{policy} -o {out}",
+    "prune magnitude": "{policy} -o {out}",
+    "distill weights": "{policy} --file {tuned} -o {out}",
     "quantize bfloat16": "{policy} -o {out}",
     "quantize float8": "{policy} -o {out}",
     "quantize": "{policy} -o {out}",
@@ -122,7 +124,15 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
     assert not left.value.code
     original = "import vlatool\npolicy = vlatool.load(BUNDLE)\ndef act(given):\n    return policy.infer(given).chunk\n"
     (here / "original.py").write_text(original.replace("BUNDLE", repr(str(here / "bundle"))))
-    made = {"bundle": here / "bundle", "original": here / "original.py", "gate": here / "gate.yaml"}
+    with pytest.raises(SystemExit) as left:
+        main(["prune", str(noisy), "-o", str(here / "pruned"), "--ratio", "0.01"])
+    assert not left.value.code
+    made = {
+        "bundle": here / "bundle",
+        "tuned": here / "pruned/module/main.safetensors",
+        "original": here / "original.py",
+        "gate": here / "gate.yaml",
+    }
     return SimpleNamespace(policy=noisy, **made, here=here)
 
 
@@ -178,6 +188,8 @@ def test_what_the_policy_printed_is_on_stderr(vlatool, places, tmp_path) -> None
 BAD = {
     "optimize": "{nothing} -o {out}",
     "export": "{nothing} -o {out}",
+    "prune": "{nothing} -o {out}",
+    "distill": "{nothing} --file {nothing} -o {out}",
     "quantize": "{nothing} -o {out}",
     "benchmark": "{nothing}",
     "evaluate": "{nothing}",
