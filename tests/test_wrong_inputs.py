@@ -407,7 +407,7 @@ BUNDLES = [
         lambda at: lambda: load(at.bundle("golden/golden.npz", b"PK", sealed=True)), called),
 ]  # fmt: skip
 SOURCES = [
-    Row("no source", "is no bundle and no policy source", 3, lambda at: ["export", at.root / "none", *at.to]),
+    Row("no source", "is neither a bundle nor a policy source", 3, lambda at: ["export", at.root / "none", *at.to]),
     Row("no ONNX file", "There is no ONNX file", 3, lambda at: ["quantize", at.root / "none.onnx", *at.to]),
     Row("an ONNX file that is none", "is not a readable ONNX file", 3,
         lambda at: ["quantize", at.file("a.onnx", b"\x0a\xff" * 9), *at.to]),

@@ -167,10 +167,10 @@ NUMBERS = [
 ]  # fmt: skip
 NAMES = [
     Row("no source", "Missing argument", 2, lambda at: ["hwselect", "select"]),
-    Row("a source that is not there", "is no bundle and no policy source", 3,
+    Row("a source that is not there", "is neither a bundle nor a policy source", 3,
         lambda at: ["hwselect", at.root / "none"]),
     Row("an ONNX file that is not there", "There is no ONNX file", 3, lambda at: ["hwselect", at.root / "none.onnx"]),
-    Row("a misspelt subcommand", "is no bundle and no policy source", 3, lambda at: ["hwselect", "scroe"]),
+    Row("a misspelt subcommand", "is neither a bundle nor a policy source", 3, lambda at: ["hwselect", "scroe"]),
     Row("an unknown profile", "Unknown profile 'rasberry-pi-5'; did you mean 'raspberry-pi-5'", 3,
         lambda at: ["hwselect", at.float, "--boards", "rasberry-pi-5"]),
     Row("a profile that is not there", "cannot be read: No such file", 3,
@@ -248,7 +248,7 @@ SIMULATE = [
                     "int8"]),
     Row("simulate float32 on an NPU", "raspberry-pi-5-hailo8", 3,
         lambda at: ["simulate", at.float, "--profile", "raspberry-pi-5-hailo8", "--engine", "hailort"]),
-    Row("simulate a policy that is not there", "is no bundle and no policy source", 3,
+    Row("simulate a policy that is not there", "is neither a bundle nor a policy source", 3,
         lambda at: ["simulate", at.root / "none", "--profile", "raspberry-pi-5"]),
     Row("simulate a policy without static shapes", "1 layers have no static shape", 3,
         lambda at: ["simulate", at.shapeless(), "--profile", "raspberry-pi-5"]),

@@ -9,7 +9,8 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._made import for_board
+from vlatool.cli._made import ForBoard, for_board
+from vlatool.errors import GraphError
 from vlatool.hardware.profile import load_profile
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
@@ -32,6 +33,13 @@ def test_the_layout_and_the_activations_follow_the_board() -> None:
         assert (StaticInt8().on(board).layout, StaticInt8().on(board).activations) == ("ort", "auto")
     assert (WeightOnly().on(orin).layout, WeightOnly().on(pi).layout) == ("qdq", "ort")
     assert DynamicInt8().on(orin) == DynamicInt8()
+
+
+def test_openvino_takes_a_layout_of_its_own() -> None:
+    nuc = load_profile("nuc")
+    first = nuc.model_copy(update={"engines": {"openvino": nuc.engines["openvino"], **nuc.engines}})
+    assert first.engine == "openvino"
+    assert (StaticInt8().on(first).layout, StaticInt8().on(first).activations) == ("openvino", "auto")
 
 
 def test_what_was_typed_stays_as_typed() -> None:
@@ -72,3 +80,27 @@ def test_an_export_says_it_too_and_an_unknown_board_is_refused(onnx_file: Path, 
 
 def test_without_recordings_or_a_source_nothing_is_compared(float_bundle: Bundle, onnx_file: Path) -> None:
     assert for_board(float_bundle, None, load_profile("pi5"), Context()).error is None
+
+
+def test_a_policy_that_is_not_exported_yet_is_not_predicted(policy_dir: Path, tmp_path: Path, capsys) -> None:
+    told = run(capsys, "prune", "magnitude", str(policy_dir), "-o", str(tmp_path / "out"), "--profile", "pi5")
+    assert "nothing is predicted for raspberry-pi-5 before the export" in told
+    assert "graphs " not in told
+
+
+def test_what_cannot_be_predicted_is_said_when_the_bundle_is_written(
+    float_bundle: Bundle, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    def fails(profile: object, made: object) -> None:
+        raise GraphError("The graph cannot be counted.")
+
+    monkeypatch.setattr("vlatool.boards.predict.predictions", fails)
+    words = ["quantize", "dynamic-int8", str(float_bundle.path), "-o", str(tmp_path / "out"), "--profile", "pi5"]
+    told = run(capsys, *words)
+    assert "nothing is predicted for raspberry-pi-5: The graph cannot be counted." in told
+    assert (tmp_path / "out/manifest.json").is_file()
+
+
+def test_a_bundle_of_equal_size_is_not_smaller() -> None:
+    assert ForBoard("pi5", 1000, 1000, (), None).lines() == ["graphs 0.00 MB -> 0.00 MB"]
+    assert ForBoard("pi5", 3_000_000, 1_000_000, (), None).lines() == ["graphs 3.00 MB -> 1.00 MB, 3.0x smaller"]

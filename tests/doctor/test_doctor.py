@@ -270,3 +270,12 @@ def test_a_library_that_fails_is_a_warning() -> None:
 
     found = named(doctor.engines({"onnxruntime": "1.31"}, None, broken), "engine onnxruntime")
     assert (found.status, found.finding) == ("warn", "onnxruntime 1.31 fails: AttributeError: no such function")
+
+
+def test_a_runtime_without_a_provider_is_a_warning() -> None:
+    found = named(doctor.engines({"onnxruntime": "1.31"}, JETSON, lambda _: []), "engine onnxruntime")
+    assert (found.status, "no provider" in found.finding) == ("warn", True)
+    elsewhere = named(doctor.engines({"onnxruntime": "1.31"}, None, lambda _: []), "engine onnxruntime")
+    assert (elsewhere.status, elsewhere.fix) == ("warn", "reinstall it")
+    silent = named(doctor.engines({"openvino": "2026.4"}, None, lambda _: None), "engine openvino")
+    assert (silent.status, silent.finding) == ("ok", "openvino 2026.4")

@@ -420,3 +420,15 @@ def test_a_users_profile_may_have_the_name_that_a_board_goes_by(
     write(tmp_path, valid | {"name": "thor"}, "thor")
     monkeypatch.setenv("VLATOOL_PROFILES", str(tmp_path))
     assert load_profile("thor").name == "thor"
+
+
+@pytest.mark.parametrize("aliases", [
+    "aliases: [one, two]\n", "aliases:\n  - one\n  - two\n", "aliases:\n- one\n", "aliases: [\n  one,\n  two,\n]\n",
+])  # fmt: skip
+def test_a_copy_has_no_other_names(aliases: str, tmp_path: Path, valid: dict[str, Any]) -> None:
+    path = write(tmp_path, {key: value for key, value in valid.items() if key != "aliases"})
+    path.write_text(aliases + path.read_text())
+    assert load_profile(path).aliases
+    copy_profile(str(path), "mine", tmp_path / "copied.yaml")
+    wanted = load_profile(path).model_copy(update={"name": "mine", "aliases": ()})
+    assert load_profile(tmp_path / "copied.yaml") == wanted

@@ -123,3 +123,9 @@ def test_weights_of_another_shape_are_refused(changed: Bundle):
     )
     with pytest.raises(SourceError, match=r"has the shape \[2, 3\] in .*main.safetensors; the module's is \[6, 3\]"):
         edited({"main": mlp()}, Bundle(changed.path, other))
+
+
+def test_a_file_that_is_not_safetensors_is_refused(changed: Bundle):
+    (changed.path / "module/main.safetensors").write_bytes(b"\xff" * 64)
+    with pytest.raises(SourceError, match=r"main\.safetensors cannot be read as safetensors"):
+        edited({"main": mlp()}, changed)

@@ -20,13 +20,14 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
+from vlatool.cli._run import exported
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
 from vlatool.optimize.pipeline import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
 from vlatool.report import Report, read_report
 from vlatool.runtime import load
-from vlatool.sources import brings_calibration, exported, source_stage, sourced
+from vlatool.sources import brings_calibration, source_stage, sourced
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context

@@ -23,9 +23,11 @@ absent = acme_robotics.no_such_file
 
 [vlatool.engines]
 acme = acme_robotics.engine
+absent = acme_robotics.no_such_engine
 
 [vlatool.sources]
 acme = acme_robotics.source
+a-first = acme_robotics.no_such_source
 
 [vlatool.profiles]
 acme = acme_robotics.boards
@@ -87,11 +89,11 @@ def test_the_help_lists_its_method_and_its_command(run: Run):
 
 def test_doctor_says_what_it_adds(run: Run):
     told = {each["name"]: each for each in json.loads(ok(run("doctor", "--json")))}
-    assert (
-        "acme-robotics 1.2 adds commands.acme, engines.acme, profiles.acme" in told["plugin acme-robotics"]["finding"]
-    )
-    assert "quantize.rounded" in told["plugin acme-robotics"]["finding"]
-    assert "'absent' (vlatool.quantize), cannot be imported" in told["plugin acme-robotics"]["finding"]
+    finding = told["plugin acme-robotics"]["finding"]
+    for added in ("acme-robotics 1.2 adds ", "commands.acme", "engines.acme", "profiles.acme", "quantize.rounded"):
+        assert added in finding
+    for broken in ("'absent' (vlatool.quantize)", "'absent' (vlatool.engines)", "'a-first' (vlatool.sources)"):
+        assert f"{broken}, cannot be imported" in finding
     assert told["engine acme_robotics"]["finding"] == "acme-robotics 1.2: Acme"
 
 
@@ -140,6 +142,13 @@ def test_what_cannot_be_imported_is_told_as_its_own(run: Run, onnx_file: Path, t
     done = run("quantize", "absent", str(onnx_file), "-o", str(tmp_path / "out"))
     assert done.returncode == 3
     assert "acme-robotics 1.2, which brings 'absent' (vlatool.quantize), cannot be imported" in done.stderr
+
+
+def test_an_engine_that_cannot_be_imported_stands_in_nobodys_way(run: Run, onnx_file: Path, tmp_path: Path):
+    ok(run("quantize", "dynamic-int8", str(onnx_file), "-o", str(tmp_path / "out")))
+    done = run("benchmark", str(tmp_path / "out"), "--engine", "absent", "--iterations", "20")
+    assert done.returncode == 3
+    assert "acme-robotics 1.2, which brings 'absent' (vlatool.engines), cannot be imported" in done.stderr
 
 
 def test_it_replaces_nothing_of_vlatools_own(run: Run):

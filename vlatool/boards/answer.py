@@ -25,6 +25,7 @@ from vlatool.hardware.profile import Profile, load_profile, names
 from vlatool.latency_model.model import LatencyModel, shipped
 from vlatool.machine.host import cache_directory
 from vlatool.module.description import read_location
+from vlatool.module.edits import is_changed
 from vlatool.module.origin import origin_of
 from vlatool.report import Report
 from vlatool.sources import sourced
@@ -154,6 +155,8 @@ def carry_count(source: str, context: Context) -> Path:
     if not _may_carry(bundle):
         if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
             raise UsageError(f"{source} is counted without torch; only a policy with code carries a count.")
+        if is_changed(bundle):
+            raise UsageError(f"{source} is a bundle; only a policy with code carries a count.", "leave it out")
         raise UsageError(
             f"The factory of {source} lies in a package ({bundle.manifest.source['factory']}), whose changes nobody "
             "would notice.",
@@ -172,7 +175,7 @@ def carry_count(source: str, context: Context) -> Path:
 
 def _may_carry(bundle: Bundle) -> bool:
     """Say whether a count can be known to be of this code: it lies beside ``policy.yaml``, or comes with vlatool."""
-    if bundle.manifest.graphs:
+    if bundle.manifest.graphs or is_changed(bundle):
         return False
     source = bundle.manifest.source
     return bool(source.get("code")) or str(source.get("factory", "")).startswith("vlatool.")

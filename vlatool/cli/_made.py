@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.errors import VlatoolError
 from vlatool.hardware.profile import Profile
 from vlatool.report import Measurement
 from vlatool.stage.base import Context
 
 SAMPLES = 64
 """Recorded observations that the actions are compared on."""
+SMALLER = 1.05
+"""From here on a bundle is told to be smaller than what it was made from."""
 SHOWN = {"latency_p50": "latency p50", "memory": "memory"}
 
 
@@ -24,6 +29,7 @@ class ForBoard:
         before, after: Bytes of the graphs; before is None where the source has no graphs.
         predictions: For the board, with their intervals.
         error: How the actions differ from the source's on recorded observations, None where that cannot be said.
+        missing: What could not be predicted or compared, and why, in words.
     """
 
     board: str
@@ -31,33 +37,65 @@ class ForBoard:
     after: int
     predictions: tuple[Measurement, ...]
     error: Measurement | None
+    missing: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
         """Return what a person wants to know."""
-        size = f"graphs {self.after / 1e6:.2f} MB"
-        if self.before is not None and self.after:
-            before = f"graphs {self.before / 1e6:.2f} MB"
-            size = f"{before} -> {self.after / 1e6:.2f} MB, {self.before / self.after:.1f}x smaller"
-        predicted = [f"{SHOWN[each.name]} on {self.board}, predicted: {_number(each)}" for each in self.predictions]
-        return [size, *predicted, *([_words(self.error)] if self.error is not None else [])]
+        predicted = [
+            f"{SHOWN[number.name]} on {self.board}, predicted: {_number(number)}" for number in self.predictions
+        ]
+        error = [_words(self.error)] if self.error is not None else []
+        return [*([self._size()] if self.after else []), *predicted, *error, *self.missing]
+
+    def _size(self) -> str:
+        after = f"{self.after / 1e6:.2f} MB"
+        if self.before is None:
+            return f"graphs {after}"
+        smaller = self.before / self.after
+        ratio = f", {smaller:.1f}x smaller" if smaller >= SMALLER else ""
+        return f"graphs {self.before / 1e6:.2f} MB -> {after}{ratio}"
 
     def values(self) -> dict[str, Any]:
         """Return the same as JSON values."""
-        numbers = {each.name: {"value": _known(each.value), "low": each.low, "high": each.high, "unit": each.unit,
-                               "note": each.note} for each in self.predictions}  # fmt: skip
-        error = None if self.error is None else {"name": self.error.name, "value": _known(self.error.value)}
+        numbers = {number.name: {"value": number.value, "low": number.low, "high": number.high, "unit": number.unit,
+                                 "note": number.note} for number in self.predictions}  # fmt: skip
+        error = None if self.error is None else {"name": self.error.name, "value": self.error.value}
         return {"board": self.board, "graphs_before": self.before, "graphs_after": self.after, "predictions": numbers,
-                "actions": error}  # fmt: skip
+                "actions": error, "missing": [*self.missing]}  # fmt: skip
 
 
 def for_board(made: Bundle, source: Bundle | None, profile: Profile, context: Context) -> ForBoard:
-    """Compare a new bundle with its source, and predict it on a board."""
+    """Compare a new bundle with its source, and predict it on a board.
+
+    The bundle is written by now: what cannot be predicted or compared is said, and is no failure.
+    """
+    missing: list[str] = []
+    numbers: tuple[Measurement, ...] = ()
+    error = None
+    if made.manifest.graphs:
+        context.tell(f"predicting for {profile.name}", None)
+        with _said(missing, f"nothing is predicted for {profile.name}"):
+            numbers = _predicted(made, profile)
+        with _said(missing, "the actions were not compared with the source's"):
+            error = _error(made, source, context)
+    else:
+        missing.append(f"nothing is predicted for {profile.name} before the export")
+    before = graph_bytes(source) if source is not None and source.manifest.graphs else None
+    return ForBoard(profile.name, before, graph_bytes(made), numbers, error, tuple(missing))
+
+
+@contextlib.contextmanager
+def _said(missing: list[str], what: str) -> Iterator[None]:
+    try:
+        yield
+    except VlatoolError as error:
+        missing.append(f"{what}: {error.message}")
+
+
+def _predicted(made: Bundle, profile: Profile) -> tuple[Measurement, ...]:
     from vlatool.boards.predict import predictions
 
-    context.tell(f"predicting for {profile.name}", None)
-    found = tuple(each for each in predictions(profile, made) if each.name in SHOWN)
-    before = graph_bytes(source) if source is not None and source.manifest.graphs else None
-    return ForBoard(profile.name, before, graph_bytes(made), found, _error(made, source, context))
+    return tuple(number for number in predictions(profile, made) if number.name in SHOWN)
 
 
 def graph_bytes(bundle: Bundle) -> int:
@@ -87,7 +125,3 @@ def _number(each: Measurement) -> str:
         return each.note or "not known"
     interval = f" ({each.low:.3g} to {each.high:.3g})" if each.low is not None and each.high is not None else ""
     return f"{each.value:.3g} {each.unit}{interval}"
-
-
-def _known(value: float) -> float | None:
-    return value if value == value else None

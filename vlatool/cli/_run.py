@@ -23,7 +23,7 @@ from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.optimize.choice import foretold
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
-from vlatool.stage.run import cache_directory, measured_with, run_transform
+from vlatool.stage.run import cache_directory, cached_transform, measured_with, run_transform
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -87,7 +87,7 @@ MEASURE_FLAGS = (
 def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool, profile: str | None = None) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
     from vlatool.hardware.profile import load_profile
-    from vlatool.sources import exported, is_bundle, source_stage, sourced
+    from vlatool.sources import is_bundle, source_stage, sourced
 
     bundle: Bundle | None
     refuse_existing(out, force, source, file_or_none(profile), *named_files(stage), kind=BUNDLE)
@@ -98,9 +98,8 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
             bundle = Bundle.open(source)
         elif stage.takes_modules:
             bundle = sourced(source, cache_directory(), context)
-            if (
-                bundle.manifest.graphs and stage.kind() == "export"
-            ):  # an ONNX file: its source stage is all the export that there is
+            if bundle.manifest.graphs and stage.kind() == "export":
+                # of an ONNX file, whose source stage is all the export that there is
                 stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
@@ -173,9 +172,18 @@ def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
     return bundle
 
 
+def exported(source: str, cache: Path, context: Context) -> Bundle:
+    """Return a float32 bundle with graphs of what a person typed as SOURCE, exported with the default options."""
+    from vlatool.export.onnx import ExportOnnx
+    from vlatool.sources import sourced
+
+    bundle = sourced(source, cache, context)
+    return bundle if bundle.manifest.graphs else cached_transform(ExportOnnx(), bundle, cache, context)
+
+
 def opened(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or that of a policy, exported with the default options."""
-    from vlatool.sources import exported, is_bundle
+    from vlatool.sources import is_bundle
 
     return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import SourceError, require
-from vlatool.module.edits import Edit, load_tensors
+from vlatool.errors import SourceError
+from vlatool.module.edits import Edit, load_tensors, read_tensors
 from vlatool.module.stage import ModuleStage
 from vlatool.stage.base import Context
 
@@ -45,11 +45,7 @@ class Weights(ModuleStage):
         Raises:
             SourceError: when the file is not safetensors, or a tensor is missing or has another shape.
         """
-        safetensors = require("safetensors.torch", "build")
-        try:
-            stored = safetensors.load_file(str(self.file))
-        except Exception as error:  # the seam: safetensors raises its own kind
-            raise SourceError(f"{self.file} cannot be read as safetensors: {error}.") from error
+        stored = read_tensors(self.file)
         for graph, module in modules.items():
             context.tell(f"loading the weights of {graph}", None)
             load_tensors(graph, module, stored, str(self.file))

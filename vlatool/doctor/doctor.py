@@ -19,7 +19,7 @@ from vlatool.errors import MissingExtra, PluginError, VlatoolError
 from vlatool.files.printable import message_of
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
-from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, engine_class, engine_names
+from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, usable_engines
 from vlatool.telemetry.rapl import UDEV_RULE
 
 Status = Literal["ok", "warn", "missing"]
@@ -91,12 +91,11 @@ def python_version(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
 
 
 def engines(
-    installed: Mapping[str, str], board: str | None, ask: Callable[[type[Engine]], list[str]]
+    installed: Mapping[str, str], board: str | None, ask: Callable[[type[Engine]], list[str] | None]
 ) -> Iterator[Check]:
     """The inference libraries with their version and, where they say so, what they run on."""
     jetson = bool(board and "jetson" in board.lower())
-    for name in engine_names():
-        library: type[Engine] = engine_class(name)
+    for library in usable_engines().values():
         title = f"engine {library.package}"
         found = next((each for each in (library.package, *library.substitutes) if each in installed), None)
         if found is not None:
@@ -108,27 +107,29 @@ def engines(
 
 
 def _engine(
-    title: str, words: str, library: type[Engine], jetson: bool, ask: Callable[[type[Engine]], list[str]]
+    title: str, words: str, library: type[Engine], jetson: bool, ask: Callable[[type[Engine]], list[str] | None]
 ) -> Check:
     try:
-        found = ask(library)
+        providers = ask(library)
     except MissingExtra as error:
         return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
     except Exception as error:  # the seam: a library, or another package's engine, raises what it likes
         return Check(title, "warn", f"{words} fails: {type(error).__name__}: {message_of(error)}", "update it")
-    short = [name.removesuffix("ExecutionProvider") for name in found]
-    finding = f"{words}: {', '.join(short)}" if short else words
-    if short and jetson and not {"CUDA", "Tensorrt"} & {*short}:
+    if providers is None:
+        return Check(title, "ok", words)
+    short = [name.removesuffix("ExecutionProvider") for name in providers]
+    finding = f"{words}: {', '.join(short) or 'no provider'}"
+    if jetson and not {"CUDA", "Tensorrt"} & {*short}:
         fix = "install the onnxruntime-gpu wheel of NVIDIA's Jetson index for your JetPack; the plain wheel has no GPU"
         return Check(title, "warn", f"{finding}; this board's GPU stays idle", fix)
-    return Check(title, "ok", finding)
+    return Check(title, "ok" if short else "warn", finding, "" if short else "reinstall it")
 
 
 def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
-    for name in engine_names():
+    for name, library in usable_engines().items():
         try:
-            found = str(engine_class(name).arithmetic())
+            found = str(library.arithmetic())  # type: ignore[attr-defined]
         except VlatoolError:
             continue
         title = f"int8 {name}"
@@ -175,7 +176,7 @@ def plugins() -> Iterator[Check]:
 
 def _substitutes() -> dict[str, tuple[str, ...]]:
     """Package of an engine -> the distributions of other names that bring it."""
-    return {library.package: library.substitutes for library in map(engine_class, engine_names())}
+    return {library.package: library.substitutes for library in usable_engines().values()}
 
 
 def instruction_set(features: Sequence[str] | None) -> Check:

@@ -293,7 +293,7 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
     if not re.fullmatch(NAME, name):
         raise ProfileError(f"'{name}' is no name of a profile; allowed: lower-case letters, digits and hyphens.")
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
-    text = re.sub(r"(?m)^aliases: .*\n", "", text, count=1)
+    text = re.sub(r"(?m)^aliases:.*\n(?:[ \t]+.*\n|- .*\n|\]\n)*", "", text, count=1)
     try:
         write_own(target, text, force=force)
     except OSError as error:

@@ -87,7 +87,7 @@ def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = 
     for graph, module in modules.items() if weights else ():
         if (name := f"{FOLDER}/{graph}.safetensors") in bundle.manifest.files:
             path = bundle.file(name)
-            load_tensors(graph, module, require("safetensors.torch", "build").load_file(str(path)), str(path))
+            load_tensors(graph, module, read_tensors(path), str(path))
     return dict(modules)
 
 
@@ -121,6 +121,19 @@ def _keep(module: Any, edit: Edit) -> None:
                 kept = value.detach().index_select(axis, index).contiguous()
                 holder[name] = torch.nn.Parameter(kept, value.requires_grad) if holder is module._parameters else kept
     setattr(module, size, len(edit.keep))
+
+
+def read_tensors(path: Path) -> dict[str, Any]:
+    """Return the tensors of a safetensors file: name -> tensor.
+
+    Raises:
+        SourceError: when the file cannot be read, or is not safetensors.
+    """
+    safetensors = require("safetensors.torch", "build")
+    try:
+        return dict(safetensors.load_file(str(path)))
+    except Exception as error:  # the seam: safetensors raises its own kind
+        raise SourceError(f"{path} cannot be read as safetensors: {error}.") from error
 
 
 def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where: str) -> None:

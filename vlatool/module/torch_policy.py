@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
-from vlatool.module.edits import edited, load_tensors
+from vlatool.module.edits import edited, load_tensors, read_tensors
 from vlatool.module.factory import exits_told
 from vlatool.module.failures import remedy_for
 from vlatool.module.modules import modules_of
@@ -49,11 +49,10 @@ def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> 
     Raises:
         SourceError: when a tensor is missing or has another shape.
     """
-    safetensors = require("safetensors.torch", "build")
     stored: dict[str, Any] = {}
     for file in shard_files(folder, pattern):
         read_header(file)
-        stored.update(safetensors.load_file(str(file)))
+        stored.update(read_tensors(file))
     load_tensors(graph, module, stored, str(folder / pattern))
 
 

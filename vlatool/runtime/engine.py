@@ -6,6 +6,7 @@ that opens a graph (``vlatool.runtime.program.Session``) and overrides what it d
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from vlatool import registry
-from vlatool.errors import GraphError, require
+from vlatool.errors import GraphError, PluginError, require
 
 DEFAULT_ENGINE = "ort_cpu"
 """Runs a bundle that names no engine, and computes for stages that need float32 answers."""
@@ -99,14 +100,14 @@ class Engine:
         return require(cls.package, cls.extra)
 
     @classmethod
-    def execution_providers(cls) -> list[str]:
-        """Return what the installed library runs on, where it says so.
+    def execution_providers(cls) -> list[str] | None:
+        """Return what the installed library runs on, None where it does not say so.
 
         Raises:
             MissingExtra: when it cannot be imported.
         """
         cls.library()
-        return []
+        return None
 
     @classmethod
     def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
@@ -164,16 +165,28 @@ def engine_names() -> list[str]:
     return sorted(registry.names("engines"), key=lambda name: (name != DEFAULT_ENGINE, name))
 
 
+def usable_engines() -> dict[str, type[Engine]]:
+    """Return the classes of all engines, the default one first, without those of packages that cannot be imported.
+
+    ``doctor`` names such a package; the engines beside it work.
+    """
+    classes: dict[str, type[Engine]] = {}
+    for name in engine_names():
+        with contextlib.suppress(PluginError):
+            classes[name] = engine_class(name)
+    return classes
+
+
 def layouts() -> dict[str, tuple[Int8Layout, str]]:
     """Return the layouts of int8 graphs, the default one first: name -> what is written, and for which engine.
 
     The standard one, ``qdq``, is for the engine that runs it.
     """
-    found: dict[str, tuple[Int8Layout, str]] = {}
-    for engine in engine_names():
-        own = {name: (layout, engine) for name, layout in engine_class(engine).layouts.items()}
-        found |= own if found else {**own, STANDARD_LAYOUT: (Int8Layout(), "")}
-    return found
+    listed: dict[str, tuple[Int8Layout, str]] = {}
+    for engine, library in usable_engines().items():
+        own = {name: (layout, engine) for name, layout in library.layouts.items()}
+        listed |= own if listed else {**own, STANDARD_LAYOUT: (Int8Layout(), "")}
+    return listed
 
 
 def computing(dtype: str) -> str:
@@ -182,12 +195,13 @@ def computing(dtype: str) -> str:
     Raises:
         GraphError: when none does.
     """
-    for name in engine_names():
-        if dtype in engine_class(name).computes:
+    for name, library in usable_engines().items():
+        if dtype in library.computes:
             return name
     raise GraphError(f"No engine computes in {dtype}.")
 
 
 def installed(name: str) -> bool:
-    """Say whether the library of an engine is installed."""
-    return importlib.util.find_spec(engine_class(name).package) is not None
+    """Say whether the library of an engine is installed; not, where another package's engine cannot be imported."""
+    library = usable_engines().get(name)
+    return library is not None and importlib.util.find_spec(library.package) is not None

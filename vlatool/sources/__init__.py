@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 from vlatool import registry
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.errors import SourceError
+from vlatool.errors import PluginError, SourceError
 from vlatool.module.description import FILE, read_description
 from vlatool.sources._source import Source
-from vlatool.stage.base import Context, Transform
+from vlatool.stage.base import Context
 from vlatool.stage.run import cached_transform
 
-__all__ = ["Source", "brings_calibration", "exported", "is_bundle", "source_stage", "sourced"]
+__all__ = ["Source", "brings_calibration", "is_bundle", "source_stage", "sourced"]
 
 
 def is_bundle(source: str) -> bool:
@@ -34,11 +35,12 @@ def source_stage(source: str) -> Source:
         SourceError: when it is none of them.
     """
     for name in registry.names("sources"):
-        kind: type[Source] = registry.load("sources", name)
-        if stage := kind.accepting(source):
-            return stage
+        with contextlib.suppress(PluginError):  # of a package that cannot be imported; ``doctor`` names it
+            kind: type[Source] = registry.load("sources", name)
+            if stage := kind.accepting(source):
+                return stage
     raise SourceError(
-        f"'{source}' is no bundle and no policy source.",
+        f"'{source}' is neither a bundle nor a policy source.",
         "give a bundle, a directory with a policy.yaml, path/to/policy.py:make, or a .onnx file",
     )
 
@@ -48,13 +50,6 @@ def sourced(source: str, cache: Path, context: Context) -> Bundle:
     stage = source_stage(source)
     stage.check(None, None)
     return cached_transform(stage, None, cache, context)
-
-
-def exported(source: str, cache: Path, context: Context) -> Bundle:
-    """Return a float32 bundle with graphs of what a person typed as SOURCE, exported with the default options."""
-    bundle = sourced(source, cache, context)
-    export: Transform = registry.load("export", "onnx")()
-    return bundle if bundle.manifest.graphs else cached_transform(export, bundle, cache, context)
 
 
 def brings_calibration(source: str) -> bool:

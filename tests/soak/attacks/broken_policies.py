@@ -30,6 +30,7 @@ from toy_robot import write_robot
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main as vlatool
+from vlatool.cli._run import exported
 from vlatool.errors import VlatoolError
 from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.run import run_gate
@@ -39,7 +40,6 @@ from vlatool.optimize.recipe import Effort, Limits, Recipe
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
 from vlatool.runtime.policy import load_goldens
-from vlatool.sources import exported
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 

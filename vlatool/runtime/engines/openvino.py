@@ -68,6 +68,7 @@ class OpenvinoSession(Engine):
     layouts: ClassVar[Mapping[str, Int8Layout]] = {
         "openvino": Int8Layout(fuses_convolutions=False, symmetric=True, convolutions=True, crashes=True)
     }
+    int8: ClassVar[Mapping[str, Any]] = {"layout": "openvino"}
     remedy = "quantize again with --reduce-range, or with --layout ort for ONNX Runtime, whose products are exact"
 
     def __init__(
