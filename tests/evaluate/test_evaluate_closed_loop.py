@@ -7,9 +7,9 @@ import pytest
 from vlatool.accuracy.outcome import Outcome
 from vlatool.accuracy.paired import compare_success, success_row
 from vlatool.data import observations_for
+from vlatool.episodes import controls, play
+from vlatool.episodes.play import Job, run_jobs
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
-from vlatool.evaluate import _controls, _episodes
-from vlatool.evaluate._episodes import Job, run_jobs
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.report import Row
 from vlatool.stage.base import Context
@@ -163,7 +163,7 @@ def test_an_environment_that_raises_is_named_with_its_task_and_seed(int8_bundle,
 
 
 def test_an_environment_that_never_ends_is_left(int8_bundle, world, monkeypatch):
-    monkeypatch.setattr(_episodes, "STEP_LIMIT", 50)
+    monkeypatch.setattr(play, "STEP_LIMIT", 50)
     stage = ClosedLoop(environment=world(), tasks=("reach",), episodes=1, first_seed=3)
     with pytest.raises(DataError, match=r"task 'reach' did not end within 50 steps at seed 3"):
         stage.run(int8_bundle, Context())
@@ -182,16 +182,16 @@ def test_a_worker_that_dies_is_said(int8_bundle, world):
 
 
 def test_an_inference_that_takes_too_long_is_stopped(int8_bundle, monkeypatch):
-    worker = _episodes.Worker(str(int8_bundle.path), "")
+    worker = play.Worker(str(int8_bundle.path), "")
     observation = observations_for(int8_bundle, 1)[0]
     assert worker.queue.act(observation).shape == (2,)
     worker.queue.reset()
-    monkeypatch.setattr(_episodes, "FIRST_RUN_S", -1.0)
-    monkeypatch.setattr(_controls, "FIRST_RUN_S", -1.0)
+    monkeypatch.setattr(play, "FIRST_RUN_S", -1.0)
+    monkeypatch.setattr(controls, "FIRST_RUN_S", -1.0)
     with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
         worker.queue.act(observation)
     with pytest.raises(GraphError, match="takes longer than -1 s, so it was stopped"):
-        _controls.answers_of(worker.queue.policy)
+        controls.answers_of(worker.queue.policy)
 
 
 def test_one_environment_is_open_at_a_time(float_bundle, int8_bundle, world):

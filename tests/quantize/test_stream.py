@@ -16,13 +16,15 @@ from safetensors.numpy import save_file
 
 from vlatool.bundle.bundle import hash_file
 from vlatool.errors import GraphError, OutputError, SourceError
+from vlatool.files import work
+from vlatool.files.work import work_directory
 from vlatool.quantize import _stream
 from vlatool.quantize._blocks import Format
 from vlatool.quantize._compute import Job, records_of
 from vlatool.quantize._journal import DATA, JOURNAL
 from vlatool.quantize._records import Record
 from vlatool.quantize._rewrite import Task, block_task, copy_task
-from vlatool.quantize._stream import work_directory, write_records
+from vlatool.quantize._stream import write_records
 from vlatool.quantize._worker import serve
 from vlatool.stage.base import Tell
 from vlatool.weights.shards import StoredTensor, fingerprint, read_header, read_shards, reading, stored_array
@@ -239,7 +241,7 @@ def test_forgotten_work_is_swept(shard, tmp_path):
     old, new = tmp_path / "work" / "old", tmp_path / "work" / "new"
     for place in (old, new):
         write(records(shard), place)
-    past = time.time_ns() // 10**9 - _stream.FORGOTTEN_S - 60
+    past = time.time_ns() // 10**9 - work.FORGOTTEN_S - 60
     os.utime(old / "lock", (past, past))
     write(records(shard), tmp_path / "work" / "third")
     assert not old.exists()

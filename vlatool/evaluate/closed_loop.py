@@ -10,9 +10,9 @@ from pydantic import Field
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.paired import compare_success, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.episodes.controls import CONTROLS
+from vlatool.episodes.play import Job, run_jobs
 from vlatool.errors import DataError, SourceError, UsageError, nearest
-from vlatool.evaluate._controls import CONTROLS
-from vlatool.evaluate._episodes import Job, run_jobs
 from vlatool.evaluate._findings import found_wrong
 from vlatool.machine.host import fingerprint
 from vlatool.module.description import read_description

@@ -21,20 +21,22 @@ if TYPE_CHECKING:
 
 FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
-AXES = ("outputs", "inputs")
+CHANNELS, BLOCKS = ("outputs", "inputs"), "blocks"
+AXES = (*CHANNELS, BLOCKS)
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
 
 
 @dataclass(frozen=True)
 class Edit:
-    """Channels of one module that are kept.
+    """Channels or blocks of one module that are kept.
 
     Args:
         graph: Name of the graph whose module it is in.
         module: Its name, as ``named_modules`` gives it.
-        axis: ``outputs`` (rows of the weight, the bias) or ``inputs`` (columns of the weight).
-        keep: Indices of the channels that stay, in the order in which they stay.
+        axis: ``outputs`` (rows of the weight, the bias), ``inputs`` (columns of the weight) or ``blocks`` (the modules
+            of an ``nn.ModuleList`` or ``nn.Sequential``).
+        keep: Indices of what stays, in the order in which it stays.
     """
 
     graph: str
@@ -92,10 +94,10 @@ def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = 
 
 
 def apply(modules: Mapping[str, nn.Module], edits: Iterable[Edit]) -> None:
-    """Keep the channels of each edit, in order; modules are changed in place.
+    """Keep the channels and blocks of each edit, in order; modules are changed in place.
 
     Raises:
-        SourceError: when there is no such module, it has no such axis, or fewer channels.
+        SourceError: when there is no such module, it has no such axis, or fewer channels or blocks.
     """
     for edit in edits:
         if edit.graph not in modules:
@@ -103,7 +105,7 @@ def apply(modules: Mapping[str, nn.Module], edits: Iterable[Edit]) -> None:
         parts = dict(modules[edit.graph].named_modules())
         if edit.module not in parts:
             raise SourceError(f"An edit names the module '{edit.module}'; {nearest(edit.module, list(parts)[:500])}.")
-        _keep(parts[edit.module], edit)
+        (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
 
 
 def _keep(module: Any, edit: Edit) -> None:
@@ -113,7 +115,7 @@ def _keep(module: Any, edit: Edit) -> None:
         raise SourceError(f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.")
     if max(edit.keep) >= getattr(module, size):
         raise SourceError(f"'{edit.module}' has {getattr(module, size)} {edit.axis}; an edit keeps {max(edit.keep)}.")
-    axis = AXES.index(edit.axis)
+    axis = CHANNELS.index(edit.axis)
     for holder in (module._parameters, module._buffers):
         for name, value in holder.items():
             if value is not None and value.dim() > axis and (axis == 0 or name == "weight"):
@@ -121,6 +123,20 @@ def _keep(module: Any, edit: Edit) -> None:
                 kept = value.detach().index_select(axis, index).contiguous()
                 holder[name] = torch.nn.Parameter(kept, value.requires_grad) if holder is module._parameters else kept
     setattr(module, size, len(edit.keep))
+
+
+def _keep_blocks(module: Any, edit: Edit) -> None:
+    """Keep blocks; those of a list, and those that are numbered, are numbered anew."""
+    nn = require("torch", "build").nn
+    if not isinstance(module, nn.ModuleList | nn.Sequential):
+        raise SourceError(f"The blocks of '{edit.module}' ({type(module).__name__}) cannot be chosen from.")
+    blocks = list(module._modules.items())
+    if max(edit.keep) >= len(blocks):
+        raise SourceError(f"'{edit.module}' has {len(blocks)} blocks; an edit keeps {max(edit.keep)}.")
+    module._modules.clear()
+    for number, index in enumerate(edit.keep):
+        name, block = blocks[index]
+        module._modules[str(number) if name.isdecimal() else name] = block
 
 
 def read_tensors(path: Path) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -69,12 +69,26 @@ class ModuleStage(Transform):
         modules = load_modules(bundle)
         edits = self.change(modules, bundle, context)
         apply(modules, edits)
-        write_module(out, (*read_edits(bundle), *edits), modules)
-        carry_over(bundle, out)
-        shutil.copyfile(bundle.path / LOCATION, out / LOCATION)
-        made_by: dict[str, Any] = self.made_by()
-        build = (*history(bundle), {**made_by, "input": bundle.hash})
-        made = seal(out, replace(bundle.manifest, parent=bundle.hash, made_by=made_by, build=build))
+        made = write_changed(bundle, out, (*read_edits(bundle), *edits), modules, self.made_by())
         context.tell("running the changed policy", None)
         torch_policy(made, SEED).infer(observations_for(made, 1)[0])
         return made
+
+
+def write_changed(
+    source: Bundle, out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module], made_by: dict[str, Any]
+) -> Bundle:
+    """Write a source bundle with other modules.
+
+    Args:
+        source: What it is made from.
+        out: An empty directory.
+        edits: All edits since the factory.
+        modules: Graph name -> module after the edits.
+        made_by: Stage, options and versions.
+    """
+    write_module(out, edits, modules)
+    carry_over(source, out)
+    shutil.copyfile(source.path / LOCATION, out / LOCATION)
+    build = (*history(source), {**made_by, "input": source.hash})
+    return seal(out, replace(source.manifest, parent=source.hash, made_by=made_by, build=build))

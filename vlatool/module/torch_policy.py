@@ -33,6 +33,15 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     Raises:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
+    return edited(unedited_modules(source), source)
+
+
+def unedited_modules(source: Bundle) -> dict[str, nn.Module]:
+    """Build the modules that the factory makes, whatever the bundle changes in them: graph name -> module.
+
+    Raises:
+        SourceError: as ``load_modules`` does.
+    """
     require("torch", "build")
     origin = origin_of(source)
     origin.check()
@@ -40,7 +49,7 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     if origin.weights:
         for name, module in modules.items():
             _load_weights(name, module, origin.folder, origin.weights)
-    return edited(modules, source)
+    return modules
 
 
 def _load_weights(graph: str, module: nn.Module, folder: Path, pattern: str) -> None:

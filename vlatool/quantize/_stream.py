@@ -7,13 +7,7 @@ the same plan checks the finished records and goes on after them, and gives the 
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import fcntl
-import os
-import shutil
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,11 +22,8 @@ from vlatool.weights.shards import reading
 if TYPE_CHECKING:
     from vlatool.stage.base import Tell
 
-LOCK = "lock"
 COMMIT_BYTES = 1 << 28
 """Bytes after which data and journal are flushed to the disk."""
-FORGOTTEN_S = 7 * 24 * 3600
-"""Age in seconds from which unfinished work that nobody continues is removed."""
 FULL = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -62,39 +53,6 @@ class Written:
 def work_root() -> Path:
     """Return where unfinished work is kept: ``streams`` in vlatool's cache directory."""
     return cache_directory() / "streams"
-
-
-@contextlib.contextmanager
-def work_directory(place: Path) -> Iterator[Path]:
-    """Yield the directory of unfinished work, locked: one run at a time continues it, others wait."""
-    place.mkdir(parents=True, exist_ok=True)
-    _sweep(place)
-    handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        os.utime(place / LOCK)
-        yield place
-    finally:
-        os.close(handle)
-
-
-def forget(place: Path) -> None:
-    """Remove a work directory whose result has arrived."""
-    shutil.rmtree(place, ignore_errors=True)
-
-
-def _sweep(place: Path) -> None:
-    """Remove other work that nobody has continued for a week."""
-    for other in place.parent.iterdir():
-        with contextlib.suppress(OSError):
-            if other == place or time.time_ns() / 1e9 - (other / LOCK).stat().st_mtime < FORGOTTEN_S:
-                continue
-            handle = os.open(other / LOCK, os.O_RDWR)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                forget(other)
-            finally:
-                os.close(handle)
 
 
 def write_records(records: list[Record], plan: str, place: Path, processes: int, tell: Tell) -> Written:

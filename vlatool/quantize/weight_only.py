@@ -13,13 +13,14 @@ from vlatool.bundle.bundle import Bundle, hash_file, write_manifest
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
+from vlatool.files.work import forget, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
 from vlatool.quantize._compute import records_of
 from vlatool.quantize._records import Record
 from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shards, weights_fingerprint
-from vlatool.quantize._stream import Written, forget, work_directory, work_root, write_records
+from vlatool.quantize._stream import Written, work_root, write_records
 from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for

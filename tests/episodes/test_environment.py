@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.episodes.environment import World
+from vlatool.episodes.play import Job, run_jobs
 from vlatool.errors import DataError
-from vlatool.evaluate._environment import World
-from vlatool.evaluate._episodes import Job, run_jobs
 from vlatool.stage.base import Context
 
 GOOD = """\

@@ -10,14 +10,15 @@ import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from vlatool.accuracy.outcome import Outcome
 from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, VlatoolError
-from vlatool.evaluate._controls import Array, Blind, answers_of
-from vlatool.evaluate._environment import GUIDE, World
+from vlatool.episodes.controls import Array, Blind, answers_of
+from vlatool.episodes.environment import GUIDE, World
+from vlatool.episodes.frames import Frames, Noisy
+from vlatool.errors import DataError, VlatoolError, require
 from vlatool.files.printable import message_of
 from vlatool.module.factory import call_factory, exits_told
 from vlatool.runtime.chunks import ChunkQueue
@@ -31,7 +32,20 @@ PRELOAD = ("numpy", "onnxruntime", __name__)
 
 @dataclass(frozen=True)
 class Job:
-    """Some episodes of one task."""
+    """Some episodes of one task.
+
+    Args:
+        environment: ``path.py:make`` or ``package.module:make``.
+        folder: Where its file lies.
+        task: Of the environment.
+        seeds: One for each episode.
+        instruction: ``right`` or ``wrong``.
+        control: Actions that do not look, in the place of the policy's; none when empty.
+        noise: What is added to actions, so that a policy that is trained on the episodes has seen mistakes: the share
+            of each action's standard deviation; for discrete actions, how often a random one is taken.
+        record: Folder for what the policy was given at each inference, ``NAME.npy`` for each input; nothing is kept
+            when empty.
+    """
 
     environment: str
     folder: str
@@ -39,6 +53,8 @@ class Job:
     seeds: tuple[int, ...]
     instruction: str = "right"
     control: str = ""
+    noise: float = 0.0
+    record: str = ""
 
 
 def run_jobs(bundle: Bundle, jobs: list[Job], engine: str, context: Context) -> list[Outcome]:
@@ -75,6 +91,16 @@ def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
     return outcomes
 
 
+class Actor(Protocol):
+    """Who acts in an episode."""
+
+    def act(self, observation: Mapping[str, Any]) -> Array:
+        """Return the action of this control step: (A,) float32, or a 0-d int64 index."""
+
+    def reset(self) -> None:
+        """Begin an episode."""
+
+
 class BoundedQueue(ChunkQueue):
     """A queue whose policy is stopped when an inference takes longer than any that a robot could use."""
 
@@ -92,8 +118,9 @@ class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
-        policy = Policy.open(Bundle.open(Path(path)), engine=engine, threads=1, seed=0)
-        policy.warm_up(1)
+        policy = _opened(Bundle.open(Path(path)), engine)
+        self._frames = Frames(policy.encode)
+        policy.encode = self._frames
         self.queue = BoundedQueue(policy)
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
@@ -112,15 +139,21 @@ class Worker:
     def play(self, job: Job, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
         world = World(self.environment(job), job.task, self.queue.policy.spec)
-        return [_episode(world, self._actor(job.control, seed), job.task, seed, limit) for seed in job.seeds]
+        actors = ((seed, self._actor(job, seed)) for seed in job.seeds)
+        if not job.record:
+            return [_episode(world, actor, job.task, seed, limit) for seed, actor in actors]
+        with self._frames.kept(Path(job.record)):
+            return [_episode(world, actor, job.task, seed, limit) for seed, actor in actors]
 
-    def _actor(self, control: str, seed: int) -> ChunkQueue | Blind:
-        """Return who acts: the policy, or a control that does not look."""
-        if not control:
+    def _actor(self, job: Job, seed: int) -> Actor:
+        """Return who acts: the policy, the policy with noise, or a control that does not look."""
+        if not job.control and not job.noise:
             return self.queue
         if self._answers is None:
             self._answers = answers_of(self.queue.policy)
-        return Blind(control, self.queue.policy.spec.action, self._answers, seed)
+        if job.noise:
+            return Noisy(self.queue, job.noise, self._answers, seed)
+        return Blind(job.control, self.queue.policy.spec.action, self._answers, seed)
 
     def close(self) -> None:
         """Close the open environment; one that fails to close has done its work all the same."""
@@ -128,6 +161,18 @@ class Worker:
         if environment is not None:
             with contextlib.suppress(Exception):
                 environment.close()
+
+
+def _opened(bundle: Bundle, engine: str) -> Policy:
+    """Open a bundle; one that is not exported yet runs in torch."""
+    if bundle.manifest.graphs:
+        policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
+        policy.warm_up(1)
+        return policy
+    from vlatool.module.torch_policy import torch_policy
+
+    require("torch", "build").set_num_threads(1)
+    return torch_policy(bundle, 0)
 
 
 _worker: Worker | None = None
@@ -150,7 +195,7 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
     _worker = None
 
 
-def _episode(world: World, queue: ChunkQueue | Blind, task: str, seed: int, limit: int) -> Outcome:
+def _episode(world: World, queue: Actor, task: str, seed: int, limit: int) -> Outcome:
     try:
         with exits_told(f"the environment of task '{task}', at seed {seed},"):
             observation = world.reset(seed)
@@ -171,7 +216,7 @@ def _episode(world: World, queue: ChunkQueue | Blind, task: str, seed: int, limi
     raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.")
 
 
-def _acted(queue: ChunkQueue | Blind, observation: Mapping[str, Any], where: str) -> Array:
+def _acted(queue: Actor, observation: Mapping[str, Any], where: str) -> Array:
     """Return the action; an observation that the policy does not take is the environment's."""
     try:
         return queue.act(observation)

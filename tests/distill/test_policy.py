@@ -1,0 +1,124 @@
+"""Distillation: a pruned policy learns what the whole one does, from recordings and episodes, without an expert."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.distill import policy
+from vlatool.distill.policy import PolicyDistillation
+from vlatool.errors import RecipeError
+from vlatool.export.onnx import ExportOnnx
+from vlatool.machine.host import cache_directory
+from vlatool.module.edits import read_edits
+from vlatool.module.torch_policy import torch_policy
+from vlatool.prune.magnitude import Magnitude
+from vlatool.rebuild.rebuild import rebuild
+from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import run_transform
+
+SHORT = {"steps": 12, "batch": 4, "episodes": 4, "student_episodes": 2, "every": 5, "learning_rate": 0.003}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def pruned(source_bundle: Bundle, tmp_path: Path) -> Bundle:
+    return run_transform(Magnitude(ratio=0.7), source_bundle, tmp_path / "pruned", Context())
+
+
+def error(bundle: Bundle, whole: Bundle) -> float:
+    ours, theirs = torch_policy(bundle, 0), torch_policy(whole, 0)
+    observations = recorded_observations(whole, 16)
+    return float(np.mean([relative_error(ours.infer(each).chunk, theirs.infer(each).chunk) for each in observations]))
+
+
+def distilled(source: Bundle, out: Path, told: list[str] | None = None, **options: object) -> Bundle:
+    context = Context() if told is None else Context(lambda what, _share: told.append(what))
+    return run_transform(build_stage("distill.policy", {**SHORT, **options}), source, out, context)
+
+
+def test_it_recovers_what_pruning_lost(pruned: Bundle, source_bundle: Bundle, tmp_path: Path):
+    made = distilled(pruned, tmp_path / "out", steps=60, batch=16, average=0.9, episodes=0, student_episodes=0)
+    assert error(made, source_bundle) < 0.5 * error(pruned, source_bundle)
+    assert read_edits(made) == read_edits(pruned)
+    assert [step["stage"] for step in made.manifest.build[-2:]] == ["prune.magnitude", "distill.policy"]
+
+
+def test_teacher_and_student_play_and_the_result_is_exported_and_made_again(
+    pruned: Bundle, policy_template: Path, tmp_path: Path
+):
+    told: list[str] = []
+    made = distilled(pruned, tmp_path / "out", told)
+    assert [line for line in told if "plays" in line] == [
+        "the teacher plays 4 episodes", "the student plays 2 episodes", "the student plays 2 episodes",
+    ]  # fmt: skip
+    assert not list((cache_directory() / "training").glob("*/*")), "nothing is left"
+    exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context())
+    assert load(exported.path).infer(recorded_observations(exported, 1)[0]).chunk.shape == (4, 2)
+    assert rebuild(exported, Context(), source=str(policy_template), cache=tmp_path / "cache").identical
+
+
+def test_a_run_that_is_killed_goes_on_to_the_same_weights(
+    pruned: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    whole = distilled(pruned, tmp_path / "whole")
+    dies_at = [0, 3, 6, 11, -1]
+
+    class Killed(BaseException):
+        pass
+
+    def dying(self, until, draw, tell):
+        def told(step: int, loss: float) -> None:
+            tell(step, loss)
+            if step - 1 == dies_at[0]:
+                raise Killed
+
+        train(self, until, draw, told)
+
+    train = policy.Trainer.train
+    monkeypatch.setattr(policy.Trainer, "train", dying)
+    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    stage = build_stage("distill.policy", SHORT)
+    while len(dies_at) > 1:
+        with pytest.raises(Killed):
+            run_transform(stage, pruned, tmp_path / "out", Context())
+        assert not (tmp_path / "out").exists()
+        dies_at.pop(0)
+    made = run_transform(stage, pruned, tmp_path / "out", Context())
+    name = "module/main.safetensors"
+    assert made.manifest.files[name].sha256 == whole.manifest.files[name].sha256
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"loss": "hubert"}, r"Unknown loss 'hubert'; did you mean 'huber'"),
+    ({"loss": "kl"}, "kl compares discrete actions"),
+])  # fmt: skip
+def test_a_loss_that_does_not_fit_is_refused(source_bundle: Bundle, tmp_path: Path, options: dict[str, str], says: str):
+    with pytest.raises(RecipeError, match=says):
+        distilled(source_bundle, tmp_path / "out", **options)
+
+
+def test_a_teacher_that_does_something_else_is_refused(source_bundle: Bundle, policy_dir: Path, tmp_path: Path):
+    from vlatool.sources.torch_module import TorchModule
+
+    text = (policy_dir / "policy.yaml").read_text()
+    (policy_dir / "policy.yaml").write_text(text.replace("[dx, dy]", "[dy, dx]"))
+    other = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "other", Context())
+    with pytest.raises(RecipeError, match="The teacher gives 'action' as "):
+        distilled(source_bundle, tmp_path / "out", teacher=str(other.path))
+    assert torch.get_num_threads() >= 1
+
+
+def test_the_class_is_the_stage():
+    assert PolicyDistillation.name() == "distill.policy"

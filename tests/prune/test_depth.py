@@ -1,0 +1,140 @@
+"""Depth pruning: which blocks go, by which measure, and what is protected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import BundleError, RecipeError, SourceError
+from vlatool.module.edits import Edit, apply
+from vlatool.prune.depth import Depth, protected, stacks
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import run_transform
+
+SIZES = (3.0, 0.001, 0.5, 0.05)
+"""How much each block adds."""
+
+
+class Residual(nn.Module):
+    def __init__(self, size: float):
+        super().__init__()
+        self.linear = nn.Linear(16, 16)
+        self.size = size
+
+    def forward(self, tokens):
+        return tokens + self.size * torch.tanh(self.linear(tokens))
+
+
+class Net(nn.Module):
+    def __init__(self, name: str = "trunk"):
+        super().__init__()
+        torch.manual_seed(1)
+        self.state = nn.Linear(3, 16)
+        setattr(self, name, nn.ModuleList(Residual(size) for size in SIZES))
+        self.head = nn.Linear(16, 8)
+        self.name = name
+
+    def forward(self, image, proprio, instruction):
+        tokens = self.state(proprio)
+        for block in getattr(self, self.name):
+            tokens = block(tokens)
+        return self.head(tokens).reshape(1, 4, 2)
+
+
+@pytest.mark.parametrize("rank", ["error", "gate", "cosine"])
+def test_what_adds_least_goes_first(source_bundle: Bundle, rank: str):
+    def kept(**options):
+        stage = Depth(rank=rank, samples=4, **options)
+        return stage.change({"main": Net().eval()}, source_bundle, Context())
+
+    assert kept(blocks=3) == (Edit("main", "trunk", "blocks", (0, 2, 3)),)
+    assert kept(ratio=0.5) == (Edit("main", "trunk", "blocks", (0, 2)),)
+    assert kept(blocks=1) == (Edit("main", "trunk", "blocks", (0,)),)
+
+
+def test_the_modules_are_as_they_were_after_ranking(source_bundle: Bundle):
+    module = Net().eval()
+    feeds = [torch.zeros(1), torch.ones(1, 3), torch.zeros(1)]
+    before = module(*feeds)
+    Depth(samples=2).change({"main": module}, source_bundle, Context())
+    assert torch.equal(module(*feeds), before)
+
+
+def test_a_block_that_is_removed_is_gone():
+    whole, cut = Net().eval(), Net().eval()
+    with torch.no_grad():
+        whole.trunk[1].size = whole.trunk[3].size = 0.0
+    apply({"main": cut}, [Edit("main", "trunk", "blocks", (0, 2))])
+    feeds = [torch.zeros(1), torch.ones(1, 3), torch.zeros(1)]
+    assert torch.allclose(cut(*feeds), whole(*feeds))
+    assert [name for name, _ in cut.trunk.named_children()] == ["0", "1"]
+
+
+def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundle):
+    modules = {"main": Net("action_expert").eval()}
+    with pytest.raises(RecipeError, match=r"has no other stack of blocks: action_expert \(4\)"):
+        Depth(samples=2).change(modules, source_bundle, Context())
+    chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context())
+    assert len(chosen[0].keep) == 2
+    assert protected("model.vision_tower.layers")
+    assert protected("ActionHead.blocks")
+    assert not protected("fusion")
+    assert not protected("language_model.layers")
+
+
+def test_stacks_are_blocks_of_one_kind():
+    shared = nn.Linear(2, 2)
+    net = nn.ModuleDict({
+        "same": nn.ModuleList(nn.Linear(2, 2) for _ in range(3)),
+        "sizes": nn.ModuleList([nn.Linear(2, 2), nn.Linear(2, 3)]),
+        "kinds": nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2)),
+        "one": nn.ModuleList([nn.Linear(2, 2)]),
+        "shared": nn.ModuleList([shared, shared]),
+        "weightless": nn.Sequential(nn.ReLU(), nn.ReLU()),
+    })  # fmt: skip
+    assert [name for name, _ in stacks(net)] == ["same"]
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"include": ("trunck",)}, "No stack of blocks matches 'trunck'; did you mean 'trunk'"),
+    ({"exclude": ("*",)}, "has no other stack of blocks"),
+    ({"ratio": 0.1}, r"--ratio 0.1 removes no block of trunk \(4\)"),
+    ({"blocks": 4}, r"--blocks 4 removes no block"),
+    ({"blocks": 9}, r"--blocks 9 removes no block"),
+])  # fmt: skip
+def test_wrong_options_are_told(source_bundle: Bundle, options: dict[str, object], says: str):
+    with pytest.raises(RecipeError, match=says):
+        build_stage("prune.depth", {"samples": 1, **options}).change({"main": Net()}, source_bundle, Context())
+
+
+def test_without_a_stack_widths_are_proposed(source_bundle: Bundle, float_bundle: Bundle, tmp_path: Path):
+    with pytest.raises(RecipeError, match="has no stack of blocks") as caught:
+        run_transform(Depth(), source_bundle, tmp_path / "out", Context())
+    assert "vlatool prune magnitude" in caught.value.fix
+    with pytest.raises(BundleError, match="has no torch modules"):
+        run_transform(Depth(), float_bundle, tmp_path / "out", Context())
+
+
+def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
+    class Growing(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.linear = nn.Linear(1, 1)
+
+        def forward(self, tokens):
+            return torch.cat([tokens, tokens[:, :1]], 1)
+
+    class Grown(Net):
+        def __init__(self):
+            super().__init__()
+            self.trunk = nn.ModuleList(Growing() for _ in range(2))
+            self.head = nn.Linear(18, 8)
+
+    assert observations_for(source_bundle, 1)
+    with pytest.raises(SourceError, match=r"A block gives \[1, 17\] for \[1, 16\]"):
+        Depth(samples=1).change({"main": Grown().eval()}, source_bundle, Context())

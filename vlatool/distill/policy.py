@@ -1,0 +1,229 @@
+"""Distillation: a policy is trained on what a teacher would do, without an expert."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import Field
+
+from vlatool import registry
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.episodes.play import run_jobs
+from vlatool.errors import RecipeError, nearest, require
+from vlatool.files.work import forget, work_directory
+from vlatool.machine.host import cache_directory
+from vlatool.module.batched import BatchedProgram
+from vlatool.module.edits import Edit, read_edits
+from vlatool.module.stage import ModuleStage, write_changed
+from vlatool.module.torch_policy import load_modules, unedited_modules
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.stage.base import Context
+from vlatool.training.frames import Frames, joined
+from vlatool.training.loop import Settings, Trainer
+from vlatool.training.rounds import LABEL, NOISE, label, next_round, scene_of, tensors, write_recorded
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from vlatool.hardware.profile import Profile
+
+FIRST_SEED = 1_000_000
+"""Of the first episode to train on; evaluations begin at 5,000,000."""
+LAST_SHARE = 0.9
+"""Share of the steps after which no further episodes are played: what they bring could hardly be learnt any more."""
+SEEDS = 100_000
+"""Seeds between rounds."""
+RECORDED = 100_000
+"""Recorded observations at most."""
+
+
+class PolicyDistillation(ModuleStage):
+    """Train a policy to do what a teacher does, on recordings and, where it names an environment, on episodes.
+
+    The teacher is the policy as it was before any edit, so that this recovers what pruning lost; or another bundle. No
+    expert is needed: first the teacher acts, then again and again the student, and the teacher says what it would have
+    done wherever they came to (DAgger: Ross et al., arXiv 1011.0686).
+    """
+
+    teacher: Path | None = Field(
+        None, description="source bundle of the teacher; the policy before any edit when empty"
+    )
+    loss: str = Field("auto", description="kl (discrete actions), l1, l2 or huber; kl or l1 when auto")
+    temperature: float = Field(2.0, gt=0, description="of kl")
+    delta: float = Field(0.1, gt=0, description="of huber")
+    steps: int = Field(1500, ge=1, description="updates of the weights")
+    batch: int = Field(256, ge=1, description="observations in an update")
+    learning_rate: float = Field(5e-4, gt=0, description="its highest value; it warms up, and falls as a cosine")
+    weight_decay: float = Field(0.01, ge=0, description="of AdamW")
+    average: float = Field(0.995, ge=0, lt=1, description="decay of the moving average of the weights")
+    episodes: int = Field(1200, ge=0, description="episodes that the teacher plays first, over all tasks")
+    student_episodes: int = Field(300, ge=0, description="episodes that the student plays each time")
+    every: int = Field(250, ge=1, description="steps between the student's episodes")
+    noise: float = Field(0.1, ge=0, le=1, description="disturbs the actions in these episodes: share of their spread")
+    first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode to train on")
+    seed: int = Field(0, ge=0, description="of batches and noise")
+    threads: int = Field(0, ge=0, description="of torch; all cores of this process when 0")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The teacher's manifest."""
+        return (self.teacher / "manifest.json",) if self.teacher else ()
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The loss is known, and fits the action."""
+        super().check(source, profile)
+        known = registry.names("losses")
+        if self.loss != "auto" and self.loss not in known:
+            raise RecipeError(f"Unknown loss '{self.loss}'; {nearest(self.loss, ['auto', *known])}.")
+        if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
+            raise RecipeError("The loss kl compares discrete actions; the policy's are continuous.", "try --loss l1")
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+        """Train the modules in place."""
+        torch = require("torch", "build")
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads or before)
+        place = cache_directory() / "training" / self.key(source.hash)
+        try:
+            with work_directory(place):
+                _Distillation(self, modules, source, place, context).run()
+        finally:
+            torch.set_num_threads(before)
+        forget(place)
+        return ()
+
+
+class _Distillation:
+    """One run: what is kept between its parts."""
+
+    def __init__(
+        self, stage: PolicyDistillation, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context
+    ) -> None:
+        self._stage, self._source, self._place, self._context = stage, source, place, context
+        self._spec = source.manifest.spec
+        self._modules = modules
+        self._taught_by, self._teacher_edits, teacher = _teacher_of(stage, source)
+        _check_fits(self._taught_by, source)
+        self._teacher = BatchedProgram(self._taught_by.manifest.program, teacher)
+        self._student = BatchedProgram(source.manifest.program, modules)
+        self._scene = scene_of(source) if stage.episodes or stage.student_episodes else None
+        self._loss = _loss_of(stage, source)
+        self._frames = Frames(place)
+        settings = Settings(stage.steps, stage.learning_rate, stage.weight_decay, stage.average, stage.seed)
+        self._trainer = Trainer(modules, settings, place)
+
+    def run(self) -> None:
+        """Play, label and train until all steps are done."""
+        next_round(self._frames, 0, self._first)
+        ends = [*self._pauses(), self._stage.steps]
+        for number, end in enumerate(ends):
+            if number:
+                next_round(self._frames, number, partial(self._students, number))
+            self._trainer.train(end, self._draw, self._tell)
+            self._trainer.save()
+        self._trainer.finish()
+
+    def _pauses(self) -> list[int]:
+        """Return before which steps the student plays."""
+        if self._scene is None or not self._stage.student_episodes:
+            return []
+        return list(range(self._stage.every, round(self._stage.steps * LAST_SHARE), self._stage.every))
+
+    def _first(self, target: Path) -> None:
+        """Write the first round: recordings, and the teacher's episodes."""
+        encode = ObservationEncoder(self._spec, self._source)
+        write_recorded(map(encode, recorded_observations(self._source, RECORDED)), target / "recorded")
+        self._play(target, 0, self._stage.episodes)
+
+    def _students(self, number: int, target: Path) -> None:
+        """Write a round of the student's episodes; its averaged weights act."""
+        self._trainer.swap()
+        try:
+            self._play(target, number, self._stage.student_episodes)
+        finally:
+            self._trainer.swap()
+
+    def _play(self, target: Path, number: int, episodes: int) -> None:
+        stage, seed = self._stage, self._stage.first_seed + number * SEEDS
+        folder = target / "episodes"
+        if self._scene is not None and episodes:
+            who = "student" if number else "teacher"
+            self._context.tell(f"the {who} plays {episodes} episodes", None)
+            jobs = self._scene.jobs(episodes, seed, stage.noise, folder)
+            run_jobs(self._actor(target / "actor", number), jobs, "", self._context)
+        joined((target / "recorded", *sorted(folder.glob("*"))), target)
+        for part in ("recorded", "episodes", "actor"):
+            shutil.rmtree(target / part, ignore_errors=True)
+        names = [tensor.name for tensor in self._spec.inputs]
+        outputs = [tensor.name for tensor in self._spec.outputs]
+        label(target, names, outputs, self._teacher, (stage.seed, number), self._context)
+
+    def _actor(self, place: Path, number: int) -> Bundle:
+        """Write who plays as a bundle, which the processes that play open."""
+        place.mkdir()
+        source = self._source
+        if number:
+            return write_changed(source, place, read_edits(source), self._modules, source.manifest.made_by)
+        return write_changed(
+            self._taught_by, place, self._teacher_edits, self._teacher.modules, source.manifest.made_by
+        )
+
+    def _draw(self, random: np.random.Generator) -> Tensor:
+        """Return the loss of a batch."""
+        rows = self._frames.batch(random.integers(len(self._frames), size=self._stage.batch))
+        values = self._student.run(tensors(rows), tensors(rows, NOISE))
+        name = self._spec.action.name
+        loss: Tensor = self._loss(values[name], tensors(rows, LABEL)[name])
+        return loss
+
+    def _tell(self, step: int, loss: float) -> None:
+        self._context.tell(f"step {step} of {self._stage.steps}, loss {loss:.4g}", step / self._stage.steps)
+
+
+def _teacher_of(stage: PolicyDistillation, source: Bundle) -> tuple[Bundle, tuple[Edit, ...], dict[str, nn.Module]]:
+    """Return the teacher's bundle, its edits, and its modules."""
+    if stage.teacher:
+        bundle = Bundle.open(stage.teacher)
+        return bundle, read_edits(bundle), load_modules(bundle)
+    return source, (), unedited_modules(source)
+
+
+def _loss_of(stage: PolicyDistillation, source: Bundle) -> Any:
+    """Return the loss with the options that it takes."""
+    name = stage.loss
+    if name == "auto":
+        name = "kl" if source.manifest.spec.action.kind == "discrete" else "l1"
+    kind = registry.load("losses", name)
+    takes = inspect.signature(kind).parameters
+    return kind(**{option: getattr(stage, option) for option in ("temperature", "delta") if option in takes})
+
+
+def _check_fits(teacher: Bundle, student: Bundle) -> None:
+    """Refuse a teacher that sees or does something else.
+
+    Raises:
+        RecipeError: saying what differs.
+    """
+    for ours, theirs, what in (
+        (student.manifest.spec.inputs, teacher.manifest.spec.inputs, "is given"),
+        (student.manifest.spec.outputs, teacher.manifest.spec.outputs, "gives"),
+    ):
+        wanted = {tensor.name: (tensor.kind, tensor.shape, tensor.dtype, tensor.labels) for tensor in ours}
+        other = {tensor.name: (tensor.kind, tensor.shape, tensor.dtype, tensor.labels) for tensor in theirs}
+        for name in sorted({*wanted, *other}):
+            if wanted.get(name) != other.get(name):
+                raise RecipeError(
+                    f"The teacher {what} '{name}' as {_shown(other.get(name))}, the student as "
+                    f"{_shown(wanted.get(name))}; they must agree.",
+                    "take a teacher with the same inputs and outputs",
+                )
+
+
+def _shown(tensor: Any) -> str:
+    return "nothing" if tensor is None else f"{tensor[0]} {list(tensor[1])} {tensor[2]}"

@@ -1,0 +1,1 @@
+"""Episodes in a user's environment: played, judged, and recorded to train on."""

@@ -1,0 +1,149 @@
+"""A policy's program in torch: batches of observations, with gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle.program import ProgramStep
+from vlatool.errors import SourceError, require
+from vlatool.files.printable import message_of
+from vlatool.module.factory import exits_told
+from vlatool.module.failures import remedy_for
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+
+SAME = 1e-3
+"""Relative and absolute difference that the order of additions makes."""
+
+
+class BatchedProgram:
+    """Runs the steps of a program over torch modules, as ``vlatool.runtime.program`` does over graphs.
+
+    Values have the batch in front: where the program says ``[1, 50, 7]``, a batch of B has ``(B, 50, 7)``. Kept values
+    begin at zero in every run, as they do after ``reset``. Modules that take one observation alone, such as those with
+    ``reshape(1, ...)``, are run row by row.
+
+    Args:
+        steps: As in the manifest.
+        modules: Graph name -> module.
+    """
+
+    def __init__(self, steps: Iterable[ProgramStep], modules: Mapping[str, nn.Module]) -> None:
+        self.steps = tuple(steps)
+        self.modules = modules
+        self._batches: bool | None = None
+        self.noise = {name: wanted for step in self.steps for name, wanted in step.noise.items()}
+
+    def run(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Run all steps.
+
+        Args:
+            inputs: Encoded inputs, value name -> (B, ...).
+            noise: What the program draws, value name -> (B, ...).
+
+        Returns:
+            Every value, of the inputs too.
+
+        Raises:
+            SourceError: when a module fails, or gives another number of outputs than the program says.
+        """
+        torch = require("torch", "build")
+        size = len(next(iter(inputs.values())))
+        if size > 1 and self._batches is None:
+            self._batches = self._takes_batches(inputs, noise)
+        if size == 1 or self._batches:
+            return self._run(inputs, noise)
+        rows = [self._run(_rows(inputs, row, row + 1), _rows(noise, row, row + 1)) for row in range(size)]
+        return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+
+    def _takes_batches(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> bool:
+        """Say whether two rows together give what each gives alone."""
+        torch = require("torch", "build")
+        with torch.no_grad():
+            alone = [self._run(_rows(inputs, row, row + 1), _rows(noise, row, row + 1)) for row in range(2)]
+            try:
+                both = self._run(_rows(inputs, 0, 2), _rows(noise, 0, 2))
+            except SourceError:
+                return False
+        wanted = {name: torch.cat([row[name] for row in alone]) for name in alone[0]}
+        return all(
+            both[name].shape == value.shape and torch.allclose(both[name].float(), value.float(), SAME, SAME)
+            for name, value in wanted.items()
+        )
+
+    def _run(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        torch = require("torch", "build")
+        size = len(next(iter(inputs.values())))
+        values = {**inputs, **noise}
+        for step in self.steps:
+            for name, kept in step.keep.items():
+                dtype = getattr(torch, kept.get("dtype", "float32"))
+                values[name] = torch.zeros((size, *kept["shape"][1:]), dtype=dtype)
+        for step in self.steps:
+            for turn in range(step.repeat):
+                for name, numbers in step.schedule.items():
+                    whole = all(isinstance(number, int) for number in numbers)
+                    values[name] = torch.full((size,), numbers[turn], dtype=torch.int64 if whole else torch.float32)
+                values |= self._step(step, values)
+        return values
+
+    def _step(self, step: ProgramStep, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what one run of a step's module changes."""
+        gives = outputs_of(self.modules[step.graph], step, [values[name] for name in step.feeds.values()])
+        changed = dict(zip(step.gives.values(), gives, strict=True))
+        for source, target in step.carry.items():
+            changed[target] = changed[source] if source in changed else values[source]
+        return changed
+
+
+def _rows(values: Mapping[str, Tensor], start: int, end: int) -> dict[str, Tensor]:
+    return {name: value[start:end] for name, value in values.items()}
+
+
+def outputs_of(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) -> list[Tensor]:
+    """Run a user's module and return its outputs in the order of the step's ``gives``.
+
+    Raises:
+        SourceError: when it fails, or gives something else than the tensors that the program names.
+    """
+    torch = require("torch", "build")
+    try:
+        with exits_told("the policy's forward()"):
+            given = module(*arguments)
+    except SourceError:
+        raise
+    except Exception as error:  # the seam: the user's module may raise anything
+        shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(step.feeds, arguments, strict=True))
+        reason = (message_of(error).splitlines() or [""])[0]
+        raise SourceError(
+            f"The policy fails on a batch of observations: {type(error).__name__}: {reason} (given {shapes}).",
+            remedy_for(error),
+        ) from error
+    outputs = list(given) if isinstance(given, tuple | list) else [given]
+    if len(outputs) != len(step.gives) or not all(isinstance(output, torch.Tensor) for output in outputs):
+        kinds = ", ".join(type(output).__name__ for output in outputs)
+        raise SourceError(f"The module of '{step.graph}' gives {kinds}; the program says {', '.join(step.gives)}.")
+    return outputs
+
+
+def drawn(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.Generator) -> dict[str, Tensor]:
+    """Draw a batch of what a program draws.
+
+    Args:
+        noise: Value name -> shape and distribution, as the program has them.
+        size: Of the batch.
+        random: Where it is drawn from.
+    """
+    torch = require("torch", "build")
+    values = {}
+    for name, wanted in noise.items():
+        shape = (size, *wanted["shape"][1:])
+        kind = wanted.get("distribution", "normal")
+        uniform = random.uniform(-1, 1, shape) if kind == "uniform" else random.standard_normal(shape)
+        values[name] = torch.from_numpy(np.asarray(uniform if kind != "zeros" else np.zeros(shape), np.float32))
+    return values

@@ -1,0 +1,250 @@
+"""Depth pruning: whole blocks go, so that a policy is faster on every engine and keeps the shapes of all that stays."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import RecipeError, SourceError, nearest, require
+from vlatool.graph.nodes import matches
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.edits import BLOCKS, Edit
+from vlatool.module.stage import ModuleStage
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.policy import relative_error
+from vlatool.stage.base import Context
+
+if TYPE_CHECKING:
+    from torch import nn
+
+PROTECTED = ("vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action")
+"""Parts of module names whose blocks stay unless --include names them: what sees and what acts is less redundant than
+the trunk between (two action blocks of pi0.5 cost most of its success, see docs/guides/smaller-policies.md)."""
+SEED = 0
+PROBES = 4
+"""Random directions of the action that a gate's sensitivity is taken along."""
+Stack = tuple[str, str]
+"""Blocks one behind the other: their graph and the name of the list."""
+Place = tuple[str, str, int]
+"""A block: its graph, the name of the stack, and its number there."""
+
+
+class Depth(ModuleStage):
+    """Remove the blocks that change the action least from stacks of equal blocks.
+
+    ``error`` removes one block after the other, each time the one whose absence changes the actions on recorded
+    observations least. ``gate`` takes one backward pass: how much the action moves when the block's contribution to the
+    residual stream is scaled. ``cosine`` takes one forward pass: how little a block turns what passes through it. Train
+    the result afterwards (``vlatool distill policy`` takes it as it is).
+    """
+
+    ratio: float = Field(0.5, gt=0, lt=1, description="share of the blocks of each stack that goes, at most")
+    blocks: int | None = Field(None, ge=1, description="blocks of each stack that stay, in the place of --ratio")
+    rank: Literal["error", "gate", "cosine"] = Field("error", description="how blocks are ranked")
+    samples: int = Field(32, ge=1, description="recorded observations to rank on")
+    include: tuple[str, ...] = Field((), description="globs of stacks to prune; the trunk's when empty")
+    exclude: tuple[str, ...] = Field((), description="globs of stacks to leave as they are")
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+        """Choose the blocks that stay.
+
+        Raises:
+            RecipeError: when there is no stack of blocks to prune, or a pattern matches none.
+        """
+        sizes = self._chosen({(graph, name): len(stack) for graph, module in modules.items()
+                              for name, stack in stacks(module)}, source)  # fmt: skip
+        goes = {stack: count for stack, size in sizes.items() if (count := self._goes(size)) > 0}
+        if not goes:
+            asked = f"--ratio {self.ratio:g}" if self.blocks is None else f"--blocks {self.blocks}"
+            raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
+        ranking = _Ranking(modules, source, observations_for(source, self.samples))
+        left = {stack: list(range(sizes[stack])) for stack in goes}
+        for (graph, name), block in self._going(ranking, left, goes, context):
+            left[graph, name].remove(block)
+        return tuple(Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items())
+
+    def _goes(self, size: int) -> int:
+        """Return how many blocks of a stack go; one always stays."""
+        return size - self.blocks if self.blocks is not None else min(size - 1, math.floor(size * self.ratio + 1e-9))
+
+    def _going(
+        self, ranking: _Ranking, left: Mapping[Stack, list[int]], goes: Mapping[Stack, int], context: Context
+    ) -> Iterator[tuple[Stack, int]]:
+        """Yield which block goes next; the caller takes it from what is left."""
+        rank = {"error": ranking.errors, "cosine": ranking.cosine, "gate": ranking.gate}[self.rank]
+        open_, total, removed = dict(goes), sum(goes.values()), set[Place]()
+        scores: dict[Place, float] = {}
+        for done in range(total):
+            places = [(*stack, block) for stack, count in open_.items() if count for block in left[stack]]
+            context.tell(f"ranking {len(places)} blocks", done / total)
+            if not scores or self.rank == "error":
+                scores = rank(places, removed)
+            graph, name, block = least = min(places, key=scores.__getitem__)
+            removed.add(least)
+            open_[graph, name] -= 1
+            yield (graph, name), block
+
+    def _chosen(self, sizes: Mapping[Stack, int], source: Bundle) -> dict[Stack, int]:
+        names = [name for _, name in sizes]
+        if not sizes:
+            raise RecipeError(
+                f"{source.manifest.name} has no stack of blocks: an nn.ModuleList or nn.Sequential of modules of one "
+                "class, each of which gives what it takes.",
+                "prune widths instead: vlatool prune magnitude",
+            )
+        for pattern in (*self.include, *self.exclude):
+            if not any(matches(name, (pattern,)) for name in names):
+                raise RecipeError(f"No stack of blocks matches '{pattern}'; {nearest(pattern, names)}.")
+        chosen = {
+            (graph, name): size
+            for (graph, name), size in sizes.items()
+            if (matches(name, self.include) if self.include else not protected(name))
+            and not matches(name, self.exclude)
+        }
+        if not chosen:
+            raise RecipeError(
+                f"What sees and what acts is protected, and {source.manifest.name} has no other stack of blocks: "
+                f"{_listed(sizes)}.",
+                "name the stacks that may lose blocks: --include NAME",
+            )
+        return chosen
+
+
+def _listed(sizes: Mapping[Stack, int]) -> str:
+    return ", ".join(f"{name or 'the module itself'} ({size})" for (_, name), size in sizes.items())
+
+
+def protected(name: str) -> bool:
+    """Say whether a stack belongs to what sees or acts, as far as its name says."""
+    return any(word in part for part in name.lower().split(".") for word in PROTECTED)
+
+
+def stacks(module: nn.Module) -> Iterator[tuple[str, Any]]:
+    """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes."""
+    nn = require("torch", "build").nn
+    for name, part in module.named_modules():
+        if not isinstance(part, nn.ModuleList | nn.Sequential) or len(part) < 2:
+            continue
+        kinds = {type(block) for block in part}
+        shapes = {tuple((key, tuple(value.shape)) for key, value in block.state_dict().items()) for block in part}
+        shared = len({id(block) for block in part}) < len(part)
+        if len(kinds) == 1 and len(shapes) == 1 and shapes != {()} and not shared:
+            yield name, part
+
+
+class _Ranking:
+    """What the action loses without some blocks, on recorded observations.
+
+    Args:
+        modules: Graph name -> module.
+        source: For the program and the encoding of observations.
+        observations: As the controller has them.
+    """
+
+    def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, observations: Sequence[Any]) -> None:
+        torch = require("torch", "build")
+        encode = ObservationEncoder(source.manifest.spec, source)
+        self._program = BatchedProgram(source.manifest.program, modules)
+        self._action = source.manifest.spec.action.name
+        self._inputs = [
+            {name: torch.from_numpy(np.array(value)) for name, value in encode(each).items()} for each in observations
+        ]
+        self._noise = drawn(self._program.noise, 1, np.random.default_rng(SEED))
+        self._blocks = {
+            (graph, name, number): block
+            for graph, module in modules.items()
+            for name, stack in stacks(module)
+            for number, block in enumerate(stack)
+        }
+
+    def actions(self) -> Iterator[Any]:
+        """Yield the raw action of each observation as a tensor."""
+        for inputs in self._inputs:
+            yield self._program.run(inputs, self._noise)[self._action]
+
+    def errors(self, candidates: Sequence[Place], removed: Collection[Place]) -> dict[Place, float]:
+        """Return the mean relative error of the actions without each candidate, in addition to what is removed."""
+        with require("torch", "build").no_grad():
+            wanted = [action.numpy() for action in self.actions()]
+            found = {}
+            for place in candidates:
+                with self._hooked({*removed, place}, lambda _: _passes_on):
+                    pairs = zip(self.actions(), wanted, strict=True)
+                    found[place] = float(np.mean([relative_error(action.numpy(), whole) for action, whole in pairs]))
+        return found
+
+    def cosine(self, candidates: Sequence[Place], _removed: Collection[Place]) -> dict[Place, float]:
+        """Return 1 - cosine similarity between what each block is given and what it gives, as a mean."""
+        torch = require("torch", "build")
+        turned: dict[Place, list[float]] = {place: [] for place in candidates}
+
+        def looking(place: Place) -> Any:
+            def look(_module: Any, given: Any, gives: Any) -> None:
+                similar = torch.nn.functional.cosine_similarity(given[0], _first(gives), dim=-1)
+                turned[place].append(1 - float(similar.mean()))
+
+            return look
+
+        with torch.no_grad(), self._hooked(candidates, looking):
+            for _ in self.actions():
+                pass
+        return {place: float(np.mean(shares)) for place, shares in turned.items()}
+
+    def gate(self, candidates: Sequence[Place], _removed: Collection[Place]) -> dict[Place, float]:
+        """Return the expected square of what the action moves by when a block's contribution is scaled.
+
+        With a gate g of 1 on the contribution, ``x + g (block(x) - x)``, it is the mean of ``(d(v . action)/dg)^2``
+        over random directions v: the diagonal of the Fisher information for an action with Gaussian noise.
+        """
+        torch = require("torch", "build")
+        random = torch.Generator().manual_seed(SEED)
+        gates = {place: torch.ones((), requires_grad=True) for place in candidates}
+
+        def gated(place: Place) -> Any:
+            def scale(_module: Any, given: Any, gives: Any) -> Any:
+                mixed = given[0] + gates[place] * (_first(gives) - given[0])
+                return (mixed, *gives[1:]) if isinstance(gives, tuple) else mixed
+
+            return scale
+
+        total = dict.fromkeys(candidates, 0.0)
+        with self._hooked(candidates, gated):
+            for action in self.actions():
+                for probe in range(PROBES):
+                    direction = torch.randn(action.shape, generator=random)
+                    slopes = torch.autograd.grad(
+                        (direction * action).sum(), list(gates.values()), retain_graph=probe < PROBES - 1
+                    )
+                    for place, slope in zip(gates, slopes, strict=True):
+                        total[place] += float(slope) ** 2
+        return total
+
+    @contextlib.contextmanager
+    def _hooked(self, places: Collection[Place], hook: Callable[[Place], Any]) -> Iterator[None]:
+        handles = [self._blocks[place].register_forward_hook(hook(place)) for place in places]
+        try:
+            yield
+        finally:
+            for handle in handles:
+                handle.remove()
+
+
+def _first(gives: Any) -> Any:
+    return gives[0] if isinstance(gives, tuple | list) else gives
+
+
+def _passes_on(_module: Any, given: Any, gives: Any) -> Any:
+    """Take the place of a block that is removed: what it is given, beside what else it gives."""
+    if _first(gives).shape != given[0].shape:
+        raise SourceError(
+            f"A block gives {list(_first(gives).shape)} for {list(given[0].shape)}: without it, shapes would not fit.",
+            "leave its stack out: --exclude NAME",
+        )
+    return (given[0], *gives[1:]) if isinstance(gives, tuple) else given[0]

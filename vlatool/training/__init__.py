@@ -1,0 +1,1 @@
+"""One training loop for every stage that changes a policy's weights."""

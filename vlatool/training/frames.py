@@ -1,0 +1,97 @@
+"""What a student is trained on: encoded observations and what the teacher says of them, in rounds on the disk."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.errors import DataError
+
+Array = NDArray[Any]
+BLOCK = 256
+"""Rows that are copied at a time."""
+
+
+class Frames:
+    """Rounds of rows, each round a folder with ``NAME.npy`` of (N, ...) that stays on the disk.
+
+    Args:
+        folder: Where the rounds are.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._rounds: list[dict[str, Array]] = []
+
+    def __len__(self) -> int:
+        return sum(len(next(iter(arrays.values()))) for arrays in self._rounds)
+
+    def has(self, number: int) -> bool:
+        """Say whether a round was written whole, by an earlier run too."""
+        return self._place(number).is_dir()
+
+    def read(self, number: int) -> None:
+        """Use a round that was written, after those before it."""
+        files = sorted(self._place(number).glob("*.npy"))
+        self._rounds.append({unquote(file.stem): np.load(file, mmap_mode="r") for file in files})
+
+    def draft(self, number: int) -> Path:
+        """Return an empty folder in which a round is written, and which ``keep`` makes a round."""
+        draft = self._folder / f"draft-{number:03d}"
+        shutil.rmtree(draft, ignore_errors=True)
+        draft.mkdir(parents=True)
+        return draft
+
+    def keep(self, number: int) -> None:
+        """Make a draft a round."""
+        (self._folder / f"draft-{number:03d}").rename(self._place(number))
+
+    def batch(self, rows: Array) -> dict[str, Array]:
+        """Return rows by their numbers over all rounds: name -> (B, ...)."""
+        starts = np.cumsum([0, *(len(next(iter(arrays.values()))) for arrays in self._rounds)])
+        which = np.searchsorted(starts, rows, side="right") - 1
+        offsets = np.asarray(rows) - starts[which]
+        return {
+            name: np.stack([self._rounds[number][name][row] for number, row in zip(which, offsets, strict=True)])
+            for name in self._rounds[0]
+        }
+
+    def _place(self, number: int) -> Path:
+        return self._folder / f"round-{number:03d}"
+
+
+def joined(parts: Iterable[Path], target: Path) -> int:
+    """Join the arrays of several folders, ``NAME.npy`` each; return the number of rows.
+
+    Raises:
+        DataError: when there are none.
+    """
+    folders = [part for part in parts if part.is_dir() and any(part.iterdir())]
+    if not folders:
+        raise DataError("The episodes gave no observation to train on.", "let more of them be played: --episodes")
+    names = sorted(file.name for file in folders[0].glob("*.npy"))
+    for name in names:
+        arrays = [np.load(folder / name, mmap_mode="r") for folder in folders]
+        rows = sum(map(len, arrays))
+        whole = np.lib.format.open_memmap(
+            target / name, mode="w+", dtype=arrays[0].dtype, shape=(rows, *arrays[0].shape[1:])
+        )
+        for at, block in _blocks(arrays):
+            whole[at : at + len(block)] = block
+        whole.flush()
+    return rows
+
+
+def _blocks(arrays: Iterable[Array]) -> Iterator[tuple[int, Array]]:
+    at = 0
+    for array in arrays:
+        for start in range(0, len(array), BLOCK):
+            block = array[start : start + BLOCK]
+            yield at, block
+            at += len(block)

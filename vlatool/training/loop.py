@@ -1,0 +1,182 @@
+"""The training loop: AdamW, warm-up and cosine, averaged weights, and a run that is killed goes on as if it were not.
+
+What a step does depends on the seed, its number and the weights alone: a run that continues from a checkpoint ends with
+the same weights, bit for bit, on the same processor with the same number of threads.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.errors import DataError, require
+from vlatool.files.edited import whole_file
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+CHECKPOINT = "checkpoint.safetensors"
+CLIP = 1.0
+"""Largest norm of the gradient."""
+WARMUP = 0.05
+"""Share of the steps in which the learning rate rises."""
+Draw = Callable[[np.random.Generator], "Tensor"]
+"""Random numbers of a step -> its loss."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long and how fast is trained.
+
+    Args:
+        steps: Updates of the weights.
+        learning_rate: Its highest value.
+        weight_decay: Of weights with two axes or more, decoupled (AdamW).
+        average: Decay of the exponential moving average of the weights, which is the result.
+        seed: Of the batches.
+        checkpoint_s: Seconds between checkpoints.
+    """
+
+    steps: int
+    learning_rate: float = 5e-4
+    weight_decay: float = 0.01
+    average: float = 0.995
+    seed: int = 0
+    checkpoint_s: float = 30.0
+
+    def rate(self, step: int) -> float:
+        """Return the learning rate of a step: linear warm-up, then a cosine to zero."""
+        warmup = max(1, round(self.steps * WARMUP))
+        if step < warmup:
+            return self.learning_rate * (step + 1) / warmup
+        share = (step - warmup) / max(1, self.steps - warmup)
+        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
+
+
+class Trainer:
+    """Trains the parameters of modules in place.
+
+    Modules stay in evaluation mode: normalisations keep their statistics, and nothing is dropped, so that what is
+    trained is what runs on the robot.
+
+    Args:
+        modules: Graph name -> module.
+        settings: How long and how fast.
+        folder: For checkpoints.
+    """
+
+    def __init__(self, modules: Mapping[str, nn.Module], settings: Settings, folder: Path) -> None:
+        torch = require("torch", "build")
+        self._settings = settings
+        self._file = folder / CHECKPOINT
+        self._weights = {
+            f"{graph}.{name}": value.requires_grad_()
+            for graph, module in modules.items()
+            for name, value in module.named_parameters()
+            if value.dtype.is_floating_point
+        }
+        decayed = [value for value in self._weights.values() if value.dim() > 1]
+        plain = [value for value in self._weights.values() if value.dim() <= 1]
+        groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": plain, "weight_decay": 0.0}]
+        self._optimizer = torch.optim.AdamW([group for group in groups if group["params"]], lr=settings.learning_rate)
+        self._average = {name: value.detach().clone() for name, value in self._weights.items()}
+        self.step = 0
+        self.losses: list[float] = []
+        self._resume()
+
+    def train(self, until: int, draw: Draw, tell: Callable[[int, float], None]) -> None:
+        """Take steps until so many are done.
+
+        Args:
+            until: Number of the step to stop before.
+            draw: Gives the loss of a batch that the random numbers choose.
+            tell: Called with the number of steps and the mean of the last losses.
+
+        Raises:
+            DataError: when the loss is not finite.
+        """
+        torch = require("torch", "build")
+        saved = time.monotonic()
+        while self.step < until:
+            loss = draw(np.random.default_rng((self._settings.seed, self.step)))
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                raise DataError(
+                    f"The loss is {value} in step {self.step + 1} of {self._settings.steps}.",
+                    "try a lower --learning-rate, and look for values that are not finite in the recordings",
+                )
+            for group in self._optimizer.param_groups:
+                group["lr"] = self._settings.rate(self.step)
+            self._optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(list(self._weights.values()), CLIP)
+            self._optimizer.step()
+            self._follow()
+            self.step += 1
+            self.losses.append(value)
+            tell(self.step, float(np.mean(self.losses[-20:])))
+            if time.monotonic() - saved > self._settings.checkpoint_s:
+                self.save()
+                saved = time.monotonic()
+
+    def _follow(self) -> None:
+        """Let the average follow the weights, closely in the first steps."""
+        decay = min(self._settings.average, (1 + self.step) / (10 + self.step))
+        with require("torch", "build").no_grad():
+            for name, value in self._weights.items():
+                self._average[name].lerp_(value, 1 - decay)
+
+    def swap(self) -> None:
+        """Exchange the weights and their average."""
+        with require("torch", "build").no_grad():
+            for name, value in self._weights.items():
+                kept = value.detach().clone()
+                value.copy_(self._average[name])
+                self._average[name].copy_(kept)
+
+    def finish(self) -> None:
+        """Put the average in the place of the weights, and ask for no gradients any more."""
+        self.swap()
+        for value in self._weights.values():
+            value.requires_grad_(False)
+
+    def save(self) -> None:
+        """Write a checkpoint, whole or not at all.
+
+        Raises:
+            OSError: when it cannot be written.
+        """
+        tensors = {f"weight.{name}": value.detach().contiguous() for name, value in self._weights.items()}
+        tensors |= {f"average.{name}": value for name, value in self._average.items()}
+        for name, value in self._weights.items():
+            for key, held in self._optimizer.state[value].items():
+                tensors[f"{key}.{name}"] = held.contiguous()
+        about = {"step": str(self.step), "losses": json.dumps(self.losses)}
+        with whole_file(self._file) as draft:
+            require("safetensors.torch", "build").save_file(tensors, str(draft), about)
+
+    def _resume(self) -> None:
+        """Go on from the checkpoint, if there is one."""
+        if not self._file.is_file():
+            return
+        torch = require("torch", "build")
+        with require("safetensors", "build").safe_open(str(self._file), "pt") as opened, torch.no_grad():
+            about, names = opened.metadata(), set(opened.keys())
+            self.step, self.losses = int(about["step"]), json.loads(about["losses"])
+            for name, value in self._weights.items():
+                value.copy_(opened.get_tensor(f"weight.{name}"))
+                self._average[name].copy_(opened.get_tensor(f"average.{name}"))
+                state: dict[str, Any] = {
+                    key: opened.get_tensor(f"{key}.{name}")
+                    for key in ("step", "exp_avg", "exp_avg_sq")
+                    if f"{key}.{name}" in names
+                }
+                if state:
+                    self._optimizer.state[value] = state

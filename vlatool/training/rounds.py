@@ -1,0 +1,141 @@
+"""Rounds of training data: recordings, or episodes in which somebody acts, and what the teacher would do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.episodes.frames import file_of
+from vlatool.episodes.play import Job
+from vlatool.errors import DataError, require
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.description import read_description, read_location
+from vlatool.stage.base import Context
+from vlatool.training.frames import Frames
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+LABEL, NOISE = "teacher.", "noise."
+"""Prefixes of what is kept beside the inputs: the teacher's outputs, and the noise that they were made from."""
+ROWS = 32
+"""Rows that the teacher labels at a time."""
+SLICE = 10
+"""Episodes of one task that a worker plays at a time."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where episodes are played.
+
+    Args:
+        make: Factory of the environment.
+        folder: Where its file lies.
+        tasks: Of the environment.
+    """
+
+    make: str
+    folder: Path
+    tasks: tuple[str, ...]
+
+    def jobs(self, episodes: int, first_seed: int, noise: float, record: Path) -> list[Job]:
+        """Return the jobs of so many episodes, spread evenly over the tasks."""
+        each = -(-episodes // len(self.tasks))
+        jobs: list[Job] = []
+        for task in self.tasks:
+            for start in range(0, each, SLICE):
+                seeds = tuple(range(first_seed + start, first_seed + min(each, start + SLICE)))
+                place = str(record / f"{len(jobs):05d}")
+                jobs.append(Job(self.make, str(self.folder), task, seeds, noise=noise, record=place))
+        return jobs
+
+
+def scene_of(source: Bundle) -> Scene | None:
+    """Return where a policy's description says that it acts; None when it names no environment."""
+    folder = read_location(source.path)
+    named = read_description(folder).environment if (folder / "policy.yaml").is_file() else {}
+    if not named.get("make") or not named.get("tasks"):
+        return None
+    return Scene(str(named["make"]), folder, tuple(named["tasks"]))
+
+
+def write_recorded(encoded: Iterable[Mapping[str, Any]], target: Path) -> int:
+    """Write encoded observations as a part of a round; return their number."""
+    kept: dict[str, list[Any]] = {}
+    for values in encoded:
+        for name, value in values.items():
+            kept.setdefault(name, []).append(np.array(value))
+    target.mkdir(parents=True, exist_ok=True)
+    for name, arrays in kept.items():
+        np.save(file_of(target, name), np.concatenate(arrays))
+    return len(next(iter(kept.values()), []))
+
+
+def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram, seed: Sequence[int],
+          context: Context) -> None:  # fmt: skip
+    """Write what the teacher gives for every row of a round, and the noise that it drew, beside the inputs.
+
+    Args:
+        frames: Folder of the round.
+        names: Inputs of the policy.
+        outputs: Outputs of the policy.
+        teacher: Its program.
+        seed: Of the noise.
+        context: For progress.
+
+    Raises:
+        DataError: when the teacher gives something that is not finite.
+        SourceError: when it fails.
+    """
+    torch = require("torch", "build")
+    inputs = {name: np.load(file_of(frames, name), mmap_mode="r") for name in names}
+    count = len(next(iter(inputs.values())))
+    kept: dict[str, Any] = {}
+    with torch.no_grad():
+        for start in range(0, count, ROWS):
+            rows = {name: torch.from_numpy(np.array(values[start : start + ROWS])) for name, values in inputs.items()}
+            noise = drawn(teacher.noise, len(next(iter(rows.values()))), np.random.default_rng((*seed, start)))
+            values = teacher.run(rows, noise)
+            given = {LABEL + name: values[name] for name in outputs} | {NOISE + name: noise[name] for name in noise}
+            for name, value in given.items():
+                if name not in kept:
+                    kept[name] = np.lib.format.open_memmap(
+                        file_of(frames, name), mode="w+", dtype=value.numpy().dtype, shape=(count, *value.shape[1:])
+                    )
+                if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+                    raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
+                kept[name][start : start + len(value)] = value.numpy()
+            context.tell(f"the teacher labels {count} observations", (start + 1) / count)
+    for values in kept.values():
+        values.flush()
+
+
+def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
+    """Return the arrays of a batch whose names begin so, without that beginning, as tensors."""
+    torch = require("torch", "build")
+    others = (LABEL, NOISE)
+    return {
+        name[len(prefix) :]: torch.from_numpy(value)
+        for name, value in rows.items()
+        if (name.startswith(prefix) if prefix else not name.startswith(others))
+    }
+
+
+def next_round(frames: Frames, number: int, fill: Any) -> None:
+    """Use a round; write it first when no earlier run did.
+
+    Args:
+        frames: All rounds.
+        number: Of the round.
+        fill: Called with the folder to write into.
+    """
+    if not frames.has(number):
+        draft = frames.draft(number)
+        fill(draft)
+        frames.keep(number)
+    frames.read(number)
