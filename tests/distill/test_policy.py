@@ -63,7 +63,7 @@ def test_teacher_and_student_play_and_the_result_is_exported_and_made_again(
     assert [line for line in told if "plays" in line] == [
         "the teacher plays 4 episodes", "the student plays 2 episodes", "the student plays 2 episodes",
     ]  # fmt: skip
-    assert not list((cache_directory() / "training").glob("*/*")), "nothing is left"
+    assert not list((cache_directory() / "streams").glob("*/*")), "nothing is left"
     exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context())
     assert load(exported.path).infer(recorded_observations(exported, 1)[0]).chunk.shape == (4, 2)
     assert rebuild(exported, Context(), source=str(policy_template), cache=tmp_path / "cache").identical

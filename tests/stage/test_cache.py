@@ -237,11 +237,13 @@ def test_a_file_that_only_looks_like_a_shared_one_stays(kept: Bundle, cache: Pat
 
 
 def test_unfinished_work_is_an_entry_that_its_lock_protects(cache: Path):
-    from vlatool.quantize._stream import work_directory
+    from vlatool.files.work import work_directory
 
     place = cache / "streams" / "abc"
     with work_directory(place):
-        (place / "data").write_bytes(b"half")
+        for name in ("data", "checkpoint.safetensors", "round-000/image.npy", "draft-001/episodes/00001/image.npy"):
+            (place / name).parent.mkdir(parents=True, exist_ok=True)
+            (place / name).write_bytes(b"half")
         (cache / "stages").mkdir()
         age(cache)
         assert prune(cache, older_than_s=0).stays == {"streams/abc": "is in use by a running process"}

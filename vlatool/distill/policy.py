@@ -25,6 +25,7 @@ from vlatool.module.stage import ModuleStage, write_changed
 from vlatool.module.torch_policy import load_modules, unedited_modules
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
+from vlatool.stage.cache import STREAMS
 from vlatool.training.frames import Frames, joined
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import LABEL, NOISE, label, next_round, scene_of, tensors, write_recorded
@@ -89,7 +90,7 @@ class PolicyDistillation(ModuleStage):
         torch = require("torch", "build")
         before = torch.get_num_threads()
         torch.set_num_threads(self.threads or before)
-        place = cache_directory() / "training" / self.key(source.hash)
+        place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
         try:
             with work_directory(place):
                 _Distillation(self, modules, source, place, context).run()

@@ -13,13 +13,14 @@ import re
 import stat
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from vlatool.files.kept import DIGEST, FILES, STAGES, TAG
 from vlatool.files.locks import alone
+from vlatool.files.work import LOCK
 from vlatool.files.writing import sweep
 from vlatool.files.written import LEDGER, hash_once, read_listing
 from vlatool.graph.stored import is_workload
@@ -30,7 +31,8 @@ NAMES = {
     STREAMS: re.compile(r"[\w.-]+"),
     WORKLOADS: re.compile(r"[0-9a-f]{32}\.json"),
 }
-STREAM_FILES = ("lock", "data", "journal")
+STREAM_FILES = re.compile(r"lock|data|journal|checkpoint\.safetensors|(round|draft)-\d{3}/.+")
+"""What unfinished work is made of: a file that is written part by part, or training."""
 DRAFT = re.compile(r"\.(?P<final>.+)\.tmp-\d+-[0-9a-f]{8}")
 PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")
 NEW_S = 60.0
@@ -204,8 +206,8 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
         files = _stage_files(path)
         return Entry(name, named["what"], status.st_mtime, files) if files else None
     if folder == STREAMS:
-        files = _own_files(path, STREAM_FILES) if (path / STREAM_FILES[0]).is_file() else {}
-        used = (path / STREAM_FILES[0]).stat().st_mtime if files else 0.0
+        files = _own_files(path, STREAM_FILES.fullmatch) if (path / LOCK).is_file() else {}
+        used = (path / LOCK).stat().st_mtime if files else 0.0
         return Entry(name, "unfinished work", used, files) if files else None
     if not stat.S_ISREG(status.st_mode) or not is_workload(path):
         return None
@@ -214,18 +216,18 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
 
 def _stage_files(path: Path) -> dict[str, tuple[Inode, int]]:
     listing = read_listing(path) if path.is_dir() else None
-    return {} if listing is None else _own_files(path, (*listing.files, LEDGER))
+    return {} if listing is None else _own_files(path, {*listing.files, LEDGER}.__contains__)
 
 
-def _own_files(path: Path, names: Iterable[str]) -> dict[str, tuple[Inode, int]]:
-    """Return the regular files of those names below a directory, to which no link leads."""
-    wanted, found = set(names), {}
+def _own_files(path: Path, is_own: Callable[[str], object]) -> dict[str, tuple[Inode, int]]:
+    """Return the regular files below a directory whose names are vlatool's, to which no link leads."""
+    found = {}
     for folder, _, files in os.walk(path):
         for file in files:
             name = Path(folder, file).relative_to(path).as_posix()
             with contextlib.suppress(FileNotFoundError):
                 status = os.lstat(Path(folder, file))
-                if name in wanted and stat.S_ISREG(status.st_mode):
+                if is_own(name) and stat.S_ISREG(status.st_mode):
                     found[name] = _inode(status)
     return found
 
@@ -235,7 +237,7 @@ def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
     path = cache / entry.name
     if _now() - entry.used < NEW_S:
         return RECENT
-    lock = path / STREAM_FILES[0] if entry.what == "unfinished work" else path
+    lock = path / LOCK if entry.what == "unfinished work" else path
     with alone(lock) as mine:
         if not mine:
             return f"{IN_USE} by a running process"
