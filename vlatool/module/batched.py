@@ -10,6 +10,7 @@ import numpy as np
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
+from vlatool.module.cut import RETRACE
 from vlatool.module.factory import exits_told
 from vlatool.module.failures import remedy_for
 
@@ -37,6 +38,7 @@ class BatchedProgram:
         self.steps = tuple(steps)
         self.modules = modules
         self._batches: bool | None = None
+        self._retraced: dict[tuple[str, int], nn.Module] = {}
         self.noise = {name: wanted for step in self.steps for name, wanted in step.noise.items()}
 
     def run(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -92,9 +94,19 @@ class BatchedProgram:
                 values |= self._step(step, values)
         return values
 
+    def _module(self, graph: str, size: int) -> nn.Module:
+        """Return the module of a graph for a batch of that size: a traced one may be made for one size alone."""
+        retrace = getattr(self.modules[graph], RETRACE, None)
+        if retrace is None or size == 1:
+            return self.modules[graph]
+        if (graph, size) not in self._retraced:
+            self._retraced[graph, size] = retrace(size)
+        return self._retraced[graph, size]
+
     def _step(self, step: ProgramStep, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return what one run of a step's module changes."""
-        gives = outputs_of(self.modules[step.graph], step, [values[name] for name in step.feeds.values()])
+        size = len(values[next(iter(step.feeds.values()))])
+        gives = outputs_of(self._module(step.graph, size), step, [values[name] for name in step.feeds.values()])
         changed = dict(zip(step.gives.values(), gives, strict=True))
         for source, target in step.carry.items():
             changed[target] = changed[source] if source in changed else values[source]

@@ -7,22 +7,26 @@ module after them. A module is always made in this order: the factory, the edits
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
 from vlatool.files.json import read_json
+from vlatool.module.cut import cut
+from vlatool.module.feeds import first_feeds
 
 if TYPE_CHECKING:
     from torch import nn
 
 FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
-CHANNELS, BLOCKS = ("outputs", "inputs"), "blocks"
-AXES = (*CHANNELS, BLOCKS)
+CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
+AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d")
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
 
@@ -35,7 +39,8 @@ class Edit:
         graph: Name of the graph whose module it is in.
         module: Its name, as ``named_modules`` gives it.
         axis: ``outputs`` (rows of the weight, the bias), ``inputs`` (columns of the weight) or ``blocks`` (the modules
-            of an ``nn.ModuleList`` or ``nn.Sequential``).
+            of an ``nn.ModuleList`` or ``nn.Sequential``); ``units A.P`` (then ``module`` names a weight) is factor P of
+            its axis A, as ``vlatool.module.axes`` finds it, with all that goes along.
         keep: Indices of what stays, in the order in which it stays.
     """
 
@@ -69,7 +74,12 @@ def _edit(value: Any, path: Path) -> Edit:
     known = set(Edit.__dataclass_fields__)
     fits = isinstance(value, Mapping) and set(value) == known and isinstance(value["keep"], list)
     whole = fits and all(isinstance(each, int) and not isinstance(each, bool) and each >= 0 for each in value["keep"])
-    if not whole or not value["keep"] or len(set(value["keep"])) != len(value["keep"]) or value["axis"] not in AXES:
+    if (
+        not whole
+        or not value["keep"]
+        or len(set(value["keep"])) != len(value["keep"])
+        or not AXIS.fullmatch(str(value["axis"]))
+    ):
         raise SourceError(f"{path} has an edit that makes no sense: {json.dumps(value)[:200]}.")
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
 
@@ -78,34 +88,78 @@ def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = 
     """Change what the factory made as a bundle says.
 
     Args:
-        modules: Graph name -> module, which is changed in place.
+        modules: Graph name -> module, which is changed in place, or replaced where it must be traced.
         bundle: With edits, weights, both or none.
         weights: Whether its weights are loaded, too; without them, only the structure counts.
 
     Raises:
         SourceError: when an edit or a tensor does not fit the module.
     """
-    apply(modules, read_edits(bundle))
-    for graph, module in modules.items() if weights else ():
+    made = apply(modules, read_edits(bundle), bundle)
+    for graph, module in made.items() if weights else ():
         if (name := f"{FOLDER}/{graph}.safetensors") in bundle.manifest.files:
             path = bundle.file(name)
             load_tensors(graph, module, read_tensors(path), str(path))
-    return dict(modules)
+    return made
 
 
-def apply(modules: Mapping[str, nn.Module], edits: Iterable[Edit]) -> None:
-    """Keep the channels and blocks of each edit, in order; modules are changed in place.
+def apply(
+    modules: Mapping[str, nn.Module], edits: Iterable[Edit], bundle: Bundle | None = None
+) -> dict[str, nn.Module]:
+    """Keep what each edit says, in order.
+
+    Args:
+        modules: Graph name -> module, changed in place, or replaced where it must be traced.
+        edits: Of any graphs.
+        bundle: Whose policy runs once; only where a module loses units it is needed, since it is traced then.
 
     Raises:
         SourceError: when there is no such module, it has no such axis, or fewer channels or blocks.
     """
-    for edit in edits:
-        if edit.graph not in modules:
-            raise SourceError(f"An edit names the graph '{edit.graph}'; {nearest(edit.graph, modules)}.")
-        parts = dict(modules[edit.graph].named_modules())
-        if edit.module not in parts:
-            raise SourceError(f"An edit names the module '{edit.module}'; {nearest(edit.module, list(parts)[:500])}.")
-        (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
+    made = dict(modules)
+    for units, group in groupby(edits, lambda edit: edit.axis.startswith(UNITS)):
+        if units and bundle is not None:
+            made = _without_units(made, tuple(group), bundle)
+            continue
+        for edit in group:
+            parts = dict(_named(made, edit.graph).named_modules())
+            if edit.module not in parts:
+                known = list(parts)[:500]
+                raise SourceError(f"An edit names the module '{edit.module}'; {nearest(edit.module, known)}.")
+            (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
+    return made
+
+
+def _named(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
+    if graph not in modules:
+        raise SourceError(f"An edit names the graph '{graph}'; {nearest(graph, modules)}.")
+    return modules[graph]
+
+
+def _without_units(modules: Mapping[str, nn.Module], edits: Sequence[Edit], bundle: Bundle) -> dict[str, nn.Module]:
+    """Trace the modules that lose units, and cut them."""
+    feeds = first_feeds(modules, bundle)
+    made = dict(modules)
+    for graph in dict.fromkeys(edit.graph for edit in edits):
+        made[graph] = cut(_named(modules, graph), feeds[graph], [edit for edit in edits if edit.graph == graph])
+    return made
+
+
+def joined_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
+    """Return edits that do what those before and those after them do; of the same units, those kept both times."""
+    last: dict[tuple[str, str, str], int] = {}
+    result = list(before)
+    for number, edit in enumerate(before):
+        last = {} if not edit.axis.startswith(UNITS) else last
+        last[edit.graph, edit.module, edit.axis] = number
+    for edit in after:
+        number = last.get((edit.graph, edit.module, edit.axis), -1)
+        if edit.axis.startswith(UNITS) and number >= 0:
+            kept = result[number].keep
+            result[number] = replace(edit, keep=tuple(kept[index] for index in edit.keep))
+        else:
+            result.append(edit)
+    return tuple(result)
 
 
 def _keep(module: Any, edit: Edit) -> None:

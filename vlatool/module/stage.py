@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, require
 from vlatool.module.description import read_location
-from vlatool.module.edits import Edit, apply, read_edits, write_module
+from vlatool.module.edits import Edit, apply, joined_edits, read_edits, write_module
 from vlatool.module.origin import factory_of
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.stage.base import Context, Transform, source_of
@@ -68,8 +68,8 @@ class ModuleStage(Transform):
         self.check(bundle, None)
         modules = load_modules(bundle)
         edits = self.change(modules, bundle, context)
-        apply(modules, edits)
-        made = write_changed(bundle, out, (*read_edits(bundle), *edits), modules, self.made_by())
+        modules = apply(modules, edits, bundle)
+        made = write_changed(bundle, out, joined_edits(read_edits(bundle), edits), modules, self.made_by())
         context.tell("running the changed policy", None)
         torch_policy(made, SEED).infer(observations_for(made, 1)[0])
         return made

@@ -1,0 +1,188 @@
+"""Axes of weights that belong together, found through reshapes; and modules without some of their units."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional
+
+from vlatool.errors import SourceError
+from vlatool.module.axes import Factors, Walk
+from vlatool.module.cut import RETRACE, cut, traced
+from vlatool.module.edits import Edit
+
+WIDTH, HEADS = 24, 4
+
+
+class Attention(nn.Module):
+    """Heads are found in reshapes alone: no attribute says how many there are."""
+
+    def __init__(self, form: str):
+        super().__init__()
+        self.form = form
+        self.joint = nn.Linear(WIDTH, 3 * WIDTH)
+        self.output = nn.Linear(WIDTH, WIDTH)
+        self.norm = nn.LayerNorm(WIDTH)
+
+    def forward(self, tokens):
+        batch, length, _ = tokens.shape
+        x = self.joint(self.norm(tokens))
+        if self.form == "chunk":
+            parts = [part.reshape(batch, length, HEADS, -1).transpose(1, 2) for part in x.chunk(3, -1)]
+        elif self.form == "split":
+            parts = [part.view(batch, length, HEADS, -1).transpose(1, 2) for part in x.split(WIDTH, dim=-1)]
+        else:
+            parts = list(x.reshape(batch, length, 3, HEADS, -1).permute(2, 0, 3, 1, 4).unbind(0))
+        query, key, value = parts
+        if self.form == "sdpa":
+            mixed = functional.scaled_dot_product_attention(query, key, value, scale=0.4)
+        else:
+            mixed = torch.softmax(query @ key.transpose(-2, -1) * 0.4, -1) @ value
+        return tokens + self.output(mixed.transpose(1, 2).reshape(batch, length, WIDTH))
+
+
+def units(walk: Walk) -> dict[str, int]:
+    """Return first weight with axis and place -> number of units, of all that may go."""
+    return {
+        f"{members[0].weight} {members[0].axis}.{members[0].place}": walk.factors.sizes[leaf]
+        for leaf, members in walk.members().items()
+    }
+
+
+def walked(module: nn.Module, *feeds: torch.Tensor) -> Walk:
+    return Walk(traced(module.eval(), feeds))
+
+
+@pytest.mark.parametrize("form", ["chunk", "split"])
+def test_heads_are_found_in_reshapes(form: str):
+    walk = walked(Attention(form), torch.randn(2, 5, WIDTH))
+    assert units(walk) == {"joint.weight 0.1": HEADS, "joint.weight 0.2": WIDTH // HEADS}
+    members = next(iter(walk.members().values()))
+    assert [(each.weight, each.axis, each.place, each.sizes) for each in members] == [
+        ("joint.weight", 0, 1, (3, 4, 6)), ("joint.bias", 0, 1, (3, 4, 6)), ("output.weight", 1, 0, (4, 6)),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["chunk", "split"])
+def test_a_head_that_goes_is_a_head_that_says_nothing(form: str):
+    torch.manual_seed(0)
+    module, tokens = Attention(form).eval(), torch.randn(1, 5, WIDTH)
+    small = cut(module, [tokens], [Edit("main", "joint.weight", "units 0.1", (0, 3))])
+    with torch.no_grad():
+        module.output.weight.view(WIDTH, HEADS, -1)[:, 1:3] = 0
+        torch.testing.assert_close(small(tokens), module(tokens))
+    sizes = {name: tuple(value.shape) for name, value in small.state_dict().items()}
+    assert (sizes["joint.weight"], sizes["joint.bias"], sizes["output.weight"]) == ((36, 24), (36,), (24, 12))
+    assert [name for name, _ in small.named_children()] == ["joint", "output", "norm"]
+    assert small(tokens.expand(3, -1, -1)).shape == (3, 5, WIDTH)
+
+
+class Conv(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.first = nn.Conv2d(3, 8, 3, padding=1)
+        self.norm = nn.BatchNorm2d(8)
+        self.deep = nn.Conv2d(8, 8, 3, padding=1, groups=8)
+        self.second = nn.Conv2d(8, 8, 3, padding=1)
+        self.film = nn.Linear(4, 16)
+        self.last = nn.Linear(8 * 6 * 6, 5)
+
+    def forward(self, image, words):
+        x = functional.relu(self.norm(self.first(image)))
+        scale, shift = self.film(words)[:, :, None, None].chunk(2, 1)
+        x = x + self.second(self.deep(x)) * (1 + scale) + shift
+        return self.last(x.flatten(1))
+
+
+def test_channels_are_coupled_through_normalisation_depth_residual_film_and_flatten():
+    torch.manual_seed(0)
+    module, feeds = Conv().eval(), (torch.randn(1, 3, 6, 6), torch.randn(1, 4))
+    walk = walked(module, *feeds)
+    assert units(walk) == {"first.weight 0.0": 8}
+    coupled = {f"{each.weight} {each.axis}.{each.place}" for each in next(iter(walk.members().values()))}
+    assert coupled >= {"norm.running_var 0.0", "deep.weight 0.0", "second.weight 0.0", "second.weight 1.0",
+                       "film.weight 0.1", "last.weight 1.0"}  # fmt: skip
+    keep = (1, 2, 5)
+    small = cut(module, list(feeds), [Edit("main", "first.weight", "units 0.0", keep)])
+    with torch.no_grad():
+        gone = [unit for unit in range(8) if unit not in keep]
+        module.last.weight.view(5, 8, 36)[:, gone] = 0
+        module.second.weight[:, gone] = 0
+        torch.testing.assert_close(small(*feeds), module(*feeds))
+    assert small.get_parameter("film.weight").shape == (6, 4)
+
+
+def test_what_is_normalised_over_read_or_given_stays():
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.one, self.two, self.norm = nn.Linear(4, 6), nn.Linear(6, 5), nn.LayerNorm(6)
+            self.table = nn.Embedding(9, 4)
+
+        def forward(self, ids):
+            return torch.cumsum(self.two(self.norm(self.one(self.table(ids)))), -1)
+
+    assert units(walked(Net(), torch.ones(2, 3, dtype=torch.int64))) == {}
+
+
+def test_work_is_counted():
+    walk = walked(nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 3)), torch.randn(1, 4))
+    (leaf,) = walk.members()
+    assert walk.macs({}) == 4 * 8 + 8 * 3
+    assert walk.macs({leaf: 5}) == 4 * 5 + 5 * 3
+
+
+def test_a_module_for_one_observation_is_traced_again_for_a_batch():
+    class One(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.up, self.down = nn.Linear(4, 8), nn.Linear(8, 4)
+
+        def forward(self, x):
+            assert len(x) in (1, 3), "a size that the code does not know"
+            return self.down(self.up(x).relu()).reshape(len(x), 2, 2)
+
+    torch.manual_seed(0)
+    small = cut(One().eval(), [torch.randn(1, 4)], [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
+    again = getattr(small, RETRACE)(3)
+    x = torch.randn(3, 4)
+    torch.testing.assert_close(again(x), torch.cat([small(row[None]) for row in x]))
+    assert again.get_parameter("up.weight") is small.get_parameter("up.weight")
+
+
+@pytest.mark.parametrize(("edit", "says"), [
+    (Edit("main", "0.weight", "units 0.1", (0,)), "cannot be chosen from"),
+    (Edit("main", "0.weight", "units 1.0", (0,)), "cannot be chosen from"),
+    (Edit("main", "7.weight", "units 0.0", (0,)), "cannot be chosen from"),
+    (Edit("main", "0.weight", "units 0.0", (8,)), r"are 8; an edit keeps 8"),
+])  # fmt: skip
+def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):
+    module = nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 3))
+    with pytest.raises(SourceError, match=says):
+        cut(module, [torch.randn(1, 4)], [edit])
+
+
+def test_what_cannot_be_traced_is_told():
+    class Loop(nn.Module):
+        def forward(self, x):
+            while float(x.sum()) > 0:
+                x = x - 1
+            return x
+
+    with pytest.raises(SourceError, match=r"torch\.export cannot trace Loop") as caught:
+        traced(Loop(), [torch.ones(1, 2)])
+    assert "vlatool prune depth" in caught.value.fix
+
+
+def test_factors_are_divided_alike():
+    factors = Factors()
+    one, other = factors.new(24), factors.new(24)
+    factors.divide(one[0], 4)
+    factors.unite(one, other)
+    assert factors.leaves(one) == factors.leaves(other)
+    assert [factors.sizes[leaf] for leaf in factors.leaves(other)] == [4, 6]
+    third = factors.new(24)
+    factors.divide(third[0], 3)
+    factors.unite(one, third)
+    assert all(factors.is_frozen(leaf) for leaf in (*factors.leaves(one), *factors.leaves(third)))

@@ -1,0 +1,178 @@
+"""A module with fewer heads, neurons and channels: traced, its weights cut, and the sizes in its reshapes with them."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from vlatool.errors import SourceError, require
+from vlatool.files.printable import message_of
+from vlatool.module.axes import Shape, Walk
+from vlatool.module.to_onnx import quiet_exporter
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from vlatool.module.edits import Edit
+
+SIZED = {"reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "unflatten": 2}
+"""Operator -> which of its arguments lists sizes of what it gives."""
+RETRACE = "vlatool_retrace"
+"""Attribute of a cut module that takes one batch size alone: gives the same module for another size."""
+
+
+def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
+    """Trace a module with torch.export.
+
+    Args:
+        module: Whose forward takes the feeds.
+        feeds: Tensors, the batch in front: free where it is larger than 1, and the module allows that.
+
+    Raises:
+        SourceError: when torch.export cannot trace it.
+    """
+    torch = require("torch", "build")
+    free = [{0: torch.export.Dim.AUTO} if feed.dim() and len(feed) > 1 else None for feed in feeds]
+    try:
+        with quiet_exporter(), torch.no_grad():
+            return torch.export.export(module, tuple(feeds), dynamic_shapes=free, strict=False)
+    except Exception as error:  # the seam: torch.export raises many foreign types
+        reason = (message_of(error).splitlines() or [""])[0]
+        raise SourceError(
+            f"torch.export cannot trace {type(module).__name__}: {type(error).__name__}: {reason}.",
+            "prune what needs no trace: vlatool prune depth, vlatool prune magnitude",
+        ) from error
+
+
+def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn.Module:
+    """Return a module without the elements that edits do not keep.
+
+    Args:
+        module: As the factory, and the edits before these, made it.
+        feeds: Example inputs, a batch of 1.
+        edits: Each names a weight, and ``units AXIS.PLACE``: which factor of which of its axes.
+
+    Raises:
+        SourceError: when torch.export cannot trace it, or an edit does not fit.
+    """
+    wanted = list(edits)
+    free = _for_any_batch(module, feeds, wanted)
+    if free is not None:
+        return free
+    kept = _cut(module, feeds, wanted)
+
+    def retrace(size: int) -> nn.Module:
+        other = _cut(module, _repeated(feeds, size), wanted)
+        _share(kept, other)
+        return other
+
+    setattr(kept, RETRACE, retrace)
+    return kept
+
+
+def _for_any_batch(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module | None:
+    """Return the cut module for batches of any size, None where its code fixes the size."""
+    torch = require("torch", "build")
+    with contextlib.suppress(Exception), torch.no_grad():  # the seam: a user's module raises what it likes
+        module(*_repeated(feeds, 2))
+        made = _cut(module, _repeated(feeds, 2), edits)
+        for size in (1, 3):
+            made(*_repeated(feeds, size))
+        return made
+    return None
+
+
+def _repeated(feeds: Sequence[Tensor], size: int) -> list[Tensor]:
+    return [feed.expand(size, *feed.shape[1:]).contiguous() if feed.dim() else feed for feed in feeds]
+
+
+def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module:
+    torch = require("torch", "build")
+    program = traced(module, feeds)
+    walk = Walk(program)
+    keep = {_leaf(walk, edit): edit.keep for edit in edits}
+    for node in program.graph.nodes:
+        _resize(walk, node, keep)
+    state = program.state_dict
+    for name, shape in walk.weights.items():
+        value = state[name] if name in state else program.constants[name]
+        smaller = _indexed(walk, value, shape, keep)
+        holder = state if name in state else program.constants
+        holder[name] = torch.nn.Parameter(smaller, value.requires_grad) if isinstance(
+            value, torch.nn.Parameter) else smaller  # fmt: skip
+    with quiet_exporter():
+        made: nn.Module = torch.export.unflatten(program)
+    return made
+
+
+def _leaf(walk: Walk, edit: Edit) -> int:
+    """Return the factor that an edit names.
+
+    Raises:
+        SourceError: when there is none, or it is smaller.
+    """
+    axis, place = (int(number) for number in edit.axis.removeprefix("units ").split("."))
+    shape = walk.weights.get(edit.module, [])
+    leaves = walk.factors.leaves(shape[axis]) if axis < len(shape) else ()
+    if place >= len(leaves) or walk.factors.is_frozen(leaves[place]):
+        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.")
+    if max(edit.keep) >= walk.factors.sizes[leaves[place]]:
+        size = walk.factors.sizes[leaves[place]]
+        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}; an edit keeps {max(edit.keep)}.")
+    return leaves[place]
+
+
+def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[int]]) -> Any:
+    """Return a weight without what goes."""
+    torch = require("torch", "build")
+    for number, axis in enumerate(shape):
+        leaves = walk.factors.leaves(axis)
+        if not any(leaf in keep for leaf in leaves):
+            continue
+        rows = torch.zeros(1, dtype=torch.int64)
+        for leaf in leaves:
+            size = walk.factors.sizes[leaf]
+            chosen = torch.tensor(keep[leaf]) if leaf in keep else torch.arange(size)
+            rows = (rows[:, None] * size + chosen[None]).reshape(-1)
+        value = value.detach().index_select(number, rows.to(value.device)).contiguous()
+    return value
+
+
+def _resize(walk: Walk, node: Any, keep: Mapping[int, Sequence[int]]) -> None:
+    """Write the new sizes into an operator that states sizes."""
+    if node.op != "call_function":
+        return
+    name = getattr(node.target, "_opname", "")
+    shape = walk.shape(node)
+    if name in SIZED and shape is not None:
+        place = SIZED[name]
+        stated = list(node.args[place])
+        offset = len(shape) - len(stated) if name != "unflatten" else node.args[1] % len(shape)
+        for number, size in enumerate(stated):
+            if isinstance(size, int) and size > 0:
+                stated[number] = _kept_size(walk, shape[number + offset], keep)
+        node.args = (*node.args[:place], stated, *node.args[place + 1 :])
+    elif name.startswith("conv") and len(node.args) > 6 and node.args[6] > 1 and shape is not None:
+        node.args = (*node.args[:6], _kept_size(walk, shape[1], keep))
+    elif name in ("split", "split_with_sizes"):
+        shapes = walk.parts(node)
+        along = (node.args[2] if len(node.args) > 2 else node.kwargs.get("dim", 0)) % len(shapes[0])
+        sizes = [_kept_size(walk, part[along], keep) for part in shapes]
+        node.args = (node.args[0], sizes if name == "split_with_sizes" else sizes[0], *node.args[2:])
+
+
+def _kept_size(walk: Walk, axis: Iterable[int], keep: Mapping[int, Sequence[int]]) -> int:
+    return math.prod(
+        len(keep[leaf]) if leaf in keep else walk.factors.sizes[leaf] for leaf in walk.factors.leaves(axis)
+    )
+
+
+def _share(source: nn.Module, target: nn.Module) -> None:
+    """Let a module have the weights of another one, not copies."""
+    parts = dict(source.named_modules())
+    for name, part in target.named_modules():
+        for holder in ("_parameters", "_buffers"):
+            for key in getattr(part, holder):
+                getattr(part, holder)[key] = getattr(parts[name], holder)[key]

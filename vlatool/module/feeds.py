@@ -1,0 +1,46 @@
+"""What each module of a policy is given, as an example."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import require
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.runtime.observation import ObservationEncoder
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+
+def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, list[Tensor]]:
+    """Run a policy on its first observation; return graph name -> what its module is given first, in order.
+
+    Raises:
+        SourceError: when a module fails.
+    """
+    torch = require("torch", "build")
+    encode = ObservationEncoder(bundle.manifest.spec, bundle)
+    values = encode(observations_for(bundle, 1)[0])
+    program = BatchedProgram(bundle.manifest.program, modules)
+    given: dict[str, list[Any]] = {}
+
+    def note(graph: str) -> Any:
+        def look(_module: Any, arguments: tuple[Any, ...]) -> None:
+            given.setdefault(graph, [argument.clone() for argument in arguments])
+
+        return look
+
+    handles = [module.register_forward_pre_hook(note(graph)) for graph, module in modules.items()]
+    try:
+        with torch.no_grad():
+            inputs = {name: torch.from_numpy(np.array(value)) for name, value in values.items()}
+            program.run(inputs, drawn(program.noise, 1, np.random.default_rng(0)))
+    finally:
+        for handle in handles:
+            handle.remove()
+    return given
