@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -34,7 +35,9 @@ def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
         SourceError: when torch.export cannot trace it.
     """
     torch = require("torch", "build")
-    free = [{0: torch.export.Dim.AUTO} if feed.dim() and len(feed) > 1 else None for feed in feeds]
+    axes = tuple({0: torch.export.Dim.AUTO} if feed.dim() and len(feed) > 1 else None for feed in feeds)
+    kinds = [parameter.kind for parameter in inspect.signature(module.forward).parameters.values()]
+    free = (axes,) if inspect.Parameter.VAR_POSITIONAL in kinds else axes
     try:
         with quiet_exporter(), torch.no_grad():
             return torch.export.export(module, tuple(feeds), dynamic_shapes=free, strict=False)

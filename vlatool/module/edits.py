@@ -145,6 +145,11 @@ def _without_units(modules: Mapping[str, nn.Module], edits: Sequence[Edit], bund
     return made
 
 
+def loses_units(edits: Iterable[Edit]) -> bool:
+    """Say whether a module must be traced to be edited so."""
+    return any(edit.axis.startswith(UNITS) for edit in edits)
+
+
 def joined_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
     """Return edits that do what those before and those after them do; of the same units, those kept both times."""
     last: dict[tuple[str, str, str], int] = {}

@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import SourceError, require
-from vlatool.module.edits import edited
+from vlatool.module.edits import edited, loses_units, read_edits
 from vlatool.module.factory import exits_told
 from vlatool.module.modules import modules_of
 from vlatool.module.origin import origin_of
@@ -72,11 +72,21 @@ def _declare(step: ProgramStep, values: dict[str, Any]) -> None:
 def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
     origin = origin_of(bundle)
     origin.check((".py",))
-    with _parameters_on_meta(torch):
+    traced = loses_units(read_edits(bundle))  # a trace runs the module, with all that it computes
+    with contextlib.nullcontext() if traced else _parameters_on_meta(torch):
         made = origin.made()
     modules = modules_of(made, (step.graph for step in bundle.manifest.program))
     modules = edited(modules, bundle, weights=False)
+    for module in modules.values() if traced else ():
+        _to_meta(torch, module)
     return {name: module.float() for name, module in modules.items()}
+
+
+def _to_meta(torch: Any, module: Any) -> None:
+    for part in module.modules():
+        for name, value in part._parameters.items():
+            if value is not None:
+                part._parameters[name] = torch.nn.Parameter(value.detach().to("meta"), requires_grad=False)
 
 
 @contextlib.contextmanager
