@@ -27,7 +27,14 @@ STILTED = (
     r"\braces? each other\b",
     r"\b(is|are|was|were) held against\b",
     r"\bhanded? out\b",
-    r"\bso run on so far\b",
+    r"\bfor whoever\b",
+    r"\bsomebody else's\b",
+    r"\b(is|are) (told|seen) (as|to)\b",
+    r"\bwhat is told\b",
+    r"\bis no (bundle|policy|tokenizer|fault|measure|signature)\b",
+    r"\bin the place of\b",
+    r"\bwhen nothing is said\b",
+    r"\bcould not be had\b",
 )
 """Phrases that read as translated."""
 
