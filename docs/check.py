@@ -78,6 +78,7 @@ def main() -> None:
     """Check every page; print each fault and exit with 1 when there is one."""
     pages = [Page(path, path.read_text(encoding="utf-8")) for path in page_paths(ROOT)]
     faults = [f"{page.path.relative_to(ROOT)}: {fault}" for page in pages for check in CHECKS for fault in check(page)]
+    faults += pages_named_by_code(ROOT)
     if faults:
         sys.exit("\n".join(faults))
     print(f"links, paths, commands, quoted messages and words are right ({len(pages)} pages)")
@@ -87,6 +88,18 @@ def page_paths(root: Path) -> list[Path]:
     """Return the pages that people write; ``docs/reference`` is generated."""
     pages = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "sample_models").glob("*/README.md")]
     return sorted(page for page in pages if page.parent.name != "reference")
+
+
+def pages_named_by_code(root: Path) -> list[str]:
+    """Return each page that the code or a test names and that does not exist."""
+    sources = [*(root / "vlatool").rglob("*.py"), *(root / "tests").rglob("*.py")]
+    files = [root / "Makefile", *(file for file in sources if file.parent.name != "docs")]
+    return [
+        f"{file.relative_to(root)}: there is no page {name}"
+        for file in files
+        for name in re.findall(r"\bdocs/[\w/-]+\.md\b", file.read_text(encoding="utf-8"))
+        if not (root / name).is_file()
+    ]
 
 
 def links(page: Page) -> Iterator[str]:

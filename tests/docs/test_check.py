@@ -107,6 +107,14 @@ def test_translated_phrases_are_faults(check, page):
     assert not list(check.words(page("Commands exit with 0, and how to fix it.")))
 
 
+def test_a_page_that_the_code_names_must_exist(check, tmp_path):
+    (tmp_path / "vlatool").mkdir()
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "Makefile").write_text("")
+    (tmp_path / "vlatool/errors.py").write_text('FIX = "see docs/guides/gone.md"\n')
+    assert check.pages_named_by_code(tmp_path) == ["vlatool/errors.py: there is no page docs/guides/gone.md"]
+
+
 def test_troubleshooting_quotes_messages(check):
     text = (ROOT / "docs/troubleshooting.md").read_text(encoding="utf-8")
     assert len(check.MESSAGE.findall(text)) > 25
