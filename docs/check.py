@@ -45,7 +45,7 @@ CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 FILE = re.compile(r"(?<![\w/.~…-])((?:[\w-]+/)+[\w.-]+\.(?:py|md|json|csv|yaml|npz|onnx))(?![\w/])")
 MODULE = re.compile(r"(?<![\w.-])vlatool((?:\.[A-Za-z_]\w*)+)(?!\w)(?!:)")
 PRIVATE = re.compile(r"^_[a-z][a-z0-9_]*$")
-MESSAGE = re.compile(r"^\s*(?:error|warning|fix): (.+)$", re.MULTILINE)
+MESSAGE = re.compile(r"^\s*(?:error|warning|fix|warn +[\w ]+): (.+)$", re.MULTILINE)
 TABLE_OF_MESSAGES = "what it says"
 
 
