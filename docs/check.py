@@ -20,6 +20,8 @@ PLACES = ("", "vlatool", "tests", "docs")
 """Folders that a path on a page may start from, beside the page's own."""
 GROUPS = {"engines", "profiles", "commands"}
 """Entry point groups that are not packages of vlatool."""
+EVERYWHERE = ("--help", "--trust")
+"""Options that every command takes, whether its help lists them or not."""
 STILTED = (
     r"\bmend(s|ed|ing)?\b",
     r"\bleaves? with (code |exit code )?\d",
@@ -225,7 +227,7 @@ def unknown_words(words: list[str]) -> Iterator[str]:
 def options(node: Any) -> set[str]:
     """Return the options of a command and, for a group, those of its commands: one of them may be the default."""
     own = {name for parameter in node.params for name in (*parameter.opts, *parameter.secondary_opts)}
-    return own.union({"--help"}, *(options(child) for child in getattr(node, "commands", {}).values()))
+    return own.union(EVERYWHERE, *(options(child) for child in getattr(node, "commands", {}).values()))
 
 
 @cache
