@@ -39,12 +39,13 @@ metaworld: $(BIN)/vlatool  ## install what the sample policy vla-metaworld needs
 test: $(VENV)/.dev  ## run the tests with coverage
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto
 
-check: $(VENV)/.dev  ## lint, format, types, layers, docs equal code
+check: $(VENV)/.dev  ## lint, format, types, layers, docs that match the code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python docs/generate.py --check
+	$(BIN)/python docs/check.py
 
 robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnxruntime 1.23, numpy, nothing else
 	$(BIN)/vlatool quantize sample_models/vln-babyai -o $(OUT)/robot/bundle --force

@@ -18,6 +18,7 @@ ENTRY_POINTS = """\
 [vlatool.quantize]
 rounded = acme_robotics.rounded:Rounded
 broken = acme_robotics.broken
+no-run = acme_robotics.no_run
 static-int8 = acme_robotics.broken
 absent = acme_robotics.no_such_file
 
@@ -136,6 +137,20 @@ def test_its_bug_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     assert "The package acme-robotics 1.2, which adds to vlatool, fails: ZeroDivisionError" in done.stderr
     assert "bug in vlatool" not in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_method_without_run_is_told_as_unfinished(run: Run, onnx_file: Path, tmp_path: Path):
+    done = run("quantize", "no-run", str(onnx_file), "-o", str(tmp_path / "out"))
+    assert done.returncode == 3
+    assert "quantize.no_run has no method run()" in done.stderr
+    assert "bug in vlatool" not in done.stderr
+
+
+def test_its_method_takes_the_options_that_select_layers(run: Run, policy_dir: Path, tmp_path: Path):
+    ok(run("export", str(policy_dir), "-o", str(tmp_path / "float32")))
+    done = run("quantize", "rounded", str(tmp_path / "float32"), "--exclude", "*", "-o", str(tmp_path / "out"))
+    assert done.returncode == 3
+    assert "No layer is left to quantize" in done.stderr
 
 
 def test_what_cannot_be_imported_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):

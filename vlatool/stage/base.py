@@ -17,7 +17,7 @@ from pydantic import ConfigDict, ValidationError
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import PluginError, RecipeError, nearest
 from vlatool.files.numbers import Numeric
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.version import VERSION
@@ -32,6 +32,7 @@ Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
 BEFORE_ENGINES = ("sources", "export")
 """Kinds of stages whose output is the same whatever OpenVINO computes in."""
+UNFINISHED = "define it; docs/guides/add-a-method.md shows a complete stage"
 RECORD = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
 
@@ -168,7 +169,7 @@ class Transform(Stage):
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the new bundle into the empty directory ``out`` and return it."""
-        raise NotImplementedError(self.name())
+        raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
 
     def _told_options(self) -> dict[str, Any]:
         """Return the options with files named by name and content: paths are not recorded."""
@@ -223,7 +224,7 @@ class Measure(Stage):
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Measure and return the report; the caller writes it."""
-        raise NotImplementedError(self.name())
+        raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
 
 
 def source_of(source: Bundle | None, stage: str) -> Bundle:
