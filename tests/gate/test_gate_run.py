@@ -14,7 +14,7 @@ from vlatool.gate import timed
 from vlatool.gate.config import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
 from vlatool.gate.run import run_gate
 from vlatool.measurement.agreement import run_agreement
-from vlatool.measurement.pairs import Job, Pairs
+from vlatool.measurement.pairs import PairJob, Pairs
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.telemetry._reading import THROTTLE, Reader, gauge
@@ -26,10 +26,10 @@ QUICK = Gate(memory=None, latency=LatencyClaim(looks=(10,)))
 def as_fast(monkeypatch: pytest.MonkeyPatch):
     """A function that sets how much slower the candidate seems to be; no process is started."""
 
-    def make(slowdown: float) -> list[Job]:
-        jobs: list[Job] = []
+    def make(slowdown: float) -> list[PairJob]:
+        jobs: list[PairJob] = []
 
-        def measured(job: Job, timeout: float | None) -> Pairs:
+        def measured(job: PairJob, timeout: float | None) -> Pairs:
             jobs.append(job)
             shift = math.exp(0.001 * (job.seed % 5 - 2))
             return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80)

@@ -12,7 +12,7 @@ from vlatool.accuracy.paired import compare_success, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._controls import CONTROLS
-from vlatool.evaluate._episodes import Job, run_jobs
+from vlatool.evaluate._episodes import EpisodesJob, run_jobs
 from vlatool.evaluate._findings import found_wrong
 from vlatool.machine.host import fingerprint
 from vlatool.module.description import read_description
@@ -86,7 +86,7 @@ class ClosedLoop(Measure):
             warnings=(*believed.warnings, *found_wrong(source)),
         )  # fmt: skip
 
-    def _reference(self, baseline: Bundle, jobs: list[Job], context: Context) -> Row:
+    def _reference(self, baseline: Bundle, jobs: list[EpisodesJob], context: Context) -> Row:
         """Play the baseline, and the controls that show what succeeds by chance."""
         row = success_row("baseline", "baseline", run_jobs(baseline, jobs, self.engine, context))
         if self.instruction != "right":
@@ -101,7 +101,7 @@ class ClosedLoop(Measure):
         episodes = min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))
         return [self.model_copy(update={"control": each, "episodes": episodes, "baseline": None}) for each in CONTROLS]
 
-    def _may_run(self, job: Job) -> None:
+    def _may_run(self, job: EpisodesJob) -> None:
         """Let the environment's code run where it was named in the options; what a bundle names must be trusted.
 
         Raises:
@@ -120,7 +120,7 @@ class ClosedLoop(Measure):
             )
         trust.require(file.parent, f"{function}() of {file.name}")
 
-    def _jobs(self, source: Bundle | None) -> list[Job]:
+    def _jobs(self, source: Bundle | None) -> list[EpisodesJob]:
         described = read_description(self.policy) if self.policy else None
         named = described.environment if described else (source.manifest.environment if source else {})
         known = tuple(named.get("tasks", ()))
@@ -144,5 +144,7 @@ class ClosedLoop(Measure):
         seeds = range(self.first_seed, self.first_seed + each)
         slices = [tuple(seeds[start : start + SLICE]) for start in range(0, each, SLICE)]
         return [
-            Job(where, str(folder), task, part, self.instruction, self.control) for task in tasks for part in slices
+            EpisodesJob(where, str(folder), task, part, self.instruction, self.control)
+            for task in tasks
+            for part in slices
         ]

@@ -18,7 +18,7 @@ from vlatool.gate.same import check
 from vlatool.gate.timed import Timed
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
-from vlatool.measurement.pairs import Job
+from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.validity import busy, throttled, validity
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
@@ -52,9 +52,8 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     how = gate.latency or LatencyClaim()
     seed = secrets.randbits(32) if seed is None else seed
     inputs = Inputs(baseline, gate.accuracy.data if gate.accuracy else None, seed)
-    job = Job(
-        str(baseline.path), str(candidate.path), how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed
-    )
+    paths = str(baseline.path), str(candidate.path)
+    job = PairJob(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed)
     timed = Timed(job, context, how.timeout, inputs)
     agreement = _agreement(timed, gate, inputs)
     found: list[Found] = []

@@ -1,17 +1,14 @@
 """What two bundles answer to observations that neither was made for: whether the one still follows the other.
 
-``python -m vlatool.measurement.agreement`` reads one line of JSON (the fields of ``_pairs.Job``) and prints one (those
-of ``Agreement``). Both are loaded as a robot loads them: every file is hashed, and the golden action must be computed.
-Each observation is answered twice, once right after ``reset`` and once in another order without it; where values are
-kept by design, the second time is a row of inferences in which both answer the same.
+``python -m vlatool.measurement.agreement`` reads a ``PairJob`` and answers with an ``Agreement``. Both are loaded as a
+robot loads them: every file is hashed, and the golden action must be computed. Each observation is answered twice, once
+right after ``reset`` and once in another order without it; where values are kept by design, the second time is a row of
+inferences in which both answer the same.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import random
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.machine.processes import die_with_parent
-from vlatool.measurement.child import answer, ask
-from vlatool.measurement.pairs import Job
+from vlatool.measurement.child import ask, serve
+from vlatool.measurement.pairs import PairJob
 
 Array = NDArray[Any]
 FEWEST = 24
@@ -76,21 +72,17 @@ class Agreement:
     engines: tuple[str, ...] = ("", "")
 
 
-def measure_agreement(job: Job, timeout: float | None = None) -> Agreement:
+def measure_agreement(job: PairJob, timeout: float | None = None) -> Agreement:
     """Measure in a fresh process.
 
     Raises:
         VlatoolError: what a bundle raises when it is loaded or run; GraphError when the process ends or takes longer
             than ``timeout`` seconds.
     """
-    about = f"{job.candidate} beside {job.baseline}"
-    found = ask("vlatool.measurement.agreement", (), json.dumps(dataclasses.asdict(job)), about, timeout)
-    found["followed"] = tuple(Followed(**each) for each in found["followed"])
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
-    return Agreement(**values)
+    return ask("vlatool.measurement.agreement", job, Agreement, job.about, timeout)
 
 
-def run_agreement(job: Job) -> Agreement:
+def run_agreement(job: PairJob) -> Agreement:
     """Measure in this process; ``job.seconds`` ends it early, once ``FEWEST`` observations are answered."""
     from vlatool.bundle.bundle import Bundle
     from vlatool.measurement.turns import loaded, pool_of
@@ -119,7 +111,7 @@ class _Asked:
     outputs: tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
-def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job, afresh: bool = True) -> tuple[list[_Asked], int]:
+def _asked(policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: bool = True) -> tuple[list[_Asked], int]:
     """Ask both for every observation, some bits of which are new, right after a reset (``afresh``) or in a row."""
     from vlatool.errors import GraphError
     from vlatool.measurement.answers import varied
@@ -210,5 +202,4 @@ def correlation(mine: Array, theirs: Array) -> float:
 
 
 if __name__ == "__main__":
-    die_with_parent()
-    answer(lambda: dataclasses.asdict(run_agreement(Job(**json.loads(sys.stdin.readline())))))
+    serve(PairJob, run_agreement)

@@ -29,6 +29,23 @@ PAIRS = 40
 FEWEST = 10
 
 
+@dataclass(frozen=True)
+class AnswerCheck:
+    """Timed answers, held against those of an unhurried pass.
+
+    Args:
+        looked: How many were looked at.
+        strays: How many differ.
+        worst: The largest relative difference; None when one is not finite, or of another shape.
+        first: Which of the calls was the first to differ, from 0; -1 for none.
+    """
+
+    looked: int
+    strays: int
+    worst: float | None
+    first: int
+
+
 class Answers:
     """Compares outputs with those of an unhurried pass.
 
@@ -62,10 +79,10 @@ class Answers:
             self.worst = max(self.worst, wrong if math.isfinite(wrong) else math.inf)
             self.first = self.looked if self.first < 0 else self.first
 
-    def to_dict(self) -> dict[str, float | None]:
-        """Return how many were looked at, how many differed, by how much (None: no number says) and which was first."""
+    def check(self) -> AnswerCheck:
+        """Return what was seen so far."""
         worst = self.worst if math.isfinite(self.worst) else None
-        return {"looked": self.looked, "strays": self.strays, "worst": worst, "first": self.first}
+        return AnswerCheck(self.looked, self.strays, worst, self.first)
 
 
 def expected_answers(

@@ -50,7 +50,7 @@ def examine_memory(
         with inputs.file(OBSERVATIONS, MEMORY, number) if inputs else contextlib.nullcontext() as path:
             for bundle, found in zip((candidate, baseline), peaks, strict=True):
                 probed = cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout, observations=path)
-                found.append(probed["peak_rss_mb"])
+                found.append(probed.peak_rss_mb)
     mine, theirs = median(peaks[0]), median(peaks[1])
     note = f"load and some inferences, median of {PROBES} fresh processes"
     return judged("memory", theirs, Measurement("peak_rss", mine, "MB", samples=PROBES, note=note), claim)
