@@ -21,7 +21,7 @@ MODULES = (
     "vlatool.measurement.pairs", "vlatool.optimize.pipeline", "vlatool.remote._heard",
 )  # fmt: skip
 """Where messages are defined; what they are made of is followed from there."""
-NO_MESSAGES = {"Plan", "_Asked"}
+NO_MESSAGES = {"_Asked"}
 
 
 def messages() -> list[type]:

@@ -22,7 +22,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
-from vlatool.optimize.pipeline import make_plan
+from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
 from vlatool.report import Report, read_report
 from vlatool.runtime import load

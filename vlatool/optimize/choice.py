@@ -45,6 +45,11 @@ def choose(
     return [chosen if item is best else item for item in judged]
 
 
+def chosen_of(judged: list[Judged]) -> Judged:
+    """Return the row that is marked as chosen."""
+    return next(item for item in judged if item.row.role == "chosen")
+
+
 def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged, str, tuple[str, ...]]:
     """Return the candidate that misses the limits by least, and what is said of all of them.
 

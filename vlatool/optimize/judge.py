@@ -6,85 +6,19 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from vlatool.errors import RecipeError, nearest
+from vlatool.optimize.budget import Budget, distance_of
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
 if TYPE_CHECKING:
-    from vlatool.bundle.spec import PolicySpec
     from vlatool.hardware.profile import Profile
 
 TOLERANCE = 1e-12
 AGAINST_FLOAT32 = "against float32"
-PROXY = 0.05
-"""Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
 FROM_FLOAT32 = ("relative_error", "disagreement", "error_baseline", "gripper_flips_baseline")
 """Beginnings of the measurements that are distances from float32 themselves."""
 DROPS = ("success_drop", "agreement_drop", "error_increase")
 """Which accuracy decides: the closed loop where there is one, else recorded observations."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What a plan may cost in accuracy, in a measure that recorded observations give.
-
-    Args:
-        name: The measurement, or ``unit:UNIT`` for the worst action element of that unit.
-        value: The largest allowed.
-    """
-
-    name: str
-    value: float
-
-    def of(self, row: Row) -> Measurement | None:
-        """Return the measurement of a row that the budget is about, None when there is none."""
-        if self.name == "disagreement":
-            found = row.get("agreement_baseline")
-            return None if found is None else replace(found, name=self.name, value=1.0 - found.value)
-        if self.name.startswith("unit:"):
-            unit = self.name.partition(":")[2]
-            alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
-            return max(alike, key=lambda m: m.value, default=None)
-        return row.get(self.name) or row.get(f"error_baseline.{self.name}")
-
-    def found(self, row: Row) -> Measurement:
-        """Return the measurement of a row that the budget is about.
-
-        Raises:
-            RecipeError: when the row has none of that name; names those that it has.
-        """
-        found = self.of(row)
-        if found is not None:
-            return found
-        known = [each.name.removeprefix("error_baseline.") for each in row.measurements if each.origin == "measured"]
-        units = {f"unit:{each.unit}" for each in row.measurements if each.name.startswith("error_baseline.")}
-        raise RecipeError(
-            f"--max-drop names '{self.name}', which is not measured on this policy; "
-            f"{nearest(self.name, [*known, *sorted(units)])}."
-        )
-
-
-def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
-    """Return the budget on recorded observations.
-
-    Args:
-        limits: What was asked for.
-        spec: The policy's.
-        proxy: Whether something else decides in the end (episodes, the expert's actions), so that a plan is only worth
-            a look when it is near float32.
-    """
-    if limits.metric:
-        return Budget(limits.metric, limits.max_metric or 0.0)
-    name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
-    return Budget(name, min(max(PROXY, limits.max_drop), limits.max_distance) if proxy else limits.max_drop)
-
-
-def distance_of(row: Row) -> Measurement | None:
-    """Return how far a row's actions are from float32's own, None when that is not measured.
-
-    Continuous: the mean |difference| by float32's standard deviation; discrete: the share of other answers.
-    """
-    return Budget("disagreement", 0.0).of(row) or row.get("error_baseline")
 
 
 @dataclass(frozen=True)
