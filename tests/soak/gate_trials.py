@@ -32,7 +32,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.gate.config import Gate, LatencyClaim
-from vlatool.gate.found import worst
+from vlatool.gate.result import worst
 from vlatool.gate.run import run_gate
 from vlatool.measurement.pairs import PairJob, measure_pairs
 from vlatool.stage.base import Context

@@ -38,13 +38,13 @@ def _by_task(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     return table
 
 
-def with_chance(row: Row, controls: Sequence[Row]) -> Row:
+def with_chance(reference: Row, controls: Sequence[Row]) -> Row:
     """Return the row with ``success_chance``: how often the better control succeeds, with its Wilson interval."""
-    rates = [(each.name, found) for each in controls if (found := each.get("success")) is not None]
+    rates = [(row.name, rate) for row in controls if (rate := row.get("success")) is not None]
     name, best = max(rates, key=lambda pair: pair[1].value)
     note = f"{name} actions, the better of {' and '.join(name for name, _ in rates)}"
     chance = replace(best, name="success_chance", note=note)
-    return replace(row, measurements=(*row.measurements, chance))
+    return replace(reference, measurements=(*reference.measurements, chance))
 
 
 def compare_success(baseline: Row, row: Row) -> Row:

@@ -195,21 +195,21 @@ class Latency(Measure):
             return f"The measurement is invalid: {seen[0].reason}."
         where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
         row, others = rows[0], rows[1:]
-        told = f"{row.name}: {_ms(row)} median latency on {where}"
+        text = f"{row.name}: {_ms(row)} median latency on {where}"
         for other in others:
-            told += f"; {other.name}: {_ms(other)} ({other.value('speedup'):.3g}x as fast)"
+            text += f"; {other.name}: {_ms(other)} ({other.value('speedup'):.3g}x as fast)"
         if self.rate:
             misses = row.value("deadline_misses")
             late = f"{misses:.2%} of the ticks are late" if misses else "no tick is late"
-            told = f"{row.name} at {self.rate:g} Hz: {late}, {_ms(row)} median from the tick to "
-            told += f"its action, on {where}"
-        return told + "."
+            text = f"{row.name} at {self.rate:g} Hz: {late}, {_ms(row)} median from the tick to "
+            text += f"its action, on {where}"
+        return text + "."
 
     def _told(self) -> dict[str, Any]:
         """Return how it was measured, for the environment of the report: what makes two reports differ."""
-        told = {"threads": self.threads, "rate_hz": self.rate, "pin": self.pin, "cores": self.cores,
+        options = {"threads": self.threads, "rate_hz": self.rate, "pin": self.pin, "cores": self.cores,
                 "memory_limit_mb": self.memory_mb, "emulates": self._board}  # fmt: skip
-        return {name: value for name, value in told.items() if value}
+        return {name: value for name, value in options.items() if value}
 
     def _limited(self, host: Mapping[str, Any], where: str) -> list[Finding]:
         if not (self.cores or self.memory_mb):
@@ -218,12 +218,13 @@ class Latency(Measure):
         what = [f"{min(self.cores, usable)} processors"] * bool(self.cores)
         what += [f"{self.memory_mb:,.0f} MB of memory"] * bool(self.memory_mb)
         board = f" as {self._board}" if self._board else ""
-        told = [Finding("note", f"emulation{board}: {' and '.join(what)}; the speed is that of {where.split(',')[0]}")]
+        speed = f"the speed is that of {where.split(',')[0]}"
+        notes = [Finding("note", f"emulation{board}: {' and '.join(what)}; {speed}")]
         if self.cores > usable:
             effect = "suspect" if self.threads > usable else "note"
             lacks = f"{self._board or 'the limit'} has {self.cores} processors, and this machine {usable}"
-            told.append(Finding(effect, lacks, "measure on a machine with as many"))
-        return told
+            notes.append(Finding(effect, lacks, "measure on a machine with as many"))
+        return notes
 
 
 def processors(text: str) -> tuple[int, ...]:
@@ -237,10 +238,10 @@ def processors(text: str) -> tuple[int, ...]:
     if not re.fullmatch(r"\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*", text):
         raise UsageError(f"--pin is {text!r}; allowed: processors such as 0-3 or 2,4.")
     ends = [[int(end) for end in part.split("-")] for part in text.split(",")]
-    found = sorted({number for end in ends for number in range(end[0], end[-1] + 1)})
-    if not found:
+    numbers = sorted({number for end in ends for number in range(end[0], end[-1] + 1)})
+    if not numbers:
         raise UsageError(f"--pin is {text!r}, which names no processor; allowed: such as 0-3 or 2,4.")
-    return tuple(found)
+    return tuple(numbers)
 
 
 def _ms(row: Row) -> str:

@@ -90,15 +90,15 @@ def run_agreement(job: PairJob) -> Agreement:
     baseline = Bundle.open(job.baseline)
     policies = [loaded(path, job) for path in (job.baseline, job.candidate)]
     pool = pool_of(job, baseline) if job.pairs else []
-    asked, skipped = _asked(policies, pool, job)
+    calls, skipped = _asked(policies, pool, job)
     if any(step.keep for step in baseline.manifest.program):
         for policy in policies:
             policy.reset()
-        asked += _asked(policies, [replace(each, kind=SEQUENCE) for each in pool], job, afresh=False)[0]
-    strays = [_strays(policy, asked, which, job.seed) for which, policy in enumerate(policies)]
-    kinds = dict.fromkeys(each.kind for each in asked)
-    followed = [one for kind in kinds for one in _followed(policies, [each for each in asked if each.kind == kind])]
-    return Agreement(tuple(followed), len(asked), strays[1], strays[0], skipped,
+        calls += _asked(policies, [replace(drawn, kind=SEQUENCE) for drawn in pool], job, afresh=False)[0]
+    strays = [_strays(policy, calls, which, job.seed) for which, policy in enumerate(policies)]
+    kinds = dict.fromkeys(call.kind for call in calls)
+    followed = [one for kind in kinds for one in _followed(policies, [call for call in calls if call.kind == kind])]
+    return Agreement(tuple(followed), len(calls), strays[1], strays[0], skipped,
                      tuple(policy.golden_error for policy in policies),
                      tuple(policy.engine for policy in policies))  # fmt: skip
 
@@ -119,7 +119,7 @@ def _asked(policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: b
 
     numbers = np.random.default_rng([job.seed, 3])
     steps, spec = policies[0].bundle.manifest.program, policies[0].spec
-    found: list[_Asked] = []
+    calls: list[_Asked] = []
     skipped = 0
     end = time.monotonic() + job.seconds
     for place, drawn in enumerate(pool):
@@ -132,10 +132,10 @@ def _asked(policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: b
         except GraphError:
             skipped += 1
             continue
-        found.append(
+        calls.append(
             _Asked(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise, afresh)))
         )
-    return found, skipped
+    return calls, skipped
 
 
 def _outputs(
@@ -146,35 +146,35 @@ def _outputs(
     return {name: np.array(value) for name, value in policy.infer(observation, noise=noise).outputs.items()}
 
 
-def _strays(policy: Any, asked: Sequence[_Asked], which: int, seed: int) -> int:
+def _strays(policy: Any, calls: Sequence[_Asked], which: int, seed: int) -> int:
     """Count the answers that are others in another order without reset; 0 for a policy that keeps values by design."""
     from vlatool.measurement.answers import Answers
 
     if any(step.keep for step in policy.bundle.manifest.program):
         return 0
-    answers = Answers([each.outputs[which] for each in asked])
-    for place in random.Random(seed).sample(range(len(asked)), len(asked)):
-        answers.look(place, policy.infer(asked[place].observation, noise=asked[place].noise).outputs)
+    answers = Answers([call.outputs[which] for call in calls])
+    for place in random.Random(seed).sample(range(len(calls)), len(calls)):
+        answers.look(place, policy.infer(calls[place].observation, noise=calls[place].noise).outputs)
     return answers.strays
 
 
-def _followed(policies: Sequence[Any], asked: Sequence[_Asked]) -> list[Followed]:
-    kind, count = asked[0].kind, len(asked)
-    found = []
+def _followed(policies: Sequence[Any], calls: Sequence[_Asked]) -> list[Followed]:
+    kind, count = calls[0].kind, len(calls)
+    followed = []
     for tensor in policies[0].spec.outputs:
         theirs, mine = (
-            _physical(policy, tensor.name, [each.outputs[which][tensor.name] for each in asked])
+            _physical(policy, tensor.name, [call.outputs[which][tensor.name] for call in calls])
             for which, policy in enumerate(policies)
         )
-        found.append(Followed(kind, tensor.name, correlation(mine, theirs), count))
-    return found
+        followed.append(Followed(kind, tensor.name, correlation(mine, theirs), count))
+    return followed
 
 
 def _physical(policy: Any, name: str, values: Sequence[Array]) -> Array:
     """Return an output in physical units by the bundle's own statistics, (N, ...); logits without their mean."""
     from vlatool.runtime.statistics import load_normaliser
 
-    tensor = next(each for each in policy.spec.outputs if each.name == name)
+    tensor = next(tensor for tensor in policy.spec.outputs if tensor.name == name)
     wide = np.stack(values).astype(np.float64)
     if tensor.kind == "discrete":
         return np.asarray(wide - wide.mean(-1, keepdims=True))
@@ -196,7 +196,7 @@ def correlation(mine: Array, theirs: Array) -> float:
     if not varied.any():
         near = float(np.linalg.norm(mine - theirs)) <= CLOSE * (float(np.linalg.norm(theirs)) or 1.0)
         return float(near)
-    one, two = ((each - each.mean(axis=0))[:, varied] / spread[varied] for each in (mine, theirs))
+    one, two = ((values - values.mean(axis=0))[:, varied] / spread[varied] for values in (mine, theirs))
     size = float(np.linalg.norm(one) * np.linalg.norm(two))
     return float((one * two).sum() / size) if size > 0 else 0.0
 

@@ -54,7 +54,7 @@ class Answers:
     """
 
     def __init__(self, expected: Sequence[Mapping[str, NDArray[Any]]]) -> None:
-        self._expected = [dict(each) for each in expected]
+        self._expected = [dict(outputs) for outputs in expected]
         self.looked = 0
         self.strays = 0
         self.worst = 0.0
@@ -90,13 +90,13 @@ def expected_answers(
 ) -> Answers:
     """Run through the observations unhurriedly, as many as fit into some seconds, and return what they gave."""
     policy.reset()
-    found: list[Mapping[str, NDArray[Any]]] = []
+    expected: list[Mapping[str, NDArray[Any]]] = []
     end = time.monotonic() + seconds
     for number, observation in enumerate(observations):
         if number >= fewest and time.monotonic() > end:
             break
-        found.append({name: np.array(value) for name, value in policy.infer(observation).outputs.items()})
-    return Answers(found)
+        expected.append({name: np.array(value) for name, value in policy.infer(observation).outputs.items()})
+    return Answers(expected)
 
 
 @dataclass(frozen=True)

@@ -152,12 +152,13 @@ def percentile_measurements(
 
 def _lacks(seen: Percentile, calls: int, seconds: float) -> str:
     """Return what a percentile lacks; calls that follow each other count for less than independent ones."""
-    if not seen.worth:
+    size = seen.effective_sample_size
+    if not size:
         return "ticks share inferences, so nothing bounds it; pass a lower --rate"
-    more = math.ceil(1.1 * seen.needed * max(1.0, calls / seen.worth) / 100) * 100
-    size = f"{calls:,} calls" if seen.worth >= calls else f"{calls:,} calls that are worth {int(seen.worth):,}"
+    more = math.ceil(1.1 * seen.needed * max(1.0, calls / size) / 100) * 100
+    run = f"{calls:,} calls" if size >= calls else f"{calls:,} calls that are worth {int(size):,}"
     advice = f"pass --iterations {more} (about {seconds * more / calls:.0f} s)"
-    return f"needs {seen.needed:,} independent calls, this run has {size}; {advice}"
+    return f"needs {seen.needed:,} independent calls, this run has {run}; {advice}"
 
 
 def speedup(contestant: Contestant, reference: Contestant) -> Measurement:

@@ -87,12 +87,12 @@ class Turns:
         gc.enable()
         if not self.places:
             raise GraphError(f"{self.job.baseline} answers none of the observations that were drawn for it.")
-        slow, told = self._confirm()
+        slow, slow_input = self._confirm()
         self.policies = [None, None]
         looked, strays = self._replay(1)
         unsteady = self._replay(0)[1] if strays else 0
         baseline, candidate = map(tuple, self.taken)
-        return Pairs(baseline, candidate, tuple(self.places), slow, told, looked, strays, unsteady)
+        return Pairs(baseline, candidate, tuple(self.places), slow, slow_input, looked, strays, unsteady)
 
     def _load(self, which: int) -> Policy:
         path = (self.job.baseline, self.job.candidate)[which]
@@ -186,7 +186,7 @@ class Turns:
     def _confirm(self) -> tuple[tuple[float, ...], str]:
         """Time further pairs of the place (an observation, exact or varied) where the candidate seemed the slowest."""
         mine, theirs = (medians(self.taken[which], self.places) for which in (1, 0))
-        place = max(mine, key=lambda each: mine[each] / theirs[each])
+        place = max(mine, key=lambda place: mine[place] / theirs[place])
         if mine[place] / theirs[place] < SUSPECT:
             return (), ""
         before = len(self.places)
@@ -220,7 +220,7 @@ def loaded(path: str, job: PairJob) -> Policy:
         VlatoolError: what ``load`` raises, with the bundle's path.
     """
     try:
-        known = [each["name"] for each in Bundle.described(path).manifest.findings]
+        known = [finding["name"] for finding in Bundle.described(path).manifest.findings]
         return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known)
     except VlatoolError as error:
         if path in error.message:
@@ -256,15 +256,15 @@ def halved(numbers: Sequence[int], order: random.Random) -> list[int]:
     return [place_of(number, number in exact) for number in numbers]
 
 
-def sequence(places: Sequence[int], order: random.Random) -> list[int]:
+def sequence(pool: Sequence[int], order: random.Random) -> list[int]:
     """Return each place ``REPEATS`` times in random order, never twice in a row unless there is one alone."""
-    found: list[int] = []
+    places: list[int] = []
     for _ in range(REPEATS):
-        part = order.sample(places, len(places))
-        if found and part[0] == found[-1]:
+        part = order.sample(pool, len(pool))
+        if places and part[0] == places[-1]:
             part.reverse()
-        found += part
-    return found
+        places += part
+    return places
 
 
 def described(drawn: Drawn, exact: bool = True) -> str:

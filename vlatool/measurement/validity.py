@@ -53,7 +53,7 @@ def findings(measured: Measured, job: LatencyJob, duration_is_sustained: bool = 
 
 def validity(seen: Sequence[Finding]) -> str:
     """Return ``invalid``, ``suspect`` or ``valid``: the worst effect."""
-    effects = {each.effect for each in seen}
+    effects = {finding.effect for finding in seen}
     return next((effect for effect in ("invalid", "suspect") if effect in effects), "valid")
 
 

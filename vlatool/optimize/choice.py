@@ -119,19 +119,19 @@ def _times(row: Row, base: Row) -> str:
 
 def foretold(row: Row, base: Row, elsewhere: str) -> str:
     """Return a sentence on what a row is predicted to need on a board, with its range; empty without a board."""
-    found = row.get("latency_p50", "predicted")
+    latency = row.get("latency_p50", "predicted")
     if not elsewhere:
         return ""
-    if found is None or not found.known:
+    if latency is None or not latency.known:
         return f" No latency can be predicted for {elsewhere}."
     span = (
         ""
-        if found.low is None or found.high is None
-        else f" ({found.low:.3g} to {found.high:.3g}, {found.confidence:.0%})"
+        if latency.low is None or latency.high is None
+        else f" ({latency.low:.3g} to {latency.high:.3g}, {latency.confidence:.0%})"
     )
     reference = base.get("latency_p50", "predicted")
     beside = f", {base.name} {reference.value:.3g} ms" if row is not base and reference and reference.known else ""
-    return f" Predicted for {elsewhere}, not measured there: {found.value:.3g} ms{span}{beside}."
+    return f" Predicted for {elsewhere}, not measured there: {latency.value:.3g} ms{span}{beside}."
 
 
 def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
@@ -163,8 +163,8 @@ def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> 
     if not is_faster(row, base):
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
         why = f" It was chosen because {reason}."
-    told = foretold(row, base, elsewhere)
-    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {size}.{why}{success}{told}"
+    board = foretold(row, base, elsewhere)
+    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {size}.{why}{success}{board}"
     return (first, f"{row.reason[:1].upper()}{row.reason[1:]}.")
 
 
@@ -172,17 +172,17 @@ def _float32_kept(judged: list[Judged], elsewhere: str) -> tuple[str, ...]:
     base = judged[0].row
     outside = [item for item in judged[1:] if not item.within and is_faster(item.row, base)]
     inside = [item for item in judged[1:] if item.within]
-    told = tuple(f"{item.row.name} is {speed_words(item.row, base, elsewhere)}." for item in inside)
+    speeds = tuple(f"{item.row.name} is {speed_words(item.row, base, elsewhere)}." for item in inside)
     board = foretold(base, base, elsewhere)
     if outside:
         return (
             f"{base.name} was kept: no candidate inside the limits is faster on this host.{board}",
-            *told,
+            *speeds,
             *(f"{item.row.name} is faster, but outside: {item.row.reason}." for item in outside),
         )
     return (
         f"{base.name} was kept: no quantized candidate is faster on this host.{board}",
-        *told,
+        *speeds,
         "In a graph this small the quantize and dequantize steps can cost more than int8 arithmetic saves.",
     )
 

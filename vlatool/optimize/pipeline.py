@@ -193,8 +193,8 @@ def _measured(
     rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
     if plan.profile:
-        foretold = foretold_by_engine(plan.profile, bundles, where)
-        rows = {name: replace(row, measurements=(*row.measurements, *foretold[name])) for name, row in rows.items()}
+        predicted = foretold_by_engine(plan.profile, bundles, where)
+        rows = {name: replace(row, measurements=(*row.measurements, *predicted[name])) for name, row in rows.items()}
     return rows, warnings
 
 

@@ -110,15 +110,15 @@ class Search:
         self._observations = recorded_observations(self.baseline, 256)
         self.budget = budget_of(self.limits, self.baseline.manifest.spec)
 
-    def run(self, given: Mapping[str, StageList]) -> dict[str, StageList]:
+    def run(self, candidates: Mapping[str, StageList]) -> dict[str, StageList]:
         """Try everything; return the finalists that are not among the given candidates, fastest first."""
-        variants = {**given, **variants_for(self.profile, calibrated=bool(self._observations))}
+        variants = {**candidates, **variants_for(self.profile, calibrated=bool(self._observations))}
         self._planned = len(variants) + 2 * ROUNDS
         for name, stages in variants.items():
             self._try(name, stages)
         self._repair()
         chosen = self._finalists()
-        return {trial.name: trial.stages for trial in chosen if trial.name not in given}
+        return {trial.name: trial.stages for trial in chosen if trial.name not in candidates}
 
     def tables(self) -> dict[str, list[dict[str, Any]]]:
         """Return what was tried, and which layers cost the accuracy, as tables of the report."""

@@ -56,9 +56,9 @@ class Timing:
             torch = [source] if source.manifest.source and source.path != baseline.path else []
             return self._timed(bundles, torch)
         own = {name: bundle for name, bundle in bundles.items() if name != base and engine_of(bundle) == ENGINE}
-        rows, told = self._timed({name: bundle for name, bundle in bundles.items() if name not in own})
+        rows, warnings = self._timed({name: bundle for name, bundle in bundles.items() if name not in own})
         theirs, more = self._timed({base: baseline, **own}, engine=ENGINE) if own else ({}, ())
-        return joined(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*told, *more)))
+        return joined(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*warnings, *more)))
 
     def _timed(self, bundles: Mapping[str, Bundle], torch: Sequence[Bundle] = (), engine: str = "") -> Timed:
         """Time bundles in one run, eager torch last; all in one engine where it is named."""
@@ -76,7 +76,9 @@ class Timing:
             own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
             named[base] = replace(named[base], measurements=(*named[base].measurements, own))
         seen = [
-            "; ".join(filter(None, (each.reason, each.remedy))) for each in report.findings if each.effect != "note"
+            "; ".join(filter(None, (finding.reason, finding.remedy)))
+            for finding in report.findings
+            if finding.effect != "note"
         ]
         return named, (*report.warnings, *seen, *(kept if report.created < begun else ()))
 
