@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vlatool.accuracy.outcome import Outcome
-from vlatool.accuracy.paired import compare_success, success_row
+from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.data import observations_for
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
 from vlatool.evaluate import _controls, _episodes

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from vlatool.accuracy.outcome import Outcome
 from vlatool.errors import DataError
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact, paired_drop, wilson
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one episode ended: after ``steps`` control steps."""
+
+    task: str
+    seed: int
+    success: bool
+    steps: int
 
 
 def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:

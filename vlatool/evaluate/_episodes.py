@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool.accuracy.outcome import Outcome
+from vlatool.accuracy.paired import Outcome
 from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, VlatoolError

@@ -27,10 +27,6 @@ class Timed:
     inputs: Inputs | None = None
     pairs: list[Pairs] = field(default_factory=list)
 
-    def log_ratio(self, number: int) -> float:
-        """Return the log ratio of a process, candidate over baseline; measures it when it is the next one."""
-        return self.process(number).log_ratio
-
     def process(self, number: int) -> Pairs:
         """Return what a process found; measures it when it is the next one.
 

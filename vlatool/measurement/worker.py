@@ -95,7 +95,7 @@ def measure(
     gc.freeze()
     canaries: list[float] = []
     wait()
-    before = _usage()
+    before = resource.getrusage(resource.RUSAGE_SELF)
     begun = time.monotonic()
     pace: Pace | None = None
     if job.rate:
@@ -110,7 +110,7 @@ def measure(
         only.blocks, only.starts, pace = [ticked.response_ms], ticked.due_s, ticked.pace()
     else:
         run_interleaved(contestants, job.iterations, 0, tell, job.duration, lambda: canaries.append(canary_ms()))
-    ended, after = time.monotonic(), _usage()
+    ended, after = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF)
     timed()
     return Measured(
         begun_s=begun,
@@ -135,10 +135,12 @@ def opened(path: str, job: LatencyJob) -> Contestant:
         policy = Policy.open(bundle, engine=job.engine, threads=job.threads, seed=0)
         policy.warm_up(1, first_run_s=FIRST_RUN_S)
     elif "factory" in manifest.source:
+        import torch
+
         from vlatool.module.torch_policy import torch_policy
 
         policy = torch_policy(bundle, seed=0)
-        _set_torch_threads(job.threads)
+        torch.set_num_threads(job.threads)  # as many as the engine gets
     else:
         raise BundleError(f"{bundle.path} has nothing to run.")
     stage = str(manifest.made_by.get("stage", "policy")).rpartition(".")[2]
@@ -183,17 +185,6 @@ def _engines(policy: Policy) -> Iterator[GraphEngine]:
             computes_in=getattr(session, "precision", graph.compute or "float32"),
             macs_in=", ".join(f"{kind} {share:.1%}" for kind, share in shares),
         )
-
-
-def _usage() -> resource.struct_rusage:
-    return resource.getrusage(resource.RUSAGE_SELF)
-
-
-def _set_torch_threads(threads: int) -> None:
-    """Give eager torch as many threads as the engine gets."""
-    import torch
-
-    torch.set_num_threads(threads)
 
 
 if __name__ == "__main__":

@@ -156,16 +156,27 @@ def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> 
     row, base = best.row, judged[0].row
     if best is judged[0]:
         return _float32_kept(judged, elsewhere)
-    size = f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
-    accuracy = row.get("success")
-    success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
+    success = f" {_episodes(row)}." if row.get("success") else ""
     why = ""
     if not is_faster(row, base):
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
         why = f" It was chosen because {reason}."
     board = foretold(row, base, elsewhere)
-    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {size}.{why}{success}{board}"
-    return (first, f"{row.reason[:1].upper()}{row.reason[1:]}.")
+    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {_size(row, base)}.{why}{success}{board}"
+    return (first, _reason(row))
+
+
+def _size(row: Row, base: Row) -> str:
+    return f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
+
+
+def _episodes(row: Row) -> str:
+    success = row.get("success")
+    return f"{success.value:.1%} of {success.samples} closed-loop episodes succeed" if success else ""
+
+
+def _reason(row: Row) -> str:
+    return f"{row.reason[:1].upper()}{row.reason[1:]}."
 
 
 def _float32_kept(judged: list[Judged], elsewhere: str) -> tuple[str, ...]:
@@ -199,15 +210,14 @@ def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     times = ratio(row, base, "predicted")
     faster = is_faster(row, base, "predicted")
     speed = f"{times:.2f}x as fast as {base.name}" if faster else f"not faster than {base.name} ({times:.3g}x)"
-    here = f" Measured on this host: its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
-    if accuracy := row.get("success"):
-        here += f", and {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed"
+    here = f" Measured on this host: {_size(row, base)}"
+    here += f", and {_episodes(row)}" if row.get("success") else ""
     overlap = ""
     if faster and reference.low is not None and reference.low < high:
         overlap = f" (whose range, {reference.low:.4g} to {reference.high or reference.value:.4g} ms, overlaps)"
     return (
         f"{row.name} is predicted to need {own.value:.4g} ms ({low:.4g} to {high:.4g}) on {own.where}, "
         f"{speed}{overlap}; not measured there.{here}.",
-        f"{row.reason[:1].upper()}{row.reason[1:]}.",
+        _reason(row),
         "The board's engine does not run on this host: the latencies measured here are ONNX Runtime's on this CPU.",
     )

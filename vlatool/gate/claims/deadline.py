@@ -15,11 +15,9 @@ LEAST, MOST = 10, 60
 def examine(timed: Timed, claim: DeadlineClaim) -> ClaimResult:
     """Examine the percentile; measures further processes until there are calls enough for a bound."""
     while len(timed.pairs) < LEAST:
-        timed.log_ratio(len(timed.pairs))
-    bounded = _percentile(timed, claim)
-    while not bounded.known and len(timed.pairs) < MOST:
-        timed.log_ratio(len(timed.pairs))
-        bounded = _percentile(timed, claim)
+        timed.process(len(timed.pairs))
+    while not (bounded := _percentile(timed, claim)).known and len(timed.pairs) < MOST:
+        timed.process(len(timed.pairs))
     calls = timed.calls("candidate")
     above = proven_above(calls, claim.percent, claim.ms, processes=timed.processes())
     if not bounded.known:
