@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from vlatool.accuracy.outcome import Outcome
-from vlatool.accuracy.paired import compare_success, success_row
+from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.data import observations_for
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
 from vlatool.evaluate import _controls, _episodes
-from vlatool.evaluate._episodes import Job, run_jobs
+from vlatool.evaluate._episodes import EpisodesJob, run_jobs
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.report import Row
 from vlatool.stage.base import Context
@@ -229,7 +228,7 @@ def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
 
 
 def test_jobs_come_back_in_their_order(int8_bundle, policy_template):
-    jobs = [Job("environment.py:make", str(policy_template), task, (2, 1)) for task in ("push", "reach")]
+    jobs = [EpisodesJob("environment.py:make", str(policy_template), task, (2, 1)) for task in ("push", "reach")]
     outcomes = run_jobs(int8_bundle, jobs, "ort_cpu", Context(workers=2))
     assert [(each.task, each.seed) for each in outcomes] == [("push", 2), ("push", 1), ("reach", 2), ("reach", 1)]
 

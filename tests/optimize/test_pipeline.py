@@ -23,7 +23,7 @@ from vlatool.cli import main
 from vlatool.cli._run import exported
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
-from vlatool.optimize.pipeline import make_plan
+from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
 from vlatool.report import Report, read_report
 from vlatool.runtime import load

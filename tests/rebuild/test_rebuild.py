@@ -19,9 +19,9 @@ from vlatool.bundle.bundle import DIGEST, Bundle, digest_of, hash_file, seal
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.optimize.differences import compare_bundles, explain, listed
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.rebuild.differences import compare_bundles, explain, listed
 from vlatool.rebuild.rebuild import Rebuilt, build_record, rebuild, version_changes
 from vlatool.report import Report
 from vlatool.sources import source_stage

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from vlatool.stats.percentiles import (
+    effective_sample_size,
     exceeding,
     floor,
     independent,
@@ -15,7 +16,6 @@ from vlatool.stats.percentiles import (
     midranks,
     percentile,
     proven_above,
-    worth_of,
 )
 
 
@@ -52,7 +52,7 @@ def test_a_percentile_by_hand() -> None:
     found = percentile(calls, 99)
     assert (found.name, found.value) == ("p99", math.ceil(0.99 * 1307))
     assert found.bound == 1302, "five of 1307 may exceed it"
-    assert found.worth == 1307
+    assert found.effective_sample_size == 1307
 
 
 def lognormal(random: np.random.Generator) -> np.ndarray:
@@ -150,10 +150,10 @@ def test_the_bound_holds_where_processes_differ(between: float, percent: float) 
 def test_calls_of_one_process_are_alike_where_processes_differ() -> None:
     random = np.random.default_rng(8)
     alike, places = several(random, 20, 0.0)
-    assert worth_of(alike, 0.9, places) == pytest.approx(3000, rel=0.35)
+    assert effective_sample_size(alike, 0.9, places) == pytest.approx(3000, rel=0.35)
     apart, places = several(random, 20, 0.2)
-    assert worth_of(apart, 0.5, places) < 60
-    assert worth_of(apart, 0.5, None) > worth_of(apart, 0.5, places)
+    assert effective_sample_size(apart, 0.5, places) < 60
+    assert effective_sample_size(apart, 0.5, None) > effective_sample_size(apart, 0.5, places)
     assert intraclass(np.array([1.0, 1.0, 5.0, 5.0]), [0, 0, 1, 1]) == 1.0
     assert intraclass(np.ones(4), [0, 0, 1, 1]) == 0.0
     assert intraclass(np.array([1.0, 5.0, 1.0, 5.0]), [0, 0, 1, 1]) < 0

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vlatool.stats.sequential import LOOKS, Decision, jointly, judged, sequential
+from vlatool.stats.sequential import INTERIM_ANALYSES, Decision, jointly, judged, sequential
 
 Source = Callable[[int], float]
 
@@ -41,9 +41,9 @@ def test_on_the_margin_hardly_anything_is_decided() -> None:
 
 def test_no_more_processes_are_measured_than_needed() -> None:
     decision, ratios = sequential(noisy(0.0, 1), 0.05)
-    assert decision.processes == len(ratios) == LOOKS[0]
+    assert decision.processes == len(ratios) == INTERIM_ANALYSES[0]
     decision, ratios = sequential(noisy(math.log(1.05), 2), 0.05)
-    assert decision.processes == len(ratios) == LOOKS[-1]
+    assert decision.processes == len(ratios) == INTERIM_ANALYSES[-1]
 
 
 def test_a_decision_by_hand() -> None:
@@ -87,10 +87,10 @@ def test_it_says_how_many_processes_would_decide() -> None:
     assert Decision("fail", 1.2, 1.1, 1.3, 0.05, 40, 0.03).wanted == 0
 
 
-@pytest.mark.parametrize("looks", [(), (5,), (20, 10), (10, 10), (8, 20, 40)])
-def test_looks_that_decide_nothing_are_refused(looks: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("interim_analyses", [(), (5,), (20, 10), (10, 10), (8, 20, 40)])
+def test_interim_analyses_that_decide_nothing_are_refused(interim_analyses: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="allowed: ascending numbers from"):
-        sequential(noisy(0, 0), 0.05, looks)
+        sequential(noisy(0, 0), 0.05, interim_analyses)
 
 
 @pytest.mark.parametrize("margin", [-1, -2, math.nan])

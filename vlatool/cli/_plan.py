@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlatool.optimize.pipeline import Plan
+    from vlatool.optimize.plan import Plan
     from vlatool.stage.base import Stage
 
 

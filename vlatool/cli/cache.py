@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli._document import document
+from vlatool.cli._options import Json
 from vlatool.errors import DataError, UsageError, nearest
 from vlatool.files.printable import printable
 
@@ -23,11 +24,10 @@ app = typer.Typer(help="Look at finished stages that are kept, and remove them."
 SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 Place = Annotated[Path | None, typer.Option("--cache", help="the cache; $VLATOOL_CACHE or the user's if unset")]
-AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 
 
 @app.command("size")
-def size(cache: Place = None, as_json: AsJson = False) -> None:
+def size(cache: Place = None, as_json: Json = False) -> None:
     """Say how large the cache is, stage by stage; a recording that stages share is counted once."""
     held = _contents(cache)
     if as_json:
@@ -42,7 +42,7 @@ def size(cache: Place = None, as_json: AsJson = False) -> None:
 
 
 @app.command("list")
-def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
+def list_entries(cache: Place = None, as_json: Json = False) -> None:
     """List what is kept, the least recently used first: age, size of its own, size that it shares, name."""
     held = _contents(cache)
     if as_json:
@@ -63,7 +63,7 @@ def prune(
     everything: Annotated[bool, typer.Option("--all", help="remove all that no running process uses")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be removed, and remove nothing")] = False,
     cache: Place = None,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Remove finished stages, which the next run makes again when it needs them.
 

@@ -18,6 +18,7 @@ from vlatool.cli import _complete
 from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
+from vlatool.cli._options import Force, Json, ReportOutput
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files.edited import refuse_file, write_own
@@ -56,11 +57,11 @@ def run(
         int | None,
         typer.Option(min=0, help="of observations, noise and order; fresh, and told in the report, if unset"),
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    output: ReportOutput = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    force: Force = False,
+    as_json: Json = False,
     raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
 ) -> None:
     """Measure the baseline anew beside the candidate, and exit with 0 (pass), 1 (fail) or 5 (inconclusive).
@@ -99,7 +100,7 @@ def init(
     ),
     candidate: Annotated[Path, typer.Option(help="what a change makes, relative to the repository")] = Path("policy"),
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Json = False,
 ) -> None:
     """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
     from vlatool.gate.files import gate_files

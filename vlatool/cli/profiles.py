@@ -11,6 +11,7 @@ import typer
 
 from vlatool.cli import _complete
 from vlatool.cli._document import document
+from vlatool.cli._options import Json
 
 app = typer.Typer(
     help="Hardware profiles: what a board has and what it allows.", no_args_is_help=True, rich_markup_mode=None
@@ -89,7 +90,7 @@ def validate_profiles(
             help="YAML files, directories of them, or names", show_default=False, autocompletion=_complete.profiles
         ),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Json = False,
 ) -> None:
     """Check profiles against the schema; exit 3 when one is wrong, naming every field that is."""
     from vlatool.errors import ProfileError
@@ -124,7 +125,7 @@ def new_profile(
     ] = "raspberry-pi-5",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; NAME.yaml when not given")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace a file that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Json = False,
 ) -> None:
     """Write a profile of your own to begin with: another one's figures under a new name."""
     from vlatool.hardware.profile import copy_profile
@@ -148,7 +149,7 @@ def calibrate_profile(
     ],
     mode: Annotated[str | None, typer.Option(help="power mode that it ran in; the default one when not given")] = None,
     bundle: Annotated[Path | None, typer.Option(help="what was measured, when the report does not say")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Json = False,
 ) -> None:
     """Tell the latency model what was measured on a board: predictions for it rest on that from now on."""
     from vlatool.boards.measured import calibrations, elsewhere, measured_in, store

@@ -11,6 +11,7 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
+from vlatool.cli._options import Force, Json
 from vlatool.errors import MissingExtra, UsageError, VlatoolError, nearest
 from vlatool.files.writing import writing
 
@@ -19,7 +20,7 @@ app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_
 
 @app.command("list")
 def list_samples(
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Json = False,
 ) -> None:
     """List the shapes that can be made."""
     if as_json:
@@ -41,8 +42,8 @@ def make(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new policy", show_default=False)],
     seed: Annotated[int, typer.Option(min=0, help="seed of weights and data")] = 0,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Write a policy with seeded random weights, for latency and memory work."""
     from vlatool.boards.answer import carry_count

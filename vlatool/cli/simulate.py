@@ -9,12 +9,11 @@ import typer
 from vlatool.cli import _complete
 from vlatool.cli._console import progress
 from vlatool.cli._document import document
+from vlatool.cli._options import BundleOrSource, Json
 
 
 def simulate(
-    source: Annotated[
-        str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
-    ],
+    source: BundleOrSource,
     profile: Annotated[str, typer.Option(help="the board", show_default=False, autocompletion=_complete.profiles)],
     mode: Annotated[str | None, typer.Option(help="power mode; the default one when not given")] = None,
     engine: Annotated[
@@ -24,7 +23,7 @@ def simulate(
     precision: Annotated[
         str, typer.Option(help="precision; as the policy is stored when not given", autocompletion=_complete.precisions)
     ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: Json = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
     from vlatool.boards.answer import simulated, simulation_lines

@@ -12,6 +12,7 @@ import typer
 
 from vlatool.cli._document import document
 from vlatool.errors import DataError, UsageError
+from vlatool.files.messages import to_json
 
 if TYPE_CHECKING:
     from vlatool.telemetry import Recorded
@@ -35,11 +36,10 @@ def telemetry(
         raise DataError(f"There is no directory {root}.")
     with Recorder(open_all(root), period) as recorder:
         time.sleep(seconds)
-    found = recorder.recorded
     if as_json:
-        document(found.to_dict())
+        document(to_json(recorder.recorded))
         return
-    for line in lines(found):
+    for line in lines(recorder.recorded):
         typer.echo(line)
 
 
@@ -55,7 +55,7 @@ def lines(found: Recorded) -> Iterator[str]:
         yield f"  {name}: {gauge.mean:.4g} {gauge.unit}{span}"
     for name, counter in sorted(found.counters.items()):
         yield f"  {name}: +{counter.difference:.4g} {counter.unit} in {counter.seconds:.1f} s"
-    if found.absent:
+    if found.unmeasured:
         yield "unmeasured:"
-    for absent in found.absent:
+    for absent in found.unmeasured:
         yield f"  {absent.reader}: {absent.reason}"

@@ -17,8 +17,8 @@ from vlatool.files.writing import writing
 from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
-from vlatool.optimize.differences import Compared, compare_bundles
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
+from vlatool.rebuild.differences import Compared, compare_bundles
 from vlatool.sources import source_stage
 from vlatool.stage.base import Context, Transform, build_stage, installed_version, source_of, stage_class
 from vlatool.stage.finish import DECIDED, HANDED_OUT, history, reseal

@@ -13,7 +13,7 @@ CONFIDENCE = 1 - 2 * ALPHA
 
 
 @dataclass(frozen=True)
-class Found:
+class ClaimResult:
     """What an examined claim says.
 
     Args:

@@ -1,9 +1,7 @@
-"""What is measured, as it is handed from process to process: plain JSON values."""
+"""What the processes of a benchmark are asked to do."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,8 +27,8 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Job:
-    """A measurement.
+class LatencyJob:
+    """A benchmark of the latency.
 
     Args:
         bundles: Directories; the first is the reference of ratios.
@@ -58,14 +56,34 @@ class Job:
     check: bool = True
     limits: Limits = Limits()
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON values."""
-        found = dataclasses.asdict(self)
-        return {**found, "bundles": list(self.bundles), "limits": {**found["limits"], "cpus": list(self.limits.cpus)}}
 
-    @classmethod
-    def from_dict(cls, found: Mapping[str, Any]) -> Job:
-        """Read what ``to_dict`` wrote."""
-        limits = dict(found.get("limits") or {})
-        limits["cpus"] = tuple(limits.get("cpus", ()))
-        return cls(**{**found, "bundles": tuple(found["bundles"]), "limits": Limits(**limits)})
+@dataclass(frozen=True)
+class WorkerJob:
+    """What the agent asks of the worker.
+
+    Args:
+        job: The benchmark.
+        named: Folders whose code the user lets run (``trust.named_so_far``).
+    """
+
+    job: LatencyJob
+    named: tuple[tuple[Any, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class ColdStartJob:
+    """One cold start.
+
+    Args:
+        bundle: Directory.
+        engine: Of the runtime; that which the bundle was made for when empty.
+        threads: Intra-op threads.
+        begun_ns: When the process was started, on the clock that is the same in every process of a machine.
+        observations: File of observations (``save_drawn``) to infer on after the golden one; none when empty.
+    """
+
+    bundle: str
+    engine: str
+    threads: int
+    begun_ns: int
+    observations: str = ""
