@@ -30,7 +30,7 @@ from vlatool.graph.workload import workload
 from vlatool.hardware.profile import load_profile, names
 from vlatool.latency_model.model import shipped
 from vlatool.machine.host import cache_directory
-from vlatool.render._boards import limit_ms
+from vlatool.render.sections.boards import limit_ms
 from vlatool.stage.base import Context
 
 SAMPLES = Path(__file__).parents[2] / "sample_models"

@@ -46,7 +46,9 @@ NOT_SHARES = re.compile(r"^error|^skill|^variation|(^|_)p(_?value)?$|ratio")
 
 def plain(text: object) -> str:
     """Return text on one line without control characters, so that a name cannot steer a terminal or break a table."""
-    spaced = re.sub(r"[^\S\xa0\u202f]+", " ", str(text))
+    if (shown := str(text)).isprintable() and "  " not in shown:
+        return shown
+    spaced = re.sub(r"[^\S\xa0\u202f]+", " ", shown)
     return "".join(char for char in spaced if unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Co", "Cn"))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from vlatool.render._format import plain
 from vlatool.report import EFFECTS, Finding, Report
 
-MARKS = {"valid": "✅", "suspect": "⚠️", "invalid": "⛔"}
 SENTENCES = {
     "": "",
     "valid": "The measurement is valid.",
@@ -16,23 +15,23 @@ SENTENCES = {
 
 def findings(report: Report) -> list[Finding]:
     """Return what was found, the worst first."""
-    return sorted(report.findings, key=lambda found: -EFFECTS.index(found.effect))
+    return sorted(report.findings, key=lambda finding: -EFFECTS.index(finding.effect))
 
 
 def sentence(report: Report) -> str:
     """Return whether the measurement can be trusted, as a sentence; nothing when nobody judged it."""
-    said = SENTENCES[report.validity]
-    return said.replace("measurement", "comparison") if report.kind == "compare" else said
+    judgement = SENTENCES[report.validity]
+    return judgement.replace("measurement", "comparison") if report.kind == "compare" else judgement
 
 
-def reason(found: Finding) -> str:
+def reason(finding: Finding) -> str:
     """Return the reason as a sentence."""
-    return ended(plain(found.reason))
+    return ended(plain(finding.reason))
 
 
-def remedy(found: Finding) -> str:
+def remedy(finding: Finding) -> str:
     """Return the remedy as a sentence; nothing when there is none."""
-    text = plain(found.remedy).strip()
+    text = plain(finding.remedy).strip()
     return ended(f"Remedy: {text}") if text else ""
 
 

@@ -3,8 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+
+from vlatool.render.charts.svg import series
+from vlatool.report import Report, Row
+
+SERIES_NAME, TIMES = "latency_ms", "at_s"
+MOST = 8
+MARKED = {"p50": 0.5, "p90": 0.9, "p99": 0.99}
+"""The percentiles that are marked on the curve and below the histogram."""
 
 
 def finite(samples: Sequence[float | None]) -> list[float]:
@@ -68,13 +77,13 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
     stretches: list[list[float]] = [[] for _ in range(bins)]
     for moment, sample in zip(times, samples, strict=True):
         stretches[min(bins - 1, int((moment - first) / wide)) if wide > 0 else 0].append(sample)
-    found = []
+    bands = []
     for place, part in enumerate(stretches):
         if part:
             part.sort()
             inner = quantile(part, 0.1), part[len(part) // 2], quantile(part, 0.9)
-            found.append(Band(first + (place + 0.5) * wide, part[0], *inner, part[-1]))
-    return found
+            bands.append(Band(first + (place + 0.5) * wide, part[0], *inner, part[-1]))
+    return bands
 
 
 def sparkline(samples: Sequence[float], bins: int) -> str:
@@ -85,4 +94,62 @@ def sparkline(samples: Sequence[float], bins: int) -> str:
         return "█"
     counts = histogram(ordered, lambda sample: (sample - low) / (high - low), bins)
     peak = max(counts)
-    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * found / peak)] for found in counts)
+    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * count / peak)] for count in counts)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The latency samples of one variant.
+
+    Args:
+        name, css: The variant and the class of its colour.
+        samples: In ms, as they came.
+        ordered: The same, ascending.
+        known: Share -> the percentile that the report has.
+        times: When each call began, in seconds since the start of the run; empty when that is not known.
+    """
+
+    name: str
+    css: str
+    samples: list[float]
+    ordered: list[float]
+    known: Mapping[float, float]
+    times: list[float]
+
+    @property
+    def marks(self) -> dict[str, float]:
+        """The percentiles that are marked, name -> share: those that the report has, all where it has none."""
+        return {name: share for name, share in MARKED.items() if share in self.known or not self.known}
+
+    def at(self, share: float) -> float:
+        """Return a quantile in ms; the reported one where the report has it."""
+        return self.known.get(share) or quantile(self.ordered, share)
+
+
+def left_out(report: Report) -> str:
+    """Return a sentence about the variants for which the charts have no room."""
+    more = sum(len(finite(row.raw.get(SERIES_NAME) or [])) > 1 for row in report.rows) - MOST
+    return f"Only the first {MOST} variants are drawn; {more} more in the tables." if more > 0 else ""
+
+
+def sampled(report: Report) -> list[Sampled]:
+    """Return the variants that kept latency samples, the first eight at most."""
+    variants: list[Sampled] = []
+    for row, css in zip(report.rows, series(report.rows), strict=True):
+        samples, times = _series(row)
+        if len(samples) > 1 and len(variants) < MOST:
+            reported = {share: row.value(f"latency_{name}") for name, share in MARKED.items()}
+            known = {share: value for share, value in reported.items() if math.isfinite(value)}
+            variants.append(Sampled(row.name, css, samples, sorted(samples), known, times))
+    return variants
+
+
+def _series(row: Row) -> tuple[list[float], list[float]]:
+    """Return the samples, and when each call began; no times unless all are known and time went on."""
+    samples, times = row.raw.get(SERIES_NAME) or [], row.raw.get(TIMES) or []
+    if len(times) != len(samples):
+        return finite(samples), []
+    kept = [time for time, sample in zip(times, samples, strict=True) if finite([sample])]
+    known = finite(kept)
+    going = len(known) == len(kept) > 1 and 0 <= known[0] < known[-1] and all(a <= b for a, b in pairwise(known))
+    return finite(samples), known if going else []

@@ -6,7 +6,7 @@ Each reason not to trust the measurement is one more: a warning where it is susp
 from __future__ import annotations
 
 from vlatool.render._trust import findings, reason, remedy, sentence
-from vlatool.render.junit import cases_of
+from vlatool.render.formats.junit import cases_of
 from vlatool.report import Report
 
 COMMANDS = {"fail": "error", "inconclusive": "warning", "invalid": "error", "suspect": "warning"}

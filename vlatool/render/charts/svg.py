@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -135,7 +135,7 @@ class Canvas:
         """Add text; ``anchor`` is ``start``, ``middle`` or ``end``."""
         where = f'x="{_attribute(x)}" y="{_attribute(y)}"'
         side = "" if anchor == "start" else f' text-anchor="{anchor}"'
-        style = f' class="{css}"' if css else ""
+        style = f' class="{_attribute(css)}"' if css else ""
         self._parts.append(f"<text {where}{side}{style}>{escape(plain(content))}</text>")
 
     def steps(self, points: Sequence[tuple[float, float]], css: str, tip: str = "") -> None:
@@ -156,10 +156,21 @@ class Canvas:
             self.text(axis(value), y + 15, tick(value), "tick", "middle")
         self.line(axis.start, y, axis.end, y, "axis")
 
+    def up(self, axis: Axis, left: float, right: float, ticks: Mapping[float, str]) -> None:
+        """Add the ticks of a vertical axis, value -> text, with grid lines from ``left`` to ``right``."""
+        for value, text in ticks.items():
+            self.line(left, axis(value), right, axis(value), "grid")
+            self.text(left - 6, axis(value) + 4, text, "tick", "end")
+
+    def heading(self, y: float, right: float, name: str, numbers: str, css: str) -> None:
+        """Add a name on the left, cut where it would reach the numbers that stand on the right."""
+        self.text(0, y, shorten(name, self.width - len(numbers) * 6.2 - 20), css)
+        self.text(right, y, numbers, "tick halo", "end")
+
     def svg(self) -> str:
         """Return the drawing."""
         return "\n".join([*self._parts, "</svg>"])
 
 
 def _attribute(value: str | float) -> str:
-    return escape(value) if isinstance(value, str) else f"{value:.1f}".removesuffix(".0")
+    return escape(plain(value)) if isinstance(value, str) else f"{value:.1f}".removesuffix(".0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from vlatool.render._svg import CHARACTER, Canvas, shorten
+from vlatool.render.charts.svg import CHARACTER, Canvas, shorten
 
 Box = tuple[float, float, float, float]
 WIDE = CHARACTER + 0.9

@@ -1,0 +1,279 @@
+"""A report as a document: a head, then sections of blocks. Built once; a format draws the kinds of blocks, and no more.
+
+A section is one file in ``vlatool/render/sections/`` with one public class, or what another package names in the
+entry point group ``vlatool.sections``: ``build(report)`` returns the sections that the report has something for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from vlatool import registry
+from vlatool.render import _trust
+from vlatool.render._columns import Sides, sides
+from vlatool.render._format import limit
+from vlatool.render.charts.svg import Canvas
+from vlatool.report import Report
+
+ABSENT = "–"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar below a number, or in a column of its own.
+
+    Args:
+        value: Share of the width, 0-1.
+        css: Class of the colour.
+        low, high: Interval, as shares.
+        limit: Where the limit is, as a share.
+    """
+
+    value: float
+    css: str = ""
+    low: float | None = None
+    high: float | None = None
+    limit: float | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table.
+
+    Args:
+        text: The number with its unit, or any text.
+        interval, count: What qualifies the number, each with its sign: ``97.4–99.0``, ``n = 1000``.
+        note: Why there is no number, or where it is from.
+        known: False where a number is missing.
+        tail: A further number that a page alone has room for.
+        bar: Drawn on a page.
+        css: Class of the colour of the variant that the cell names.
+    """
+
+    text: str = ""
+    interval: str = ""
+    count: str = ""
+    note: str = ""
+    known: bool = True
+    tail: str = ""
+    bar: Bar | None = None
+    css: str = ""
+
+    @property
+    def aside(self) -> list[str]:
+        """What stands in brackets behind the number."""
+        return [part for part in (self.interval, self.count) if part]
+
+
+MISSING = Cell(ABSENT, known=False)
+
+
+@dataclass(frozen=True)
+class Column:
+    """The head of a column.
+
+    Args:
+        title: In words; the first column names the lines.
+        numeric: Whether it is aligned right.
+        css: Class of the colour of the variant whose numbers these are.
+        bars: Whether bars stand below its numbers.
+        minor: Left out on a phone.
+    """
+
+    title: str
+    numeric: bool = True
+    css: str = ""
+    bars: bool = False
+    minor: bool = False
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a table, and why it is as it is.
+
+    Args:
+        cells: As many as there are columns.
+        role, note: What the line stands for (``chosen``) and why, shown below it.
+        best: Whether to point it out.
+    """
+
+    cells: tuple[Cell, ...]
+    role: str = ""
+    note: str = ""
+    best: bool = False
+
+    @property
+    def remark(self) -> str:
+        """Role and note with the name of the line; empty when there is neither."""
+        name = f"{self.cells[0].text}, {self.role}" if self.role else self.cells[0].text
+        return f"{name}: {self.note}" if self.note else name if self.role else ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; blanks in the first column mean the text above.
+
+    Args:
+        columns: Heads.
+        lines: Rows; formats cut long tables and say so.
+        title: Above the table, when the section's own does not say it.
+        beside: Title of the intervals, which then stand beside their numbers instead of below.
+        style: How a page draws it: ``cards`` (a card for each line on a phone), ``percentiles``, ``small``, ``groups``,
+            ``parts``.
+    """
+
+    columns: tuple[Column, ...]
+    lines: tuple[Line, ...]
+    title: str = ""
+    beside: str = ""
+    style: str = ""
+
+    def worded(self) -> list[int]:
+        """Return the places of the columns that say something without bars."""
+        return [
+            place
+            for place, column in enumerate(self.columns)
+            if not place or column.title or any(line.cells[place].text for line in self.lines)
+        ]
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Notes:
+    """A list of sentences, under a title of its own when it has one; ``warning`` makes them stand out."""
+
+    lines: tuple[str, ...]
+    title: str = ""
+    warning: bool = False
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Names and what they are."""
+
+    pairs: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Code:
+    """A command, as it would be typed."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A drawing, and what stands in its place where only text can be shown.
+
+    Args:
+        draw: Draws it at a width in pixels.
+        caption: How to read it; shown with the drawing.
+        alternative: A table in its place; None leaves the chart out.
+    """
+
+    draw: Callable[[int], Canvas]
+    caption: str
+    alternative: Table | None = None
+
+
+Block = Text | Table | Notes | Pairs | Code | Chart
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the document.
+
+    Args:
+        title: Heading.
+        blocks: What it shows, in order.
+        order: Sections stand in the order of this number: 10 predictions for a board, 20 variants, 90 further numbers,
+            100 details, 130 environment.
+        origin: ``measured``, ``predicted``, or empty for what is no number.
+        where: The origin in words: ``Measured on this host: Cortex-A76``.
+        about: A sentence or more on how to read it.
+        brief: Whether a brief terminal report has it.
+        folded: Whether Markdown folds it.
+        anchor: Name for links to it.
+    """
+
+    title: str
+    blocks: tuple[Block, ...]
+    order: int
+    origin: str = ""
+    where: str = ""
+    about: str = ""
+    brief: bool = True
+    folded: bool = False
+    anchor: str = ""
+
+    def __post_init__(self) -> None:
+        if self.origin not in ("", "measured", "predicted"):
+            raise ValueError(f"origin is {self.origin!r}; allowed: measured, predicted, or nothing")
+
+    def as_text(self) -> Section | None:
+        """Return the section with alternatives in place of its drawings; None when nothing is left."""
+        texts = [block.alternative if isinstance(block, Chart) else block for block in self.blocks]
+        blocks = tuple(block for block in texts if block is not None)
+        return replace(self, blocks=blocks) if blocks else None
+
+
+class Builder(Protocol):
+    """What a file of ``sections`` defines."""
+
+    def build(self, report: Report) -> Iterable[Section]:
+        """Return the sections that the report has something for."""
+        ...
+
+
+@dataclass(frozen=True)
+class Document:
+    """A report, ready to be drawn.
+
+    Args:
+        report: Kind, title, verdict, time and command.
+        result: The first sentence.
+        sentences: The others of the summary.
+        trust: Whether the measurement can be trusted, in a sentence.
+        reasons: (effect, reason, remedy) of each finding.
+        limits: (name, value) of what was asked for.
+        sides: What was measured here beside what is predicted for the board.
+        sections: In order.
+    """
+
+    report: Report
+    result: str
+    sentences: tuple[str, ...]
+    trust: str
+    reasons: tuple[tuple[str, str, str], ...]
+    limits: tuple[tuple[str, str], ...]
+    sides: Sides | None
+    sections: tuple[Section, ...]
+
+    @property
+    def as_text(self) -> list[Section]:
+        """The sections with alternatives in place of drawings."""
+        return [text for section in self.sections if (text := section.as_text())]
+
+
+def build(report: Report) -> Document:
+    """Return the document of a report."""
+    builders: list[Builder] = [registry.load("sections", name)() for name in registry.names("sections")]
+    first, *more = report.summary or (report.title,)
+    return Document(
+        report,
+        first,
+        tuple(more),
+        _trust.sentence(report),
+        tuple((item.effect, _trust.reason(item), _trust.remedy(item)) for item in _trust.findings(report)),
+        tuple(limit(name, value) for name, value in report.limits.items()),
+        sides(report),
+        tuple(sorted((part for one in builders for part in one.build(report)), key=lambda part: part.order)),
+    )

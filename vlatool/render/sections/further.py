@@ -1,0 +1,34 @@
+"""The measured numbers that stand nowhere else, how they were had, and what could not be had."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from vlatool.render._cells import matrix, remarks
+from vlatool.render._view import (
+    measured_where,
+    other_names,
+    percentile_names,
+    ranks_boards,
+    unmeasured,
+)
+from vlatool.render.document import Block, Notes, Section
+from vlatool.report import Report
+
+
+class Further:
+    """Everything else that was measured."""
+
+    def build(self, report: Report) -> Iterator[Section]:
+        """Return the table, the methods, and the reasons for what is missing."""
+        if ranks_boards(report):
+            return
+        shown = other_names(report)
+        blocks: list[Block] = [matrix(report, shown, "measured")] if shown else []
+        blocks += remarks(report, "measured", "Methods")
+        if missing := unmeasured(report, percentile_names(report)):
+            blocks.append(Notes(tuple(missing), "Unmeasured"))
+        if blocks:
+            where = measured_where(report)
+            title = "Further measurements and methods"
+            yield Section(title, tuple(blocks), 90, "measured", where, brief=False, folded=True)

@@ -1,0 +1,89 @@
+"""The percentiles of the latency: a percentile a line, a value and its bound for each variant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from vlatool.render._format import count, decimals_of, fixed, interval, number, plain
+from vlatool.render._view import measured_where, percentile_names
+from vlatool.render.charts.svg import series
+from vlatool.render.document import ABSENT, Cell, Column, Line, Notes, Section, Table
+from vlatool.report import Measurement, Report, Row
+
+
+class Percentiles:
+    """A table, when there are percentiles enough for one."""
+
+    def build(self, report: Report) -> Iterator[Section]:
+        """Return the table, and below it why a percentile could not be had."""
+        shown = percentile_names(report)
+        tints = dict(zip((row.name for row in report.rows), series(report.rows), strict=True))
+        rows = [row for row in report.rows if any(row.get(name) for name in shown)]
+        if not shown or not rows:
+            return
+        items = {name: [row.get(name) for row in rows] for name in shown}
+        digits = [_decimals([row.get(name) for name in shown]) for row in rows]
+        lines = tuple(Line((Cell(_short(name)), *map(_cell, items[name], digits))) for name in shown)
+        beside = _title([item for line in items.values() for item in line if item is not None and item.known])
+        bounded = any(cell.interval for line in lines for cell in line.cells)
+        heads = (Column("latency, ms", False), *(Column(plain(row.name), css=tints[row.name]) for row in rows))
+        table = Table(heads, lines, beside=beside if bounded else "", style="percentiles")
+        reasons = tuple(line for name in shown for line in _reasons(name, rows))
+        yield Section(
+            "Latency percentiles",
+            (table, Notes(reasons)) if reasons else (table,),
+            30,
+            "measured",
+            measured_where(report),
+            _calls(report, rows, shown),
+            brief=len(rows) == 1,
+        )
+
+
+def _short(name: str) -> str:
+    return name.removeprefix("latency_")
+
+
+def _decimals(items: Sequence[Measurement | None]) -> int:
+    """Return the decimals of a variant's column: three digits of its smallest number."""
+    values = [item.value for item in items if item is not None and math.isfinite(item.value) and item.value > 0]
+    return min(6, decimals_of(min(values))) if values else 0
+
+
+def _cell(item: Measurement | None, decimals: int) -> Cell:
+    if item is None or not item.known:
+        return Cell(ABSENT, known=False)
+    bound = f"≤ {fixed(item.high, decimals)}" if item.low is None and item.high is not None else interval(item)
+    return Cell(fixed(item.value, decimals), bound)
+
+
+def _title(items: Sequence[Measurement]) -> str:
+    bounded = [item for item in items if item.low is not None or item.high is not None]
+    covers = {item.confidence for item in bounded}
+    cover = f" ({number(covers.pop() * 100)} %)" if len(covers) == 1 else ""
+    return ("at most" if all(item.low is None for item in bounded) else "interval") + cover
+
+
+def _reasons(name: str, rows: Sequence[Row]) -> list[str]:
+    """Return why a percentile could not be had; variants are named unless it holds for all."""
+    whose: dict[str, list[str]] = {}
+    for row in rows:
+        item = row.get(name)
+        if item is not None and not item.known and item.note:
+            whose.setdefault(plain(item.note), []).append(plain(row.name))
+    names = {note: [] if len(variants) == len(rows) else variants for note, variants in whose.items()}
+    return [f"{', '.join([_short(name), *variants])}: {note}" for note, variants in names.items()]
+
+
+def _calls(report: Report, rows: Sequence[Row], shown: Sequence[str]) -> str:
+    """Return the number of calls, or of ticks of a control loop, in a sentence."""
+    what = "ticks" if report.kind == "benchmark" and "hz" in report.limits else "calls"
+    counts = {
+        plain(row.name): count(max(item.samples for name in shown if (item := row.get(name)))).removeprefix("n = ")
+        for row in rows
+    }
+    if len(set(counts.values())) == 1:
+        return f"{next(iter(counts.values()))} {what}{' each' if len(rows) > 1 else ''}."
+    told = [f"{name} {number}" for name, number in counts.items() if number]
+    return f"{what.capitalize()}: {', '.join(told)}." if told else ""
