@@ -102,7 +102,7 @@ def test_percentiles_of_one_variant_are_one_table() -> None:
 def test_percentiles_of_two_variants_stand_side_by_side() -> None:
     text = render(sustained(2), "terminal")
     assert re.search(r"^p50 +4\d\.\d  ≤ 4\d\.\d +1\d\.\d  ≤ 1\d\.\d$", text, re.M)
-    assert "≤: at most (99 %)." in text
+    assert "Beside each number: at most (99 %)." in text
     assert "300 calls each." in text
 
 

@@ -17,20 +17,10 @@ ROLES = {"subject": "measured", "within": "within limits", "outside": "outside l
 ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
 PERCENTILES = ("latency_p50", "latency_p90", "latency_p95", "latency_p99", "latency_p99.9", "latency_max")
 ORDER = (
-    *(
-        "speedup",
-        "throughput",
-        "jitter",
-        "deadline_misses",
-        "age_p50",
-        "age_p99",
-        "age_max",
-        "wakeup_p50",
-        "wakeup_p99",
-    ),
-    *("latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu"),
-    *("size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max"),
-)
+    "speedup", "throughput", "jitter", "deadline_misses", "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99",
+    "latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu",
+    "size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max",
+)  # fmt: skip
 """The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
 ABSENT = "unmeasured"
 """The details table that says what could not be had; shown with the numbers that are NaN."""
@@ -41,16 +31,11 @@ SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memo
 
 @dataclass(frozen=True)
 class Latency:
-    """The latency that a chart shows, and the limit on it when one was asked for."""
+    """The latency that a chart shows, the limit on it when one was asked for, and what a drawing calls that."""
 
     name: str
     limit: float | None
-    limit_name: str = ""
-
-    @property
-    def word(self) -> str:
-        """What the limit is called in a drawing."""
-        return "deadline" if "deadline" in self.limit_name else "limit"
+    word: str = "limit"
 
 
 def ranks_boards(report: Report) -> bool:
@@ -203,7 +188,7 @@ def latency(report: Report) -> Latency:
             percentile = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
             limited = f"latency_{percentile[0]}" if percentile else "latency_p50"
             if limited in present:
-                return Latency(limited, float(limit), plain(name))
+                return Latency(limited, float(limit), "deadline" if "deadline" in name else "limit")
     rate = report.limits.get("hz")
     if report.kind in ("benchmark", "compare") and _is_number(rate) and rate > 0:
         return Latency("latency_p50", 1e3 / rate, "deadline")

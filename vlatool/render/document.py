@@ -218,12 +218,6 @@ class Section:
         if self.origin not in ("", "measured", "predicted"):
             raise ValueError(f"origin is {self.origin!r}; allowed: measured, predicted, or nothing")
 
-    def as_text(self) -> Section | None:
-        """Return the section with alternatives in place of its drawings; None when nothing is left."""
-        texts = [block.alternative if isinstance(block, Chart) else block for block in self.blocks]
-        blocks = tuple(block for block in texts if block is not None)
-        return replace(self, blocks=blocks) if blocks else None
-
 
 class Builder(Protocol):
     """What a file of ``sections`` defines."""
@@ -259,8 +253,12 @@ class Document:
 
     @property
     def as_text(self) -> list[Section]:
-        """The sections with alternatives in place of drawings."""
-        return [text for section in self.sections if (text := section.as_text())]
+        """The sections with tables in place of drawings, less those of which nothing is left."""
+        texts = []
+        for section in self.sections:
+            blocks = (block.alternative if isinstance(block, Chart) else block for block in section.blocks)
+            texts.append(replace(section, blocks=tuple(block for block in blocks if block is not None)))
+        return [section for section in texts if section.blocks]
 
 
 def build(report: Report) -> Document:

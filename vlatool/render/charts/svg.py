@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -40,11 +41,8 @@ class Axis:
 
     def ticks(self, most: int = 6) -> list[float]:
         """Return round numbers inside the axis."""
-        if self.log:
-            found = _log_ticks(self.low, self.high, most)
-            if len(found) >= 2:
-                return found
-        return _linear_ticks(self.low, self.high, most)
+        rounded = _log_ticks(self.low, self.high, most) if self.log else []
+        return rounded if len(rounded) >= 2 else _linear_ticks(self.low, self.high, most)
 
 
 def _linear_ticks(low: float, high: float, most: int) -> list[float]:
@@ -59,8 +57,8 @@ def _linear_ticks(low: float, high: float, most: int) -> list[float]:
 def _log_ticks(low: float, high: float, most: int) -> list[float]:
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for factors in ((1, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,)):
-        found = [factor * 10.0**decade for decade in decades for factor in factors]
-        inside = [float(f"{value:.10g}") for value in found if low <= value <= high]
+        rounded = (factor * 10.0**decade for decade in decades for factor in factors)
+        inside = [float(f"{value:.10g}") for value in rounded if low <= value <= high]
         if len(inside) <= most:
             return inside
     return inside
@@ -68,8 +66,8 @@ def _log_ticks(low: float, high: float, most: int) -> list[float]:
 
 def axis_for(values: Iterable[float], start: float, end: float, *, zero: bool = False, pad: float = 0.06) -> Axis:
     """Return an axis that holds the values, logarithmic when they are positive and span more than a factor of 8."""
-    found = list(values)
-    low, high = min(found), max(found)
+    numbers = list(values)
+    low, high = min(numbers), max(numbers)
     if low > 0 and high / low > 8:
         grow = (high / low) ** pad
         return Axis(low / grow, high * grow, start, end, log=True)
@@ -80,18 +78,11 @@ def axis_for(values: Iterable[float], start: float, end: float, *, zero: bool = 
 
 def series(rows: Sequence[Row]) -> list[str]:
     """Return the class of each row's colour: the baseline is grey, the chosen one (or the only one) blue."""
-    others_of = [row for row in rows if row.role != "baseline"]
-    if len(others_of) == 1:
-        return ["s-base" if row.role == "baseline" else "s-chosen" for row in rows]
-    found = []
-    others = 0
-    for row in rows:
-        if row.role in ("baseline", "chosen"):
-            found.append("s-base" if row.role == "baseline" else "s-chosen")
-        else:
-            found.append(f"s{others % SERIES}")
-            others += 1
-    return found
+    named = {"baseline": "s-base", "chosen": "s-chosen"}
+    if sum(row.role != "baseline" for row in rows) == 1:
+        return [named.get(row.role, "s-chosen") for row in rows]
+    others = (f"s{place % SERIES}" for place in itertools.count())
+    return [named.get(row.role) or next(others) for row in rows]
 
 
 def shorten(text: str, width: float) -> str:
@@ -115,17 +106,17 @@ class Canvas:
         self._parts = [
             f'<svg role="img" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
             f'aria-labelledby="{key}-t {key}-d" class="chart">',
-            f'<title id="{key}-t">{escape(plain(title))}</title>',
-            f'<desc id="{key}-d">{escape(plain(description))}</desc>',
+            f'<title id="{key}-t">{_safe(title)}</title>',
+            f'<desc id="{key}-d">{_safe(description)}</desc>',
         ]
 
-    def add(self, tag: str, css: str = "", tip: str = "", **attributes: str | float) -> None:
-        """Add a shape; ``tip`` is shown when the pointer rests on it."""
-        if css:
-            attributes = {"class": css, **attributes}
-        words = [tag, *(f'{key.replace("_", "-")}="{_attribute(value)}"' for key, value in attributes.items())]
-        inner = f"><title>{escape(plain(tip))}</title></{tag}>" if tip else "/>"
-        self._parts.append(f"<{' '.join(words)}{inner}")
+    def add(self, tag: str, css: str = "", tip: str = "", inner: str = "", **attributes: str | float) -> None:
+        """Add a shape, or the text ``inner``; ``tip`` is shown when the pointer rests on it."""
+        names = {**attributes, "class": css} if css else attributes
+        words = [tag, *(f'{key.replace("_", "-")}="{_safe(value)}"' for key, value in names.items())]
+        title = f"<title>{_safe(tip)}</title>" if tip else ""
+        end = f">{title}{_safe(inner)}</{tag}>" if tip or inner else "/>"
+        self._parts.append(f"<{' '.join(words)}{end}")
 
     def line(self, x1: float, y1: float, x2: float, y2: float, css: str) -> None:
         """Add a straight line."""
@@ -133,10 +124,8 @@ class Canvas:
 
     def text(self, x: float, y: float, content: str, css: str = "", anchor: str = "start") -> None:
         """Add text; ``anchor`` is ``start``, ``middle`` or ``end``."""
-        where = f'x="{_attribute(x)}" y="{_attribute(y)}"'
-        side = "" if anchor == "start" else f' text-anchor="{anchor}"'
-        style = f' class="{_attribute(css)}"' if css else ""
-        self._parts.append(f"<text {where}{side}{style}>{escape(plain(content))}</text>")
+        side = {} if anchor == "start" else {"text_anchor": anchor}
+        self.add("text", css, x=x, y=y, **side, inner=content)
 
     def steps(self, points: Sequence[tuple[float, float]], css: str, tip: str = "") -> None:
         """Add a line that goes across, then up or down, to each point."""
@@ -172,5 +161,5 @@ class Canvas:
         return "\n".join([*self._parts, "</svg>"])
 
 
-def _attribute(value: str | float) -> str:
+def _safe(value: str | float) -> str:
     return escape(plain(value)) if isinstance(value, str) else f"{value:.1f}".removesuffix(".0")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -34,26 +33,21 @@ def gauges(report: Report) -> list[Gauge]:
     """Return what was read of the machine, each once: temperatures, clocks, power, the rest."""
     tables = [record for row in report.rows for record in row.details.get("telemetry", ())]
     units = {str(record.get("reading")): str(record.get("unit", "")) for record in tables}
-    found: list[tuple[str, Gauge]] = []
+    shown: list[tuple[str, Gauge]] = []
     for row in report.rows:
-        for name in row.raw:
-            at = row.raw.get(f"{name}.{TIMES}")
-            if not name.startswith(GAUGE) or not at or len(at) != len(row.raw[name]):
+        for name, values in row.raw.items():
+            times = row.raw.get(f"{name}.{TIMES}") or []
+            if not name.startswith(GAUGE) or len(times) != len(values):
                 continue
-            pairs = sorted(pair for pair in zip(at, row.raw[name], strict=True) if all(map(_number, pair)))
+            pairs = sorted(pair for pair in zip(times, values, strict=True) if len(finite(pair)) == 2)
             reading = name.removeprefix(GAUGE)
             gauge = Gauge(reading, units.get(reading, ""), [pair[0] for pair in pairs], [pair[1] for pair in pairs])
-            if len(pairs) > 1 and all(gauge != other for _, other in found):
-                found.append((row.name, gauge))
-    readings = [gauge.name for _, gauge in found]
-    named = [
-        replace(gauge, name=f"{gauge.name}, {row}") if readings.count(gauge.name) > 1 else gauge for row, gauge in found
-    ]
+            if len(pairs) > 1 and all(gauge != other for _, other in shown):
+                shown.append((row.name, gauge))
+    readings = [gauge.name for _, gauge in shown]
+    several = {name for name in readings if readings.count(name) > 1}
+    named = (replace(gauge, name=f"{gauge.name}, {row}") if gauge.name in several else gauge for row, gauge in shown)
     return sorted(named, key=_kind)
-
-
-def _number(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
 
 
 def _kind(gauge: Gauge) -> int:

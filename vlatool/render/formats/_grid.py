@@ -6,35 +6,35 @@ from collections.abc import Sequence
 
 from rich.cells import cell_len, set_cell_size
 
-HEAD = -1
+from vlatool.render.document import Line, Table
 
 
-def grid(
-    heads: Sequence[str], body: Sequence[Sequence[str]], width: int, numeric: Sequence[bool] | None = None
-) -> list[tuple[int, str]]:
-    """Return (index of the row in ``body``, or ``HEAD``; the line) for each line of the table.
+def grid(table: Table, width: int) -> list[tuple[Line | None, str]]:
+    """Return (the line of the table that is shown, or None; its text) for each line of text.
 
     Args:
-        heads: Column titles; the first column names the rows and is repeated when the table is split.
-        body: Cells by row; a row of which nothing but blanks would be shown is left out.
+        table: Its first column names the lines and is repeated when the table is split; a line of which nothing but
+            blanks would be shown is left out.
         width: Columns that no line exceeds.
-        numeric: Which columns to align right; all but the first when None.
     """
-    right = list(numeric) if numeric is not None else [False] + [True] * (len(heads) - 1)
-    wide = [max(cell_len(row[index]) for row in (heads, *body)) for index in range(len(heads))]
+    heads = [column.title for column in table.columns]
+    body = [[cell.text for cell in line.cells] for line in table.lines]
+    wide = [max(map(cell_len, column)) for column in zip(heads, *body, strict=True)]
     wide[0] = min(wide[0], max(12, int(width * 0.4)))
     gap = 2 if sum(wide) + 2 * len(wide) - 2 <= width else 1
     wide = [wide[0], *(min(size, width - gap - wide[0]) for size in wide[1:])]
-    lines: list[tuple[int, str]] = []
+    lines: list[tuple[Line | None, str]] = []
     for columns in _chunks(wide, width, gap):
-        if lines:
-            lines.append((HEAD, ""))
         shown = [0, *columns]
-        lines.append((HEAD, _line(heads, shown, wide, right, gap)))
-        lines.append((HEAD, "─" * (sum(wide[index] for index in shown) + gap * len(columns))))
-        for number, row in enumerate(body):
-            if any(row[index].strip() for index in shown):
-                lines.append((number, _line(row, shown, wide, right, gap)))
+
+        def text(row: Sequence[str], shown: Sequence[int] = shown) -> str:
+            cells = (_fit(row[index], wide[index], table.columns[index].numeric) for index in shown)
+            return (" " * gap).join(cells).rstrip()
+
+        rule = "─" * (sum(wide[index] for index in shown) + gap * len(columns))
+        lines += [*([(None, "")] if lines else []), (None, text(heads)), (None, rule)]
+        rows = zip(table.lines, body, strict=True)
+        lines += [(line, text(row)) for line, row in rows if any(row[index].strip() for index in shown)]
     return lines
 
 
@@ -48,10 +48,6 @@ def _chunks(wide: Sequence[int], width: int, gap: int) -> list[list[int]]:
         chunks[-1].append(index)
         used += gap + wide[index]
     return [chunk for chunk in chunks if chunk] or [[]]
-
-
-def _line(row: Sequence[str], shown: Sequence[int], wide: Sequence[int], right: Sequence[bool], gap: int) -> str:
-    return (" " * gap).join(_fit(row[index], wide[index], right[index]) for index in shown).rstrip()
 
 
 def _fit(text: str, width: int, right: bool) -> str:

@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.text import Text as Words
 
 from vlatool.render._format import plain
-from vlatool.render.document import Block, Code, Document, Notes, Pairs, Section, Table, Text, build
+from vlatool.render.document import Block, Code, Document, Line, Notes, Pairs, Section, Table, Text, build
 from vlatool.render.formats._grid import grid
-from vlatool.render.formats._layout import layout
+from vlatool.render.formats._layout import SHARED, layout
 from vlatool.report import Report
 
 STYLES = {"pass": "bold green", "fail": "bold red", "inconclusive": "bold yellow", "info": "bold cyan"}
@@ -108,10 +108,9 @@ class TerminalRenderer:
         return [Words(), *self._wrapped(title, style=HEADING)] if title else []
 
     def _table(self, table: Table) -> list[Words]:
-        drawn = layout(table, MOST_LINES)
-        text = grid(drawn.heads, drawn.body, self.width, drawn.numeric)
-        lines = [Words(line, drawn.styles.get(row, "")) for row, line in text]
-        lines += self._wrapped(drawn.legend, style="dim")
+        lines = [Words(text, _style(line)) for line, text in grid(layout(table, MOST_LINES), self.width)]
+        if table.beside and len(table.columns) > 2:
+            lines += self._wrapped(f"Beside each number: {table.beside}.", style="dim")
         if len(table.lines) > MOST_LINES:
             lines.append(Words(f"… {len(table.lines) - MOST_LINES} more rows in report.json", "dim"))
         remarks = [(line.remark, "green" if line.best else "") for line in table.lines if line.remark]
@@ -130,3 +129,9 @@ class TerminalRenderer:
         rest = Words((first + text)[len(head.plain) :].lstrip())
         lines = list(rest.wrap(self._console, self.width - len(indent))) if rest.plain else []
         return [Words(line.rstrip(), style) for line in (head.plain, *(indent + line.plain for line in lines))]
+
+
+def _style(line: Line | None) -> str:
+    if line is None:
+        return ""
+    return "dim" if line.role == SHARED else "bold green" if line.best else ""

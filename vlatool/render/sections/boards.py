@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from vlatool.render._cells import texts
 from vlatool.render._format import number, plain
 from vlatool.render._view import ranks_boards
+from vlatool.render.cells import texts
 from vlatool.render.charts.scatter import Bound, Point, Scatter
 from vlatool.render.document import ABSENT, Chart, Column, Line, Section, Table
 from vlatool.report import Measurement, Report, Row

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._cells import bars, number
 from vlatool.render._format import label, plain
 from vlatool.render._view import error_groups, measured_where
+from vlatool.render.cells import bars, number
 from vlatool.render.charts.svg import series
 from vlatool.render.document import Cell, Column, Line, Section, Table
 from vlatool.report import Report

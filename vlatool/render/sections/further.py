@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._cells import matrix, remarks
 from vlatool.render._view import (
     measured_where,
     other_names,
@@ -12,6 +11,7 @@ from vlatool.render._view import (
     ranks_boards,
     unmeasured,
 )
+from vlatool.render.cells import matrix, remarks
 from vlatool.render.document import Block, Notes, Section
 from vlatool.report import Report
 

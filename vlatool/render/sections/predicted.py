@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._cells import matrix, remarks
 from vlatool.render._columns import board
 from vlatool.render._format import plain
 from vlatool.render._view import brackets, names, places, ranks_boards
+from vlatool.render.cells import matrix, remarks
 from vlatool.render.document import Section
 from vlatool.report import Report
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from vlatool.render._cells import number, texts
 from vlatool.render._columns import board
 from vlatool.render._format import count, plain
 from vlatool.render._view import latency, measured_where, percentile_names
+from vlatool.render.cells import number, texts
 from vlatool.render.charts.distribution import beyond, distribution
 from vlatool.render.charts.samples import SERIES_NAME, finite, left_out, sampled, sparkline
 from vlatool.render.document import Cell, Chart, Column, Line, Section, Table

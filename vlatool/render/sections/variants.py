@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from vlatool.render._cells import bars, number, reach
 from vlatool.render._columns import about, columns
 from vlatool.render._format import plain, quantity, span
 from vlatool.render._view import brackets, latency, measured_where, place, ranks_boards, role
+from vlatool.render.cells import bars, number, reach
 from vlatool.render.charts.svg import series
 from vlatool.render.document import Bar, Cell, Column, Line, Section, Table, Text
 from vlatool.report import Measurement, Report, Row

@@ -72,8 +72,57 @@ def _bar(item: Measurement | None, top: float, css: str, limit: float | None) ->
     return Bar(min(1.0, item.value / top), css, low, high, mark)
 
 
-def column_texts(contents: Sequence[Any]) -> list[str]:
-    """Return the texts of one column of a details table; its floats get the same decimals."""
+def records_table(report: Report, title: str, bars_of: str = "") -> Table | None:
+    """Return the details of that title: a record a line, that of several variants under each other.
+
+    Args:
+        report: The report.
+        title: Of the details.
+        bars_of: Name of the number that gets a bar.
+    """
+    tinted = zip(report.rows, series(report.rows), strict=True)
+    records = [(plain(row.name), css, one) for row, css in tinted for one in row.details.get(title, ()) if one]
+    if not records:
+        return None
+    keys = list(dict.fromkeys(key for _, _, record in records for key in record))
+    several = len({name for name, _, _ in records}) > 1
+    if several:
+        order = list(dict.fromkeys(cell(record.get(keys[0])) for _, _, record in records))
+        records.sort(key=lambda item: order.index(cell(item[2].get(keys[0]))))
+    contents = [[record.get(key) for _, _, record in records] for key in keys]
+    first, *others = [
+        Column(plain(key), all(map(_is_number, content)), minor=bool(bars_of) and key == "calls")
+        for key, content in zip(keys, contents, strict=True)
+    ]
+    lines, before = [], ""
+    top = max([_length(record.get(bars_of)) for _, _, record in records])
+    for (name, css, record), (group, *rest) in zip(records, zip(*map(_texts, contents), strict=True), strict=True):
+        begins = Cell(group if group != before or first.numeric or not several else "")
+        whose = [Cell(name, css=css)] if several else []
+        bar = [Cell(bar=Bar(_length(record.get(bars_of)) / (top or 1.0), css))] if bars_of else []
+        lines.append(Line((begins, *whose, *texts(rest), *bar)))
+        before = group
+    columns = (
+        first,
+        *([Column("variant", False)] if several else []),
+        *others,
+        *([Column("", False)] if bars_of else []),
+    )
+    heading = plain(title) if several else f"{plain(title)}: {records[0][0]}"
+    return Table(columns, tuple(lines), heading, style="parts" if bars_of else "groups")
+
+
+def _is_number(content: Any) -> bool:
+    return isinstance(content, int | float | None) and not isinstance(content, bool)
+
+
+def _length(content: Any) -> float:
+    drawn = content is not None and _is_number(content) and math.isfinite(content) and content > 0
+    return float(content) if drawn else 0.0
+
+
+def _texts(contents: Sequence[Any]) -> list[str]:
+    """Return the texts of one column; its floats get the same decimals."""
     floats = [item for item in contents if isinstance(item, float) and math.isfinite(item)]
     shown = [f"{item:.4g}" for item in floats]
     if any("e" in text for text in shown):
