@@ -8,7 +8,7 @@ from typing import Any
 
 from vlatool.render._format import cell, count, fixed, label, plain, quantity, span
 from vlatool.render._view import notes
-from vlatool.render.charts.svg import series
+from vlatool.render.charts.svg import tinted
 from vlatool.render.document import MISSING, Bar, Cell, Column, Line, Notes, Table
 from vlatool.report import Measurement, Report
 
@@ -36,15 +36,14 @@ def matrix(report: Report, shown: Sequence[str], origin: str, where: str | None 
         origin: Measured or predicted.
         where: Only the numbers from there.
     """
-    numbers = [
-        {item.name: item for item in row.measurements if item.origin == origin and where in (None, item.where)}
-        for row in report.rows
-    ]
-    kept = [index for index, items in enumerate(numbers) if any(name in items for name in shown)]
-    tints = series(report.rows)
-    columns = [Column("measurement", False), *(Column(report.rows[index].name, css=tints[index]) for index in kept)]
-    lines = [Line((Cell(label(name)), *(number(numbers[index].get(name)) for index in kept))) for name in shown]
-    return Table(tuple(columns), tuple(lines))
+    variants = []
+    for row, css in tinted(report.rows):
+        items = {item.name: item for item in row.measurements if item.origin == origin and where in (None, item.where)}
+        if any(name in items for name in shown):
+            variants.append((Column(plain(row.name), css=css), items))
+    columns = (Column("measurement", False), *(column for column, _ in variants))
+    lines = (Line((Cell(label(name)), *(number(items.get(name)) for _, items in variants))) for name in shown)
+    return Table(columns, tuple(lines))
 
 
 def remarks(report: Report, origin: str, title: str = "", where: str | None = None) -> list[Notes]:
@@ -80,8 +79,9 @@ def records_table(report: Report, title: str, bars_of: str = "") -> Table | None
         title: Of the details.
         bars_of: Name of the number that gets a bar.
     """
-    tinted = zip(report.rows, series(report.rows), strict=True)
-    records = [(plain(row.name), css, one) for row, css in tinted for one in row.details.get(title, ()) if one]
+    records = [
+        (plain(row.name), css, one) for row, css in tinted(report.rows) for one in row.details.get(title, ()) if one
+    ]
     if not records:
         return None
     keys = list(dict.fromkeys(key for _, _, record in records for key in record))

@@ -14,6 +14,7 @@ from vlatool import registry
 from vlatool.render import _trust
 from vlatool.render._columns import Sides, sides
 from vlatool.render._format import limit
+from vlatool.render._view import measured_where
 from vlatool.render.charts.svg import Canvas
 from vlatool.report import Report
 
@@ -197,7 +198,7 @@ class Section:
         order: Sections stand in the order of this number: 10 predictions for a board, 20 variants, 90 further numbers,
             100 details, 130 environment.
         origin: ``measured``, ``predicted``, or empty for what is no number.
-        where: The origin in words: ``Measured on this host: Cortex-A76``.
+        where: The origin in words; what was measured says on which machine, unless this does.
         about: A sentence or more on how to read it.
         brief: Whether a brief terminal report has it.
         folded: Whether Markdown folds it.
@@ -264,6 +265,11 @@ class Document:
 def build(report: Report) -> Document:
     """Return the document of a report."""
     builders: list[Builder] = [registry.load("sections", name)() for name in registry.names("sections")]
+    sections = [
+        replace(section, where=section.where or (measured_where(report) if section.origin == "measured" else ""))
+        for builder in builders
+        for section in builder.build(report)
+    ]
     first, *more = report.summary or (report.title,)
     return Document(
         report,
@@ -273,5 +279,5 @@ def build(report: Report) -> Document:
         tuple((item.effect, _trust.reason(item), _trust.remedy(item)) for item in _trust.findings(report)),
         tuple(limit(name, value) for name, value in report.limits.items()),
         sides(report),
-        tuple(sorted((part for one in builders for part in one.build(report)), key=lambda part: part.order)),
+        tuple(sorted(sections, key=lambda section: section.order)),
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from vlatool.render.charts.svg import series
+from vlatool.render.charts.svg import tinted
 from vlatool.report import Report, Row
 
 SERIES_NAME, TIMES = "latency_ms", "at_s"
@@ -135,8 +135,8 @@ def left_out(report: Report) -> str:
 def sampled(report: Report) -> list[Sampled]:
     """Return the variants that kept latency samples, the first eight at most."""
     variants: list[Sampled] = []
-    for row, css in zip(report.rows, series(report.rows), strict=True):
-        samples, times = _series(row)
+    for row, css in tinted(report.rows):
+        samples, times = _timed(row)
         if len(samples) > 1 and len(variants) < MOST:
             reported = {share: row.value(f"latency_{name}") for name, share in MARKED.items()}
             known = {share: value for share, value in reported.items() if math.isfinite(value)}
@@ -144,7 +144,7 @@ def sampled(report: Report) -> list[Sampled]:
     return variants
 
 
-def _series(row: Row) -> tuple[list[float], list[float]]:
+def _timed(row: Row) -> tuple[list[float], list[float]]:
     """Return the samples, and when each call began; no times unless all are known and time went on."""
     samples, times = row.raw.get(SERIES_NAME) or [], row.raw.get(TIMES) or []
     if len(times) != len(samples):

@@ -76,13 +76,13 @@ def axis_for(values: Iterable[float], start: float, end: float, *, zero: bool = 
     return Axis(max(0.0, bottom) if low >= 0 else bottom, high + room, start, end)
 
 
-def series(rows: Sequence[Row]) -> list[str]:
-    """Return the class of each row's colour: the baseline is grey, the chosen one (or the only one) blue."""
+def tinted(rows: Sequence[Row]) -> list[tuple[Row, str]]:
+    """Return each row with the class of its colour: the baseline is grey, the chosen one (or the only one) blue."""
     named = {"baseline": "s-base", "chosen": "s-chosen"}
     if sum(row.role != "baseline" for row in rows) == 1:
-        return [named.get(row.role, "s-chosen") for row in rows]
+        return [(row, named.get(row.role, "s-chosen")) for row in rows]
     others = (f"s{place % SERIES}" for place in itertools.count())
-    return [named.get(row.role) or next(others) for row in rows]
+    return [(row, named.get(row.role) or next(others)) for row in rows]
 
 
 def shorten(text: str, width: float) -> str:

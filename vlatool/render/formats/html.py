@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import require
@@ -48,21 +47,18 @@ def template() -> Template:
         """Take control characters out of every text; drawings are as they are."""
         return plain(content) if isinstance(content, str) and not isinstance(content, markup) else content
 
-    environment = jinja2.Environment(autoescape=True, finalize=printed, undefined=jinja2.Undefined)
+    files = jinja2.PackageLoader("vlatool.render.formats", "")
+    environment = jinja2.Environment(autoescape=True, finalize=printed, loader=files)
     environment.filters.update(
         percent=lambda share: f"{100 * min(1.0, max(0.0, share)):.1f}%",
         capital=lambda text: text[:1].upper() + text[1:],
         pieces=lambda text: re.split(r"(?<=[_\-./])", text),
         drawn=_drawn,
     )
-    environment.globals.update(widths=WIDTHS, marks=MARKS, most=MOST_LINES, style=markup(_text("page.css")))
-    template: Template = environment.from_string(_text("page.html"))
-    return template
+    environment.globals.update(widths=WIDTHS, marks=MARKS, most=MOST_LINES)
+    page: Template = environment.get_template("page.html")
+    return page
 
 
 def _drawn(chart: Chart, width: int) -> Any:
     return require("markupsafe", "build").Markup(chart.draw(width).svg())
-
-
-def _text(name: str) -> str:
-    return files("vlatool.render.formats").joinpath(name).read_text(encoding="utf-8")

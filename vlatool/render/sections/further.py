@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from vlatool.render._view import (
-    measured_where,
     other_names,
     percentile_names,
     ranks_boards,
@@ -29,6 +28,5 @@ class Further:
         if missing := unmeasured(report, percentile_names(report)):
             blocks.append(Notes(tuple(missing), "Unmeasured"))
         if blocks:
-            where = measured_where(report)
             title = "Further measurements and methods"
-            yield Section(title, tuple(blocks), 90, "measured", where, brief=False, folded=True)
+            yield Section(title, tuple(blocks), 90, "measured", brief=False, folded=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 
-from vlatool.render._view import latency, measured_where
+from vlatool.render._view import latency
 from vlatool.render.charts.samples import left_out, sampled
 from vlatool.render.charts.timeline import MOST_GAUGES, along_the_run, gauges, over_time, throttled
 from vlatool.render.document import Chart, Section
@@ -19,7 +19,7 @@ class OverTime:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return a section for the variants whose times are known, and one for the others."""
-        variants, aim, where = sampled(report), latency(report), measured_where(report)
+        variants, aim = sampled(report), latency(report)
         if timed := [variant for variant in variants if variant.times]:
             more = len(gauges(report)) - MOST_GAUGES
             caption = f"Line: median of a stretch of time. {BANDS} Each has its own scale, latency in ms; a band that "
@@ -27,11 +27,11 @@ class OverTime:
             caption += " Vertical lines: moments of throttling." if throttled(report) else ""
             caption += f" {more} more gauges in report.json." if more > 0 else ""
             drawing = Chart(partial(over_time, report, timed, aim), caption)
-            yield Section("Latency over time", (drawing,), 50, "measured", where)
+            yield Section("Latency over time", (drawing,), 50, "measured")
         if untimed := [variant for variant in variants if not variant.times]:
             caption = f"Line: median of consecutive samples. {BANDS} A slope means warming up or throttling. Each "
             caption += (
                 f"variant has its own scale in ms; a band that touches the top goes beyond it. {left_out(report)}"
             )
             drawing = Chart(partial(along_the_run, untimed, aim), caption.strip())
-            yield Section("Latency along the run", (drawing,), 120, "measured", where)
+            yield Section("Latency along the run", (drawing,), 120, "measured")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._view import measured_where
 from vlatool.render.cells import records_table
 from vlatool.render.document import Section
 from vlatool.report import Report
@@ -19,5 +18,4 @@ class Parts:
     def build(self, report: Report) -> Iterator[Section]:
         """Return the tables that there are."""
         if tables := tuple(table for title, key in PARTS.items() if (table := records_table(report, title, key))):
-            where = measured_where(report)
-            yield Section("Where memory and time go", tables, 70, "measured", where, brief=False, folded=True)
+            yield Section("Where memory and time go", tables, 70, "measured", brief=False, folded=True)

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 
 from vlatool.render._format import count, decimals_of, fixed, interval, number, plain
-from vlatool.render._view import measured_where, percentile_names
-from vlatool.render.charts.svg import series
+from vlatool.render._view import percentile_names
+from vlatool.render.charts.svg import tinted
 from vlatool.render.document import ABSENT, Cell, Column, Line, Notes, Section, Table
 from vlatool.report import Measurement, Report, Row
 
@@ -18,27 +18,21 @@ class Percentiles:
     def build(self, report: Report) -> Iterator[Section]:
         """Return the table, and below it why a percentile could not be had."""
         shown = percentile_names(report)
-        tints = dict(zip((row.name for row in report.rows), series(report.rows), strict=True))
-        rows = [row for row in report.rows if any(row.get(name) for name in shown)]
-        if not shown or not rows:
+        rows = [(row, css) for row, css in tinted(report.rows) if any(row.get(name) for name in shown)]
+        if not rows:
             return
-        items = {name: [row.get(name) for row in rows] for name in shown}
-        digits = [_decimals([row.get(name) for name in shown]) for row in rows]
+        items = {name: [row.get(name) for row, _ in rows] for name in shown}
+        digits = [_decimals(column) for column in zip(*items.values(), strict=True)]
         lines = tuple(Line((Cell(_short(name)), *map(_cell, items[name], digits))) for name in shown)
-        beside = _title([item for line in items.values() for item in line if item is not None and item.known])
         bounded = any(cell.interval for line in lines for cell in line.cells)
-        heads = (Column("latency, ms", False), *(Column(plain(row.name), css=tints[row.name]) for row in rows))
-        table = Table(heads, lines, beside=beside if bounded else "", style="percentiles")
-        reasons = tuple(line for name in shown for line in _reasons(name, rows))
-        yield Section(
-            "Latency percentiles",
-            (table, Notes(reasons)) if reasons else (table,),
-            30,
-            "measured",
-            measured_where(report),
-            _calls(report, rows, shown),
-            brief=len(rows) == 1,
-        )
+        known = [item for line in items.values() for item in line if item is not None and item.known]
+        heads = (Column("latency, ms", False), *(Column(plain(row.name), css=css) for row, css in rows))
+        table = Table(heads, lines, beside=_title(known) if bounded else "", style="percentiles")
+        variants = [row for row, _ in rows]
+        reasons = tuple(line for name in shown for line in _reasons(name, variants))
+        about = _calls(report, variants, shown)
+        blocks = (table, Notes(reasons)) if reasons else (table,)
+        yield Section("Latency percentiles", blocks, 30, "measured", about=about, brief=len(rows) == 1)
 
 
 def _short(name: str) -> str:

@@ -7,7 +7,7 @@ from functools import partial
 
 from vlatool.render._columns import board
 from vlatool.render._format import count, plain
-from vlatool.render._view import latency, measured_where, percentile_names
+from vlatool.render._view import latency, percentile_names
 from vlatool.render.cells import number, texts
 from vlatool.render.charts.distribution import beyond, distribution
 from vlatool.render.charts.samples import SERIES_NAME, finite, left_out, sampled, sparkline
@@ -29,7 +29,7 @@ class Spread:
             aim = latency(report)
             caption = " ".join(part for part in (HELP, beyond(variants, aim.limit), left_out(report)) if part)
             drawing = Chart(partial(distribution, variants, aim), caption, _blocks(report))
-            yield Section("How latency is spread", (drawing,), 40, "measured", measured_where(report))
+            yield Section("How latency is spread", (drawing,), 40, "measured")
 
 
 def _blocks(report: Report) -> Table:

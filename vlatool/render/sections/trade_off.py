@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator
 
 from vlatool.render._format import full, label, number, quantity, tick, unit
-from vlatool.render._view import ERRORS, accuracy, floor, latency, measured, measured_where
+from vlatool.render._view import ERRORS, accuracy, floor, latency, measured
 from vlatool.render.charts.scatter import Bound, Point, Scatter
-from vlatool.render.charts.svg import series
+from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Chart, Section
 from vlatool.report import Report
 
@@ -28,7 +28,7 @@ class TradeOff:
         if plot := scatter(report):
             caption = f"{'Down' if plot.points[0].y.name in FOOTPRINT else 'Up'} {HELP}"
             title = plot.title[:1].upper() + plot.title[1:]
-            yield Section(title, (Chart(plot.draw, caption),), 60, "measured", measured_where(report))
+            yield Section(title, (Chart(plot.draw, caption),), 60, "measured")
 
 
 def upright(report: Report) -> str:
@@ -47,7 +47,7 @@ def points(report: Report) -> list[Point]:
     """Return the variants of which both numbers were measured."""
     across, up = latency(report).name, upright(report)
     shown = []
-    for row, css in zip(report.rows, series(report.rows), strict=True):
+    for row, css in tinted(report.rows):
         x, y = row.get(across), row.get(up)
         if x is not None and y is not None and math.isfinite(x.value) and math.isfinite(y.value):
             tip = f"{row.name}: {label(x.name)} {full(x)}, {label(y.name)} {full(y)}"

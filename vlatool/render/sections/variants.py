@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from vlatool.render._columns import about, columns
 from vlatool.render._format import plain, quantity, span
-from vlatool.render._view import brackets, latency, measured_where, place, ranks_boards, role
+from vlatool.render._view import brackets, latency, place, places, ranks_boards, role
 from vlatool.render.cells import bars, number, reach
-from vlatool.render.charts.svg import series
+from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Bar, Cell, Column, Line, Section, Table, Text
 from vlatool.report import Measurement, Report, Row
 
@@ -30,23 +30,17 @@ class Variants:
             return
         shown = columns(report)
         heads = (Column(title, bars=name == LATENCY) for name, title in shown.items())
-        tints = series(report.rows)
         lines = []
-        for row, bar, css in zip(report.rows, _bars(report, tints), tints, strict=True):
+        for (row, css), bar in zip(tinted(report.rows), _bars(report), strict=True):
             items = [row.get(name) for name in shown]
             where = next((item.where for item in items if item), "this host")
-            cells = (_cell(row, item, bar, where) for item in items)
-            note = f"on {place(report, where)}" if _several(report) else ""
-            said = "" if row.role == "subject" else role(row)
-            name = Cell(plain(row.name), note=note, css=css)
-            lines.append(Line((name, *cells), said, plain(row.reason), row.role == "chosen"))
+            note = f"on {place(report, where)}" if len(places(report, "measured")) > 1 else ""
+            cells = (Cell(plain(row.name), note=note, css=css), *(_cell(row, item, bar, where) for item in items))
+            words = "" if row.role == "subject" else role(row)
+            lines.append(Line(cells, words, plain(row.reason), row.role == "chosen"))
         table = Table((Column("variant", False), *heads), tuple(lines), style="cards")
-        told = " ".join(part for part in (about(report), brackets(report, "measured")) if part)
-        yield Section("Variants", (table,), 20, "measured", measured_where(report), told)
-
-
-def _several(report: Report) -> bool:
-    return len({item.where for row in report.rows for item in row.measurements if item.origin == "measured"}) > 1
+        how = " ".join(part for part in (about(report), brackets(report, "measured")) if part)
+        yield Section("Variants", (table,), 20, "measured", about=how)
 
 
 def _cell(row: Row, item: Measurement | None, bar: Bar | None, where: str) -> Cell:
@@ -64,8 +58,8 @@ def _cell(row: Row, item: Measurement | None, bar: Bar | None, where: str) -> Ce
     return number(item, bar, spoken, note)
 
 
-def _bars(report: Report, tints: list[str]) -> list[Bar | None]:
+def _bars(report: Report) -> list[Bar | None]:
     aim, items = latency(report), [row.get(LATENCY) for row in report.rows]
     longest = max((reach(item) for item in items if item is not None), default=0.0)
     near = aim.name == LATENCY and aim.limit is not None and aim.limit < FAR * longest
-    return bars(items, tints, aim.limit if near else None)
+    return bars(items, [css for _, css in tinted(report.rows)], aim.limit if near else None)
