@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vlatool.render._format import plain
-from vlatool.report import EFFECTS, Finding, Report
+from vlatool.report import EFFECTS, Report
 
 SENTENCES = {
     "": "",
@@ -13,29 +13,22 @@ SENTENCES = {
 }
 
 
-def findings(report: Report) -> list[Finding]:
-    """Return what was found, the worst first."""
-    return sorted(report.findings, key=lambda finding: -EFFECTS.index(finding.effect))
-
-
 def sentence(report: Report) -> str:
     """Return whether the measurement can be trusted, as a sentence; nothing when nobody judged it."""
     judgement = SENTENCES[report.validity]
     return judgement.replace("measurement", "comparison") if report.kind == "compare" else judgement
 
 
-def reason(finding: Finding) -> str:
-    """Return the reason as a sentence."""
-    return ended(plain(finding.reason))
+def reasons(report: Report) -> list[tuple[str, str, str]]:
+    """Return (effect, reason, remedy) of each finding, the worst first; sentences, the remedy may be empty."""
+    worst_first = sorted(report.findings, key=lambda finding: -EFFECTS.index(finding.effect))
+    remedies = (plain(finding.remedy).strip() for finding in worst_first)
+    return [
+        (finding.effect, _ended(plain(finding.reason)), _ended(f"Remedy: {remedy}") if remedy else "")
+        for finding, remedy in zip(worst_first, remedies, strict=True)
+    ]
 
 
-def remedy(finding: Finding) -> str:
-    """Return the remedy as a sentence; nothing when there is none."""
-    text = plain(finding.remedy).strip()
-    return ended(f"Remedy: {text}") if text else ""
-
-
-def ended(text: str) -> str:
-    """Return text that ends with a full stop."""
+def _ended(text: str) -> str:
     text = text.strip()
     return text if not text or text[-1] in ".!?" else f"{text}."

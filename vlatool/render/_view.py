@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
@@ -144,24 +144,25 @@ def notes(report: Report, origin: str, where: str | None = None) -> list[str]:
     return [f"{', '.join(labels)}: {note}" for note, labels in by_note.items()]
 
 
-def unmeasured(report: Report, passed_over: Iterable[str] = ()) -> list[str]:
+def unmeasured(report: Report, shown: Callable[[str], bool], *, further: bool = False) -> list[str]:
     """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
 
     Args:
         report: The report.
-        passed_over: Names of measurements whose reason stands elsewhere.
+        shown: Says of the name of a measurement whether its reason is asked for.
+        further: Add what is no measurement of a row, from its details.
     """
-    elsewhere = set(passed_over)
+    missing = [(row, _missing(item), plain(item.note)) for row in report.rows for item in row.measurements
+               if not item.known and shown(item.name)]  # fmt: skip
+    for row in report.rows if further else ():
+        records = row.details.get(ABSENT, ())
+        missing += [(row, plain(record.get("what", "")), plain(record.get("why", ""))) for record in records]
     rows_of: dict[tuple[str, str], dict[str, None]] = {}
-    for row in report.rows:
-        missing = [(_missing(item), item.note) for item in row.measurements
-                   if not item.known and item.name not in elsewhere]  # fmt: skip
-        records = [(record.get("what", ""), record.get("why", "")) for record in row.details.get(ABSENT, ())]
-        for what, why in (*missing, *records):
-            rows_of.setdefault((plain(what), plain(why)), {})[row.name] = None
+    for row, what, why in missing:
+        rows_of.setdefault((what, why), {})[plain(row.name)] = None
     grouped: dict[tuple[str, str], list[str]] = {}
     for (what, why), rows in rows_of.items():
-        whose = "" if len(rows) == len(report.rows) else f"{', '.join(plain(name) for name in rows)}, "
+        whose = "" if len(rows) == len(report.rows) else f"{', '.join(rows)}, "
         grouped.setdefault((whose, why), []).append(what)
     return [f"{whose}{', '.join(what)}{f': {why}' if why else ''}" for (whose, why), what in grouped.items()]
 

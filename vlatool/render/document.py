@@ -276,7 +276,7 @@ def build(report: Report) -> Document:
         first,
         tuple(more),
         _trust.sentence(report),
-        tuple((item.effect, _trust.reason(item), _trust.remedy(item)) for item in _trust.findings(report)),
+        tuple(_trust.reasons(report)),
         tuple(limit(name, value) for name, value in report.limits.items()),
         sides(report),
         tuple(sorted(sections, key=lambda section: section.order)),

@@ -15,13 +15,13 @@ STRIP = 52
 def beyond(variants: Sequence[Sampled], limit: float | None) -> str:
     """Return a sentence about the samples that lie beyond the end of the axis."""
     axis = _span(variants, limit, 0, 1)
-    told = []
+    outliers = []
     for variant in variants:
         outside = sum(sample > axis.high for sample in variant.samples)
         if outside:
             share = f"{fixed(outside, 0)} of {fixed(len(variant.samples), 0)}"
-            told.append(f"{variant.name}: {share}, up to {significant(variant.ordered[-1])} ms")
-    return "Beyond the right end: " + "; ".join(told) + "." if told else ""
+            outliers.append(f"{variant.name}: {share}, up to {significant(variant.ordered[-1])} ms")
+    return "Beyond the right end: " + "; ".join(outliers) + "." if outliers else ""
 
 
 def distribution(variants: Sequence[Sampled], aim: Latency, width: int) -> Canvas:

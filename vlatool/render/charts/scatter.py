@@ -79,19 +79,17 @@ class Scatter:
         height = 370 if width > 500 else 325
         frame = (52.0, 26.0, width - 14.0, height - 40.0)
         axes = _axes(self, frame)
-        marks = [Mark(axes[0](point.x.value), axes[1](point.y.value), point.name, point.css) for point in self.points]
-        inside = (frame[0], 16.0, width - 4.0, frame[3])
-        named = labels(marks, inside, _limit_boxes(self, axes, frame), width * 0.45)
-        canvas = Canvas(f"{self.key}-{width}", width, height + round(named.height), self.title, self.spoken)
+        canvas = Canvas(f"{self.key}-{width}", width, height, self.title, self.spoken)
         _background(canvas, self, axes, frame)
-        _limits(canvas, self, axes, frame)
+        taken = _limits(canvas, self, axes, frame)
         if len(best := self.front()) > 1:
             canvas.steps([(axes[0](point.x.value), axes[1](point.y.value)) for point in best], "front", "Pareto front")
         for point in self.points:
-            _whiskers(canvas, point, axes)
-        for point, mark in zip(self.points, marks, strict=True):
-            _point(canvas, point, mark.x, mark.y)
+            taken += _whiskers(canvas, point, axes)
+        marks = [_point(canvas, point, axes) for point in self.points]
+        named = labels(marks, (frame[0], 16.0, width - 4.0, frame[3]), taken, width * 0.45)
         named.draw(canvas, height)
+        canvas.height += round(named.height)
         return canvas
 
 
@@ -130,47 +128,47 @@ def _background(canvas: Canvas, plot: Scatter, axes: Axes, frame: Box) -> None:
     canvas.text(right, bottom + 32, f"{plot.across}{scale}", "note", "end")
 
 
-def _limit_boxes(plot: Scatter, axes: Axes, frame: Box) -> list[Box]:
-    """Return what the lines of the limits and their words cover."""
+def _limits(canvas: Canvas, plot: Scatter, axes: Axes, frame: Box) -> list[Box]:
+    """Draw the limits; return what their lines and words cover."""
     left, top, right, bottom = frame
-    boxes: list[Box] = []
-    if plot.most is not None and axes[0].holds(plot.most.value):
-        spot = axes[0](plot.most.value)
-        boxes.append((spot - 1, top, spot + 1, bottom))
-        boxes.append((spot - 5 - len(plot.most.words) * CHARACTER, bottom - 18, spot + 2, bottom - 4))
-    if plot.least is not None and axes[1].holds(plot.least.value):
-        spot = axes[1](plot.least.value)
-        boxes.append((left, spot - 1, right, spot + 1))
-        boxes.append((left, spot, left + 5 + len(plot.least.words) * CHARACTER, spot + 16))
-    return boxes
-
-
-def _limits(canvas: Canvas, plot: Scatter, axes: Axes, frame: Box) -> None:
-    left, top, right, bottom = frame
+    taken: list[Box] = []
     if plot.most is not None and axes[0].holds(plot.most.value):
         spot = axes[0](plot.most.value)
         canvas.add("rect", "outside", x=spot, y=top, width=right - spot, height=bottom - top)
         canvas.line(spot, top, spot, bottom, "limit")
         canvas.text(spot - 5, bottom - 8, plot.most.words, "limit-text", "end")
+        words = (spot - 5 - len(plot.most.words) * CHARACTER, bottom - 18, spot + 2, bottom - 4)
+        taken += [(spot - 1, top, spot + 1, bottom), words]
     if plot.least is not None and axes[1].holds(plot.least.value):
         spot = axes[1](plot.least.value)
         canvas.add("rect", "outside", x=left, y=spot, width=right - left, height=bottom - spot)
         canvas.line(left, spot, right, spot, "limit")
         canvas.text(left + 5, spot + 13, plot.least.words, "limit-text")
+        words = (left, spot, left + 5 + len(plot.least.words) * CHARACTER, spot + 16)
+        taken += [(left, spot - 1, right, spot + 1), words]
+    return taken
 
 
-def _whiskers(canvas: Canvas, point: Point, axes: Axes) -> None:
+def _whiskers(canvas: Canvas, point: Point, axes: Axes) -> list[Box]:
+    """Draw the intervals of a point; return what they cover."""
     x, y = axes[0](point.x.value), axes[1](point.y.value)
+    ends = []
     if point.y.low is not None and point.y.high is not None:
-        canvas.line(x, axes[1](point.y.low), x, axes[1](point.y.high), f"whisker {point.css}")
+        ends.append((x, axes[1](point.y.high), x, axes[1](point.y.low)))
     if point.x.low is not None and point.x.high is not None:
-        canvas.line(axes[0](point.x.low), y, axes[0](point.x.high), y, f"whisker {point.css}")
+        ends.append((axes[0](point.x.low), y, axes[0](point.x.high), y))
+    for whisker in ends:
+        canvas.line(*whisker, f"whisker {point.css}")
+    return [(left - 1, min(top, bottom) - 1, right + 1, max(top, bottom) + 1) for left, top, right, bottom in ends]
 
 
-def _point(canvas: Canvas, point: Point, x: float, y: float) -> None:
+def _point(canvas: Canvas, point: Point, axes: Axes) -> Mark:
+    x, y = axes[0](point.x.value), axes[1](point.y.value)
     if point.shape == "square":
         canvas.add("rect", f"dot {point.css}", point.tip, x=x - 5, y=y - 5, width=10, height=10)
-        return
-    if point.shape == "ringed":
-        canvas.add("circle", f"ring {point.css}", cx=x, cy=y, r=9.5)
-    canvas.add("circle", f"{'hollow' if point.shape == 'hollow' else 'dot'} {point.css}", point.tip, cx=x, cy=y, r=5.5)
+    else:
+        if point.shape == "ringed":
+            canvas.add("circle", f"ring {point.css}", cx=x, cy=y, r=9.5)
+        css = "hollow" if point.shape == "hollow" else "dot"
+        canvas.add("circle", f"{css} {point.css}", point.tip, cx=x, cy=y, r=5.5)
+    return Mark(x, y, point.name, point.css)

@@ -96,19 +96,17 @@ class Canvas:
 
     Args:
         key: Unique in the page; names the title and the description.
-        width, height: Size in pixels; the drawing scales down, and up to its width.
+        width, height: Size in pixels, which may grow; the drawing scales down, and up to its width.
         title: What it shows.
         description: What one sees in it.
     """
 
     def __init__(self, key: str, width: int, height: int, title: str, description: str) -> None:
         self.width, self.height = width, height
-        self._parts = [
-            f'<svg role="img" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-            f'aria-labelledby="{key}-t {key}-d" class="chart">',
-            f'<title id="{key}-t">{_safe(title)}</title>',
-            f'<desc id="{key}-d">{_safe(description)}</desc>',
-        ]
+        self._key = _safe(key)
+        self._parts: list[str] = []
+        for tag, text in (("title", title), ("desc", description)):
+            self.add(tag, inner=text, id=f"{key}-{tag[0]}")
 
     def add(self, tag: str, css: str = "", tip: str = "", inner: str = "", **attributes: str | float) -> None:
         """Add a shape, or the text ``inner``; ``tip`` is shown when the pointer rests on it."""
@@ -158,7 +156,11 @@ class Canvas:
 
     def svg(self) -> str:
         """Return the drawing."""
-        return "\n".join([*self._parts, "</svg>"])
+        top = (
+            f'<svg role="img" viewBox="0 0 {self.width} {self.height}" width="{self.width}" height="{self.height}" '
+            f'aria-labelledby="{self._key}-t {self._key}-d" class="chart">'
+        )
+        return "\n".join([top, *self._parts, "</svg>"])
 
 
 def _safe(value: str | float) -> str:

@@ -68,8 +68,8 @@ def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: 
     end = max([*(variant.times[-1] for variant in variants), *(gauge.times[-1] for gauge in readings), *moments])
     bottom = PANEL * len(variants) + GAUGE_PANEL * len(readings) + (20 if moments else 0)
     worst = ", ".join(f"{variant.name} {significant(variant.ordered[-1])} ms" for variant in variants)
-    told = f" Throttled at {len(moments)} moments." if moments else ""
-    canvas = Canvas(f"time-{width}", width, bottom + 42, "Latency over time", f"Largest latency: {worst}.{told}")
+    throttling = f" Throttled at {len(moments)} moments." if moments else ""
+    canvas = Canvas(f"time-{width}", width, bottom + 42, "Latency over time", f"Largest latency: {worst}.{throttling}")
     across = Axis(0.0, end, LEFT, width - RIGHT)
     for value in across.ticks(8 if width > 500 else 4):
         canvas.line(across(value), 22, across(value), bottom, "grid")

@@ -144,7 +144,7 @@ def scatter(report: Report) -> Scatter | None:
         "boards",
         "Price against predicted latency",
         tuple(points),
-        "predicted latency of one inference, ms (80 % interval)",
+        "predicted latency, ms (80 % interval)",
         "US dollars",
         "; ".join(f"{point.name}: {_spread(point.x)} ms, {_money(point.y)} dollars" for point in points),
         Bound(limit, f"limit {limit:g} ms") if math.isfinite(limit) else None,

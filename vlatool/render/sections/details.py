@@ -16,8 +16,8 @@ class Details:
 
     def build(self, report: Report) -> Iterator[Section]:
         """Return every table of details that no other section draws."""
-        if not ranks_boards(report) and (found := tables(report)):
-            yield Section("Details", tuple(found), 100, brief=False, folded=True)
+        if not ranks_boards(report) and (shown := tables(report)):
+            yield Section("Details", tuple(shown), 100, brief=False, folded=True)
 
 
 def tables(report: Report) -> list[Table]:

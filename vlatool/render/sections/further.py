@@ -22,10 +22,10 @@ class Further:
         """Return the table, the methods, and the reasons for what is missing."""
         if ranks_boards(report):
             return
-        shown = other_names(report)
+        shown, elsewhere = other_names(report), percentile_names(report)
         blocks: list[Block] = [matrix(report, shown, "measured")] if shown else []
         blocks += remarks(report, "measured", "Methods")
-        if missing := unmeasured(report, percentile_names(report)):
+        if missing := unmeasured(report, lambda name: name not in elsewhere, further=True):
             blocks.append(Notes(tuple(missing), "Unmeasured"))
         if blocks:
             title = "Further measurements and methods"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from vlatool.render._format import count, decimals_of, fixed, interval, number, plain
-from vlatool.render._view import percentile_names
+from vlatool.render._view import percentile_names, unmeasured
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import ABSENT, Cell, Column, Line, Notes, Section, Table
 from vlatool.report import Measurement, Report, Row
@@ -29,7 +29,7 @@ class Percentiles:
         heads = (Column("latency, ms", False), *(Column(plain(row.name), css=css) for row, css in rows))
         table = Table(heads, lines, beside=_title(known) if bounded else "", style="percentiles")
         variants = [row for row, _ in rows]
-        reasons = tuple(line for name in shown for line in _reasons(name, variants))
+        reasons = tuple(unmeasured(report, shown.__contains__))
         about = _calls(report, variants, shown)
         blocks = (table, Notes(reasons)) if reasons else (table,)
         yield Section("Latency percentiles", blocks, 30, "measured", about=about, brief=len(rows) == 1)
@@ -59,17 +59,6 @@ def _title(items: Sequence[Measurement]) -> str:
     return ("at most" if all(item.low is None for item in bounded) else "interval") + cover
 
 
-def _reasons(name: str, rows: Sequence[Row]) -> list[str]:
-    """Return why a percentile could not be had; variants are named unless it holds for all."""
-    whose: dict[str, list[str]] = {}
-    for row in rows:
-        item = row.get(name)
-        if item is not None and not item.known and item.note:
-            whose.setdefault(plain(item.note), []).append(plain(row.name))
-    names = {note: [] if len(variants) == len(rows) else variants for note, variants in whose.items()}
-    return [f"{', '.join([_short(name), *variants])}: {note}" for note, variants in names.items()]
-
-
 def _calls(report: Report, rows: Sequence[Row], shown: Sequence[str]) -> str:
     """Return the number of calls, or of ticks of a control loop, in a sentence."""
     what = "ticks" if report.kind == "benchmark" and "hz" in report.limits else "calls"
@@ -79,5 +68,5 @@ def _calls(report: Report, rows: Sequence[Row], shown: Sequence[str]) -> str:
     }
     if len(set(counts.values())) == 1:
         return f"{next(iter(counts.values()))} {what}{' each' if len(rows) > 1 else ''}."
-    told = [f"{name} {number}" for name, number in counts.items() if number]
-    return f"{what.capitalize()}: {', '.join(told)}." if told else ""
+    known = [f"{name} {number}" for name, number in counts.items() if number]
+    return f"{what.capitalize()}: {', '.join(known)}." if known else ""
