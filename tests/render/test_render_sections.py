@@ -11,10 +11,10 @@ import pytest
 from _render_reports import HOSTILE, KINDS, benchmark, optimize
 
 from vlatool import registry
-from vlatool.errors import MissingExtra
+from vlatool.errors import MissingExtra, PluginError
 from vlatool.render import render, sections
 from vlatool.render.charts.svg import Canvas
-from vlatool.render.document import Section, Text, build
+from vlatool.render.document import Cell, Column, Line, Section, Table, Text, build
 from vlatool.render.formats import html
 from vlatool.render.formats.terminal import TerminalRenderer
 from vlatool.report import Report, Row
@@ -92,6 +92,28 @@ def test_whatever_a_section_holds_is_text_on_the_page(plant: Callable[..., None]
 def test_the_origin_of_a_section_is_measured_or_predicted() -> None:
     with pytest.raises(ValueError, match="allowed: measured, predicted"):
         Section("t", (Text("x"),), 1, "guessed")
+
+
+def test_a_table_has_as_many_cells_in_each_line_as_columns() -> None:
+    with pytest.raises(ValueError, match="a line has 1 cells, the table 2 columns"):
+        Table((Column("a"), Column("b")), (Line((Cell("x"),)),))
+
+
+def test_a_block_is_one_that_formats_draw() -> None:
+    with pytest.raises(ValueError, match="a block is 'words'; allowed: Text, Table"):
+        Section("t", ("words",), 1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("theirs", [False, True])
+def test_a_section_that_fails_is_told_as_its_packages(
+    plant: Callable[..., None], monkeypatch: pytest.MonkeyPatch, theirs: bool
+) -> None:
+    plant()
+    monkeypatch.setattr(registry, "owner", lambda module: "acme 1.2" if theirs and "planted" in module else "")
+    registry.load("sections", "planted").build = lambda self, report: [Section("t", (Text("x"),), 1, "guessed")]
+    with pytest.raises(PluginError if theirs else ValueError, match="allowed: measured, predicted") as caught:
+        render(benchmark(), "terminal")
+    assert ("The package acme 1.2, which adds 'sections.planted', fails: ValueError" in str(caught.value)) == theirs
 
 
 def test_every_number_says_its_origin() -> None:

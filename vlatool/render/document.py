@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from vlatool import registry
+from vlatool.errors import PluginError
 from vlatool.render import _trust
 from vlatool.render._columns import Sides, sides
 from vlatool.render._format import limit
@@ -131,6 +132,11 @@ class Table:
     beside: str = ""
     style: str = ""
 
+    def __post_init__(self) -> None:
+        wrong = next((len(line.cells) for line in self.lines if len(line.cells) != len(self.columns)), None)
+        if wrong is not None:
+            raise ValueError(f"a line has {wrong} cells, the table {len(self.columns)} columns")
+
     def worded(self) -> list[int]:
         """Return the places of the columns that say something without bars."""
         return [
@@ -218,6 +224,9 @@ class Section:
     def __post_init__(self) -> None:
         if self.origin not in ("", "measured", "predicted"):
             raise ValueError(f"origin is {self.origin!r}; allowed: measured, predicted, or nothing")
+        for block in self.blocks:
+            if not isinstance(block, Block):
+                raise ValueError(f"a block is {block!r}; allowed: Text, Table, Notes, Pairs, Code, Chart")
 
 
 class Builder(Protocol):
@@ -263,12 +272,16 @@ class Document:
 
 
 def build(report: Report) -> Document:
-    """Return the document of a report."""
+    """Return the document of a report.
+
+    Raises:
+        PluginError: when a section of another package fails.
+    """
     builders: list[Builder] = [registry.load("sections", name)() for name in registry.names("sections")]
     sections = [
         replace(section, where=section.where or (measured_where(report) if section.origin == "measured" else ""))
         for builder in builders
-        for section in builder.build(report)
+        for section in _sections(builder, report)
     ]
     first, *more = report.summary or (report.title,)
     return Document(
@@ -281,3 +294,14 @@ def build(report: Report) -> Document:
         sides(report),
         tuple(sorted(sections, key=lambda section: section.order)),
     )
+
+
+def _sections(builder: Builder, report: Report) -> list[Section]:
+    try:
+        return list(builder.build(report))
+    except Exception as error:  # the seam: another package's code raises what it likes
+        package = registry.owner(type(builder).__module__)
+        if not package or isinstance(error, PluginError):
+            raise
+        entry, why = registry.entry_of(type(builder)), f"{type(error).__name__}: {error}"
+        raise PluginError(f"The package {package}, which adds '{entry}', fails: {why}.", "tell its authors") from error
