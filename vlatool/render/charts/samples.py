@@ -87,14 +87,14 @@ def envelope(times: Sequence[float], samples: Sequence[float], bins: int) -> lis
 
 
 def sparkline(samples: Sequence[float], bins: int) -> str:
-    """Return a histogram of one line of text, from the smallest sample to the 99th percentile."""
+    """Return a histogram of one line of text, from the smallest sample to the 99th percentile; blanks do not break."""
     ordered = sorted(samples)
     low, high = ordered[0], quantile(ordered, 0.99)
     if high <= low:
         return "█"
     counts = histogram(ordered, lambda sample: (sample - low) / (high - low), bins)
     peak = max(counts)
-    return "".join(" ▁▂▃▄▅▆▇█"[math.ceil(8 * count / peak)] for count in counts)
+    return "".join("\xa0▁▂▃▄▅▆▇█"[math.ceil(8 * count / peak)] for count in counts)
 
 
 @dataclass(frozen=True)
