@@ -563,7 +563,7 @@ FILES = [
         lambda at: ["profiles", "show", at.profile(put("memory_gb", "value", -8))]),
     Row("a profile with an unknown key", "colour: is not a known key", 3,
         lambda at: ["evaluate", at.float, "--profile", at.profile(put("colour", "red"))]),
-    Row("no report", "No report at", 3, lambda at: ["compare", at.root / "none", at.root / "neither"]),
+    Row("no report", "There is no report at", 3, lambda at: ["compare", at.root / "none", at.root / "neither"]),
     Row("a report that is not JSON", "This is not a vlatool report", 3,
         lambda at: ["compare", at.file("a.json", "{"), at.file("b.json", "{")]),
     Row("a newer report", "upgrade vlatool", 3, lambda at: at.report(put("schema", 2))),
