@@ -564,13 +564,13 @@ FILES = [
     Row("a profile with an unknown key", "colour: is not a known key", 3,
         lambda at: ["evaluate", at.float, "--profile", at.profile(put("colour", "red"))]),
     Row("no report", "There is no report at", 3, lambda at: ["compare", at.root / "none", at.root / "neither"]),
-    Row("a report that is not JSON", "This is no vlatool report", 3,
+    Row("a report that is not JSON", "This is not a vlatool report", 3,
         lambda at: ["compare", at.file("a.json", "{"), at.file("b.json", "{")]),
     Row("a newer report", "upgrade vlatool", 3, lambda at: at.report(put("schema", 2))),
     Row("a report of an unknown verdict", "verdict", 3, lambda at: at.report(put("verdict", "maybe"))),
-    Row("a report with a word for a number", "This is no vlatool report", 3,
+    Row("a report with a word for a number", "This is not a vlatool report", 3,
         lambda at: at.report(put("rows", 0, "measurements", 0, "value", "fast"))),
-    Row("a report with a word for a table", "This is no vlatool report", 3,
+    Row("a report with a word for a table", "This is not a vlatool report", 3,
         lambda at: at.report(put("rows", 0, "details", "none"))),
 ]  # fmt: skip
 OUTPUTS = [

@@ -318,12 +318,12 @@ PROFILES_COMMANDS = [
     Row("diff with nothing", "Missing argument", 2, lambda at: ["profiles", "diff", "raspberry-pi-5"]),
 ]  # fmt: skip
 CALIBRATE = [
-    Row("calibrate without a report", "There is no report at", 3, lambda at: at.calibrate(at.place)),
+    Row("calibrate without a report", "No report at", 3, lambda at: at.calibrate(at.place)),
     Row("calibrate an unknown board", "did you mean 'raspberry-pi-5'", 3,
         lambda at: at.calibrate(at.report(latency()), board="rasberry-pi-5")),
     Row("calibrate an unknown mode", "no power mode '9W'", 3,
         lambda at: at.calibrate(at.report(latency()), "--mode", "9W")),
-    Row("calibrate by a report that is none", "This is no vlatool report", 3,
+    Row("calibrate by a report that is none", "This is not a vlatool report", 3,
         lambda at: at.calibrate(at.file("report.json", "{"))),
     Row("calibrate by a report without latencies", "it holds no latency of an engine of this board", 3,
         lambda at: at.calibrate(at.report())),

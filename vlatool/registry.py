@@ -17,7 +17,10 @@ from types import ModuleType
 
 from vlatool.errors import PluginError, UsageError, VlatoolError, nearest
 
-PACKAGES = {"engines": "vlatool.runtime.engines", "commands": "vlatool.cli"}
+PACKAGES = {
+    "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
+    "sections": "vlatool.render.sections",
+}  # fmt: skip
 """Kind -> the package that holds its files, where that has another name."""
 NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",

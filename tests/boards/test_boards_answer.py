@@ -31,7 +31,7 @@ from vlatool.hardware.profile import load_profile, names
 from vlatool.latency_model.model import shipped
 from vlatool.machine.host import cache_directory
 from vlatool.prune.magnitude import Magnitude
-from vlatool.render._boards import limit_ms
+from vlatool.render.sections.boards import limit_ms
 from vlatool.stage.base import Context
 from vlatool.stage.run import run_transform
 

@@ -24,7 +24,7 @@ from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.render import render
-from vlatool.render.terminal import TerminalRenderer
+from vlatool.render.formats.terminal import TerminalRenderer
 from vlatool.report import Report
 from vlatool.runtime.policy import Policy
 from vlatool.stage.base import Context

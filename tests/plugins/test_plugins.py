@@ -35,6 +35,9 @@ acme = acme_robotics.boards
 
 [vlatool.commands]
 acme = acme_robotics.hello
+
+[vlatool.sections]
+acme = acme_robotics.section
 """
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -131,6 +134,18 @@ def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
     assert "'acme_float16'" in found
 
 
+def test_its_section_is_in_every_format_of_a_report(run: Run):
+    code = (
+        "from vlatool.render import render; from vlatool.report import Measurement, Report, Row; "
+        "row = Row('float32', measurements=(Measurement('latency_p50', 50.0, 'ms'),)); "
+        "print(render(Report('benchmark', 't', rows=(row,)), '{}'))"
+    )
+    for format in ("terminal", "markdown", "html"):
+        text = ok(run("-c", code.format(format)))
+        assert "Inferences in an hour" in text
+        assert "72,000" in text
+
+
 def test_its_bug_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     done = run("quantize", "broken", str(onnx_file), "-o", str(tmp_path / "out"))
     assert done.returncode == 3
@@ -172,5 +187,5 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "engine", "source"):
+    for name in ("rounded", "engine", "source", "section"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

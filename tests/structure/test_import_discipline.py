@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-BUILD_PACKAGES = ("torch", "onnx", "onnxscript", "onnx_ir", "pydantic", "typer", "rich", "yaml", "psutil")
+BUILD_PACKAGES = ("torch", "onnx", "onnxscript", "onnx_ir", "pydantic", "typer", "rich", "yaml", "psutil", "jinja2")
 ROBOT = f"""
 import sys
 

@@ -13,7 +13,7 @@ import pytest
 from vlatool.bundle.bundle import Bundle, restate
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
-from vlatool.render.terminal import TerminalRenderer
+from vlatool.render.formats.terminal import TerminalRenderer
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.verify import Options, check, verify

@@ -187,7 +187,7 @@ def terminal_text(report: Report, *, brief: bool = False) -> str:
     """Return the report for this terminal: its width, its colours."""
     import shutil
 
-    from vlatool.render.terminal import TerminalRenderer
+    from vlatool.render.formats.terminal import TerminalRenderer
 
     color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     width = min(shutil.get_terminal_size((80, 24)).columns, 120)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vlatool.render._distribution import TIMES, Sampled
 from vlatool.render._format import fixed, plain, significant, tick
-from vlatool.render._samples import Band, envelope, finite
-from vlatool.render._svg import Axis, Canvas, axis_for, shorten
 from vlatool.render._view import Latency
+from vlatool.render.charts.samples import TIMES, Band, Sampled, envelope, finite
+from vlatool.render.charts.svg import Axis, Canvas, axis_for
 from vlatool.report import Report
 
 THROTTLED, GAUGE = "throttled_at_s", "telemetry."
@@ -31,40 +29,25 @@ class Gauge:
     values: list[float]
 
 
-def timed(variants: Sequence[Sampled]) -> list[Sampled]:
-    """Return the variants whose samples have times."""
-    return [variant for variant in variants if variant.times]
-
-
-def untimed(variants: Sequence[Sampled]) -> list[Sampled]:
-    """Return the variants of whose samples only the order is known."""
-    return [variant for variant in variants if not variant.times]
-
-
 def gauges(report: Report) -> list[Gauge]:
     """Return what was read of the machine, each once: temperatures, clocks, power, the rest."""
     tables = [record for row in report.rows for record in row.details.get("telemetry", ())]
     units = {str(record.get("reading")): str(record.get("unit", "")) for record in tables}
-    found: list[tuple[str, Gauge]] = []
+    shown: list[tuple[str, Gauge]] = []
     for row in report.rows:
-        for name in row.raw:
-            at = row.raw.get(f"{name}.{TIMES}")
-            if not name.startswith(GAUGE) or not at or len(at) != len(row.raw[name]):
+        for name, values in row.raw.items():
+            times = row.raw.get(f"{name}.{TIMES}") or []
+            if not name.startswith(GAUGE) or len(times) != len(values):
                 continue
-            pairs = sorted(pair for pair in zip(at, row.raw[name], strict=True) if all(map(_number, pair)))
+            pairs = sorted(pair for pair in zip(times, values, strict=True) if len(finite(pair)) == 2)
             reading = name.removeprefix(GAUGE)
             gauge = Gauge(reading, units.get(reading, ""), [pair[0] for pair in pairs], [pair[1] for pair in pairs])
-            if len(pairs) > 1 and all(gauge != other for _, other in found):
-                found.append((row.name, gauge))
-    readings = [gauge.name for _, gauge in found]
-    named = [
-        replace(gauge, name=f"{gauge.name}, {row}") if readings.count(gauge.name) > 1 else gauge for row, gauge in found
-    ]
+            if len(pairs) > 1 and all(gauge != other for _, other in shown):
+                shown.append((row.name, gauge))
+    readings = [gauge.name for _, gauge in shown]
+    several = {name for name in readings if readings.count(name) > 1}
+    named = (replace(gauge, name=f"{gauge.name}, {row}") if gauge.name in several else gauge for row, gauge in shown)
     return sorted(named, key=_kind)
-
-
-def _number(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
 
 
 def _kind(gauge: Gauge) -> int:
@@ -79,14 +62,14 @@ def throttled(report: Report) -> list[float]:
     return sorted({moment for row in report.rows for moment in finite(row.raw.get(THROTTLED) or [])})
 
 
-def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: int) -> str:
+def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: int) -> Canvas:
     """Return latency on a time axis in seconds, gauges and throttled moments below."""
     readings, moments = gauges(report)[:MOST_GAUGES], throttled(report)
     end = max([*(variant.times[-1] for variant in variants), *(gauge.times[-1] for gauge in readings), *moments])
     bottom = PANEL * len(variants) + GAUGE_PANEL * len(readings) + (20 if moments else 0)
     worst = ", ".join(f"{variant.name} {significant(variant.ordered[-1])} ms" for variant in variants)
-    told = f" Throttled at {len(moments)} moments." if moments else ""
-    canvas = Canvas(f"time-{width}", width, bottom + 42, "Latency over time", f"Largest latency: {worst}.{told}")
+    throttling = f" Throttled at {len(moments)} moments." if moments else ""
+    canvas = Canvas(f"time-{width}", width, bottom + 42, "Latency over time", f"Largest latency: {worst}.{throttling}")
     across = Axis(0.0, end, LEFT, width - RIGHT)
     for value in across.ticks(8 if width > 500 else 4):
         canvas.line(across(value), 22, across(value), bottom, "grid")
@@ -102,10 +85,10 @@ def over_time(report: Report, variants: Sequence[Sampled], aim: Latency, width: 
         _gauge(canvas, gauge, PANEL * len(variants) + (20 if moments else 0) + GAUGE_PANEL * place, across)
     canvas.line(LEFT, bottom, width - RIGHT, bottom, "axis")
     canvas.text(width - RIGHT, bottom + 32, "seconds since the start of the run", "note", "end")
-    return canvas.svg()
+    return canvas
 
 
-def along_the_run(variants: Sequence[Sampled], aim: Latency, width: int) -> str:
+def along_the_run(variants: Sequence[Sampled], aim: Latency, width: int) -> Canvas:
     """Return latency in the order of the samples, where their times are not known."""
     worst = ", ".join(f"{variant.name} {significant(variant.ordered[-1])} ms" for variant in variants)
     height = PANEL * len(variants) + 22
@@ -115,7 +98,7 @@ def along_the_run(variants: Sequence[Sampled], aim: Latency, width: int) -> str:
         panel(canvas, variant, aim, PANEL * place, Axis(0, order[-1], LEFT, width - RIGHT), order)
     canvas.text(LEFT, height - 4, "first sample", "tick")
     canvas.text(width - RIGHT, height - 4, "last sample", "tick", "end")
-    return canvas.svg()
+    return canvas
 
 
 def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Axis, times: Sequence[float]) -> None:
@@ -123,9 +106,7 @@ def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Ax
     right, base = canvas.width - RIGHT, top + PANEL - 14
     high = min(variant.ordered[-1], 1.3 * variant.at(0.99))
     scale = axis_for([variant.ordered[0], max(high, variant.ordered[0] * 1.02)], base, top + 24, pad=0.04)
-    for value in scale.ticks(4):
-        canvas.line(LEFT, scale(value), right, scale(value), "grid")
-        canvas.text(LEFT - 6, scale(value) + 4, tick(value), "tick", "end")
+    canvas.up(scale, LEFT, right, {value: tick(value) for value in scale.ticks(4)})
     most = 180 if canvas.width > 500 else 90
     bins = max(20, min(most, len(variant.samples) // 12))
     _bands(canvas, envelope(times, variant.samples, bins), across, scale, variant.css)
@@ -133,9 +114,7 @@ def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Ax
         canvas.line(LEFT, scale(aim.limit), right, scale(aim.limit), "limit")
     calls = f"n = {fixed(len(variant.samples), 0)}"
     numbers = f"{significant(variant.ordered[0])}–{significant(variant.ordered[-1])} ms, {calls}"
-    room = canvas.width - len(numbers) * 6.2 - 20
-    canvas.text(0, top + 14, shorten(variant.name, room), f"name ink halo {variant.css}")
-    canvas.text(right, top + 14, numbers, "tick halo", "end")
+    canvas.heading(top + 14, right, variant.name, numbers, f"name ink halo {variant.css}")
 
 
 def _bands(canvas: Canvas, bands: Sequence[Band], across: Axis, scale: Axis, css: str) -> None:
@@ -155,6 +134,4 @@ def _gauge(canvas: Canvas, gauge: Gauge, top: float, across: Axis) -> None:
     bands = envelope(gauge.times, gauge.values, min(len(gauge.values), 120 if canvas.width > 500 else 60))
     _bands(canvas, bands, across, scale, "s-gauge")
     numbers = f"{significant(low)}–{significant(high)} {unit}".rstrip()
-    room = canvas.width - len(numbers) * 6.2 - 20
-    canvas.text(0, top + 14, shorten(gauge.name, room), "note halo")
-    canvas.text(canvas.width - RIGHT, top + 14, numbers, "tick halo", "end")
+    canvas.heading(top + 14, canvas.width - RIGHT, gauge.name, numbers, "note halo")

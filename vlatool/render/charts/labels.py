@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from vlatool.render._svg import CHARACTER, Canvas, shorten
+from vlatool.render.charts.svg import CHARACTER, Canvas, shorten
 
 Box = tuple[float, float, float, float]
 WIDE = CHARACTER + 0.9
@@ -77,11 +77,11 @@ class Labels:
 
     def draw(self, canvas: Canvas, below: float) -> None:
         """Draw lines, labels, and the legend below ``below``."""
-        for each in self.labels:
-            if each.led:
-                canvas.line(each.mark.x, each.mark.y, *each.end, f"leader {each.mark.css}")
-        for each in self.labels:
-            canvas.text(each.x, each.y, each.text, f"name halo ink {each.mark.css}", each.anchor)
+        for label in self.labels:
+            if label.led:
+                canvas.line(label.mark.x, label.mark.y, *label.end, f"leader {label.mark.css}")
+        for label in self.labels:
+            canvas.text(label.x, label.y, label.text, f"name halo ink {label.mark.css}", label.anchor)
         for number, mark in enumerate(self.legend, 1):
             name = f"{number} {shorten(mark.name, canvas.width * 0.9)}"
             canvas.text(4, below + 8 + LEGEND_ROW * number - 6, name, f"name ink {mark.css}")
@@ -105,23 +105,19 @@ def labels(marks: Sequence[Mark], frame: Box, taken: Sequence[Box], longest: flo
 
 def _placed(marks: Sequence[Mark], texts: Sequence[str], frame: Box, taken: Sequence[Box]) -> tuple[Label, ...] | None:
     """Return a label for each mark, None when there is no room for one of them."""
-    points, lines = [mark.box for mark in marks], list(taken)
-    found: list[Label] = []
+    points = [mark.box for mark in marks]
+    placed: list[Label] = []
     for mark, text in zip(marks, texts, strict=True):
         crowded = any(other is not mark and _distance(mark, other) < CLOSE for other in marks)
-        label = next(
-            (
-                each for each in _candidates(mark, text, crowded)
-                if _inside(each.box, frame) and not _meets([each.box], [*points, *lines])
-                and not _meets([each.box], [box for one in found for box in (one.box, *one.way())])
-                and not _meets(each.way(), [one.box for one in found])
-            ),
-            None,
-        )  # fmt: skip
-        if label is None:
+        covered = [*points, *taken, *(box for label in placed for box in (label.box, *label.way()))]
+        texts_of = [label.box for label in placed]
+        for label in _candidates(mark, text, crowded):
+            if _inside(label.box, frame) and not _meets([label.box], covered) and not _meets(label.way(), texts_of):
+                placed.append(label)
+                break
+        else:
             return None
-        found.append(label)
-    return tuple(found)
+    return tuple(placed)
 
 
 def _candidates(mark: Mark, text: str, crowded: bool) -> Iterator[Label]:

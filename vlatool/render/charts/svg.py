@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -40,11 +41,8 @@ class Axis:
 
     def ticks(self, most: int = 6) -> list[float]:
         """Return round numbers inside the axis."""
-        if self.log:
-            found = _log_ticks(self.low, self.high, most)
-            if len(found) >= 2:
-                return found
-        return _linear_ticks(self.low, self.high, most)
+        rounded = _log_ticks(self.low, self.high, most) if self.log else []
+        return rounded if len(rounded) >= 2 else _linear_ticks(self.low, self.high, most)
 
 
 def _linear_ticks(low: float, high: float, most: int) -> list[float]:
@@ -59,8 +57,8 @@ def _linear_ticks(low: float, high: float, most: int) -> list[float]:
 def _log_ticks(low: float, high: float, most: int) -> list[float]:
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     for factors in ((1, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,)):
-        found = [factor * 10.0**decade for decade in decades for factor in factors]
-        inside = [float(f"{value:.10g}") for value in found if low <= value <= high]
+        rounded = (factor * 10.0**decade for decade in decades for factor in factors)
+        inside = [float(f"{value:.10g}") for value in rounded if low <= value <= high]
         if len(inside) <= most:
             return inside
     return inside
@@ -68,8 +66,8 @@ def _log_ticks(low: float, high: float, most: int) -> list[float]:
 
 def axis_for(values: Iterable[float], start: float, end: float, *, zero: bool = False, pad: float = 0.06) -> Axis:
     """Return an axis that holds the values, logarithmic when they are positive and span more than a factor of 8."""
-    found = list(values)
-    low, high = min(found), max(found)
+    numbers = list(values)
+    low, high = min(numbers), max(numbers)
     if low > 0 and high / low > 8:
         grow = (high / low) ** pad
         return Axis(low / grow, high * grow, start, end, log=True)
@@ -78,20 +76,13 @@ def axis_for(values: Iterable[float], start: float, end: float, *, zero: bool = 
     return Axis(max(0.0, bottom) if low >= 0 else bottom, high + room, start, end)
 
 
-def series(rows: Sequence[Row]) -> list[str]:
-    """Return the class of each row's colour: the baseline is grey, the chosen one (or the only one) blue."""
-    others_of = [row for row in rows if row.role != "baseline"]
-    if len(others_of) == 1:
-        return ["s-base" if row.role == "baseline" else "s-chosen" for row in rows]
-    found = []
-    others = 0
-    for row in rows:
-        if row.role in ("baseline", "chosen"):
-            found.append("s-base" if row.role == "baseline" else "s-chosen")
-        else:
-            found.append(f"s{others % SERIES}")
-            others += 1
-    return found
+def tinted(rows: Sequence[Row]) -> list[tuple[Row, str]]:
+    """Return each row with the class of its colour: the baseline is grey, the chosen one (or the only one) blue."""
+    named = {"baseline": "s-base", "chosen": "s-chosen"}
+    if sum(row.role != "baseline" for row in rows) == 1:
+        return [(row, named.get(row.role, "s-chosen")) for row in rows]
+    others = (f"s{place % SERIES}" for place in itertools.count())
+    return [(row, named.get(row.role) or next(others)) for row in rows]
 
 
 def shorten(text: str, width: float) -> str:
@@ -105,27 +96,25 @@ class Canvas:
 
     Args:
         key: Unique in the page; names the title and the description.
-        width, height: Size in pixels; the drawing scales down, and up to its width.
+        width, height: Size in pixels, which may grow; the drawing scales down, and up to its width.
         title: What it shows.
         description: What one sees in it.
     """
 
     def __init__(self, key: str, width: int, height: int, title: str, description: str) -> None:
         self.width, self.height = width, height
-        self._parts = [
-            f'<svg role="img" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
-            f'aria-labelledby="{key}-t {key}-d" class="chart">',
-            f'<title id="{key}-t">{escape(plain(title))}</title>',
-            f'<desc id="{key}-d">{escape(plain(description))}</desc>',
-        ]
+        self._key = _safe(key)
+        self._parts: list[str] = []
+        for tag, text in (("title", title), ("desc", description)):
+            self.add(tag, inner=text, id=f"{key}-{tag[0]}")
 
-    def add(self, tag: str, css: str = "", tip: str = "", **attributes: str | float) -> None:
-        """Add a shape; ``tip`` is shown when the pointer rests on it."""
-        if css:
-            attributes = {"class": css, **attributes}
-        words = [tag, *(f'{key.replace("_", "-")}="{_attribute(value)}"' for key, value in attributes.items())]
-        inner = f"><title>{escape(plain(tip))}</title></{tag}>" if tip else "/>"
-        self._parts.append(f"<{' '.join(words)}{inner}")
+    def add(self, tag: str, css: str = "", tip: str = "", inner: str = "", **attributes: str | float) -> None:
+        """Add a shape, or the text ``inner``; ``tip`` is shown when the pointer rests on it."""
+        names = {**attributes, "class": css} if css else attributes
+        words = [tag, *(f'{key.replace("_", "-")}="{_safe(value)}"' for key, value in names.items())]
+        title = f"<title>{_safe(tip)}</title>" if tip else ""
+        end = f">{title}{_safe(inner)}</{tag}>" if tip or inner else "/>"
+        self._parts.append(f"<{' '.join(words)}{end}")
 
     def line(self, x1: float, y1: float, x2: float, y2: float, css: str) -> None:
         """Add a straight line."""
@@ -133,10 +122,8 @@ class Canvas:
 
     def text(self, x: float, y: float, content: str, css: str = "", anchor: str = "start") -> None:
         """Add text; ``anchor`` is ``start``, ``middle`` or ``end``."""
-        where = f'x="{_attribute(x)}" y="{_attribute(y)}"'
-        side = "" if anchor == "start" else f' text-anchor="{anchor}"'
-        style = f' class="{css}"' if css else ""
-        self._parts.append(f"<text {where}{side}{style}>{escape(plain(content))}</text>")
+        side = {} if anchor == "start" else {"text_anchor": anchor}
+        self.add("text", css, x=x, y=y, **side, inner=content)
 
     def steps(self, points: Sequence[tuple[float, float]], css: str, tip: str = "") -> None:
         """Add a line that goes across, then up or down, to each point."""
@@ -156,10 +143,25 @@ class Canvas:
             self.text(axis(value), y + 15, tick(value), "tick", "middle")
         self.line(axis.start, y, axis.end, y, "axis")
 
+    def up(self, axis: Axis, left: float, right: float, ticks: Mapping[float, str]) -> None:
+        """Add the ticks of a vertical axis, value -> text, with grid lines from ``left`` to ``right``."""
+        for value, text in ticks.items():
+            self.line(left, axis(value), right, axis(value), "grid")
+            self.text(left - 6, axis(value) + 4, text, "tick", "end")
+
+    def heading(self, y: float, right: float, name: str, numbers: str, css: str) -> None:
+        """Add a name on the left, cut where it would reach the numbers that stand on the right."""
+        self.text(0, y, shorten(name, self.width - len(numbers) * 6.2 - 20), css)
+        self.text(right, y, numbers, "tick halo", "end")
+
     def svg(self) -> str:
         """Return the drawing."""
-        return "\n".join([*self._parts, "</svg>"])
+        top = (
+            f'<svg role="img" viewBox="0 0 {self.width} {self.height}" width="{self.width}" height="{self.height}" '
+            f'aria-labelledby="{self._key}-t {self._key}-d" class="chart">'
+        )
+        return "\n".join([top, *self._parts, "</svg>"])
 
 
-def _attribute(value: str | float) -> str:
-    return escape(value) if isinstance(value, str) else f"{value:.1f}".removesuffix(".0")
+def _safe(value: str | float) -> str:
+    return escape(plain(value)) if isinstance(value, str) else f"{value:.1f}".removesuffix(".0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from xml.etree import ElementTree
 
-from vlatool.render._trust import findings, reason, remedy, sentence
+from vlatool.render._trust import reasons, sentence
 from vlatool.report import Report
 
 CONTROLS = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -34,13 +34,13 @@ class JunitRenderer:
         suite = ElementTree.SubElement(root, "testsuite", {"name": clean(report.title), **shared})
         if report.created:
             suite.set("timestamp", report.created.removesuffix("+00:00"))
-        for name, verdict, said in cases:
+        for name, verdict, text in cases:
             case = ElementTree.SubElement(suite, "testcase", {"name": name, "classname": f"vlatool.{report.kind}"})
             if verdict in FAULTS:
-                ElementTree.SubElement(case, FAULTS[verdict], {"message": clean(said)}).text = clean(report.command)
+                ElementTree.SubElement(case, FAULTS[verdict], {"message": clean(text)}).text = clean(report.command)
             elif verdict in SKIPPED:
-                ElementTree.SubElement(case, "skipped", {"message": clean(f"{verdict}: {said}")})
-            ElementTree.SubElement(case, "system-out").text = clean(said)
+                ElementTree.SubElement(case, "skipped", {"message": clean(f"{verdict}: {text}")})
+            ElementTree.SubElement(case, "system-out").text = clean(text)
         ElementTree.indent(root)
         return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -54,7 +54,7 @@ def _trust(report: Report) -> list[tuple[str, str, str]]:
     """Return a case that says whether the measurement can be trusted; nothing when nobody judged it."""
     if not report.validity:
         return []
-    why = [part for found in findings(report) for part in (reason(found), remedy(found)) if part]
+    why = [part for _, reason, remedy in reasons(report) for part in (reason, remedy) if part]
     return [("measurement", report.validity, " ".join([sentence(report), *why]))]
 
 

@@ -5,8 +5,8 @@ Each reason not to trust the measurement is one more: a warning where it is susp
 
 from __future__ import annotations
 
-from vlatool.render._trust import findings, reason, remedy, sentence
-from vlatool.render.junit import cases_of
+from vlatool.render._trust import reasons, sentence
+from vlatool.render.formats.junit import cases_of
 from vlatool.report import Report
 
 COMMANDS = {"fail": "error", "inconclusive": "warning", "invalid": "error", "suspect": "warning"}
@@ -19,8 +19,8 @@ class GithubRenderer:
         """Return the lines; a notice when nothing is wrong."""
         cases = [*cases_of(report), *_trust(report)]
         lines = [
-            f"::{COMMANDS[verdict]} title={field(f'{report.title}: {name} {verdict}')}::{data(said)}"
-            for name, verdict, said in cases
+            f"::{COMMANDS[verdict]} title={field(f'{report.title}: {name} {verdict}')}::{data(text)}"
+            for name, verdict, text in cases
             if verdict in COMMANDS
         ]
         first = report.summary[0] if report.summary else report.title
@@ -29,13 +29,10 @@ class GithubRenderer:
 
 def _trust(report: Report) -> list[tuple[str, str, str]]:
     """Return (name, effect, text) of each finding; of the judgement alone when no finding says why."""
-    found = [
-        ("measurement", each.effect, " ".join(part for part in (reason(each), remedy(each)) if part))
-        for each in findings(report)
-    ]
-    if any(effect == report.validity for _, effect, _ in found):
-        return found
-    return [("measurement", report.validity, sentence(report)), *found]
+    findings = [("measurement", effect, f"{reason} {remedy}".strip()) for effect, reason, remedy in reasons(report)]
+    if any(effect == report.validity for _, effect, _ in findings):
+        return findings
+    return [("measurement", report.validity, sentence(report)), *findings]
 
 
 def data(text: str) -> str:
