@@ -47,24 +47,24 @@ def names(kind: str) -> list[str]:
 def plugins(kind: str) -> dict[str, metadata.EntryPoint]:
     """Return what other packages add to a kind: name -> entry point. A name that vlatool has itself is not taken."""
     own = _own(kind)
-    found = {entry.name.replace("-", "_"): entry for entry in metadata.entry_points(group=f"vlatool.{kind}")}
-    return {name: entry for name, entry in found.items() if name not in own}
+    entries = {entry.name.replace("-", "_"): entry for entry in metadata.entry_points(group=f"vlatool.{kind}")}
+    return {name: entry for name, entry in entries.items() if name not in own}
 
 
 def module(kind: str, name: str) -> ModuleType:
     """Import the file of one entry.
 
     Raises:
-        UsageError: when there is no such entry; names the nearest one.
+        UsageError: for an unknown entry; suggests the nearest one.
         PluginError: when another package brings it, and cannot be imported.
     """
-    wanted = name.replace("-", "_")
-    if wanted in _own(kind):
-        return importlib.import_module(f"{package_of(kind)}.{wanted}")
-    if wanted not in plugins(kind):
+    own_name = name.replace("-", "_")
+    if own_name in _own(kind):
+        return importlib.import_module(f"{package_of(kind)}.{own_name}")
+    if own_name not in plugins(kind):
         noun = NOUNS.get(kind, kind.removesuffix("s"))
-        raise UsageError(f"Unknown {noun} '{name}'; {nearest(wanted, names(kind))}.")
-    entry = plugins(kind)[wanted]
+        raise UsageError(f"Unknown {noun} '{name}'; {nearest(own_name, names(kind))}.")
+    entry = plugins(kind)[own_name]
     try:
         return importlib.import_module(entry.module)
     except VlatoolError:
@@ -77,37 +77,37 @@ def load(kind: str, name: str) -> type:
     """Return the one public class that the file of an entry defines, or that an entry point names.
 
     Raises:
-        UsageError: when there is no such entry.
-        PluginError: when another package brings it, and it is no such class.
+        UsageError: for an unknown entry.
+        PluginError: when another package brings it, and it is not such a class.
         TypeError: when the file defines no public class, or several (a fault of the file).
     """
     source = module(kind, name)
-    wanted = name.replace("-", "_")
-    entry = plugins(kind)[wanted] if source.__name__ != f"{package_of(kind)}.{wanted}" else None
+    own_name = name.replace("-", "_")
+    entry = plugins(kind)[own_name] if source.__name__ != f"{package_of(kind)}.{own_name}" else None
     if entry is None:
         return _only_class(source)
     try:
-        found = getattr(source, entry.attr) if entry.attr else _only_class(source)
-        if not inspect.isclass(found):
-            raise TypeError(f"{entry.value} is no class")
+        entry_class = getattr(source, entry.attr) if entry.attr else _only_class(source)
+        if not inspect.isclass(entry_class):
+            raise TypeError(f"{entry.value} is not a class")
     except (AttributeError, TypeError) as error:
         raise _blamed(entry, f"does not name a class: {error}") from error
-    _FOREIGN[found] = f"{kind}.{wanted}"
-    return found
+    _FOREIGN[entry_class] = f"{kind}.{own_name}"
+    return entry_class
 
 
-def entry_of(found: type) -> str:
+def entry_of(entry_class: type) -> str:
     """Return ``kind.name`` of a class that ``load`` returned, or of one in a file of its kind."""
-    return _FOREIGN.get(found) or ".".join(found.__module__.split(".")[-2:])
+    return _FOREIGN.get(entry_class) or ".".join(entry_class.__module__.split(".")[-2:])
 
 
 def all_plugins() -> dict[str, list[str]]:
     """Return other package (``acme 1.2``) -> what it adds, as ``kind.name``."""
-    found: dict[str, list[str]] = {}
+    added: dict[str, list[str]] = {}
     for group in sorted(metadata.entry_points().groups):
         for entry in plugins(group.partition(".")[2]).values() if group.startswith("vlatool.") else ():
-            found.setdefault(_title(entry), []).append(f"{group.partition('.')[2]}.{entry.name}")
-    return found
+            added.setdefault(_title(entry), []).append(f"{group.partition('.')[2]}.{entry.name}")
+    return added
 
 
 def owner(module_name: str) -> str:
@@ -126,8 +126,8 @@ def _own(kind: str) -> list[str]:
     spec = importlib.util.find_spec(package_of(kind))
     if spec is None or spec.submodule_search_locations is None:
         return []
-    found = pkgutil.iter_modules(spec.submodule_search_locations)
-    return sorted(each.name for each in found if not each.name.startswith("_"))
+    files = pkgutil.iter_modules(spec.submodule_search_locations)
+    return sorted(file.name for file in files if not file.name.startswith("_"))
 
 
 def _only_class(source: ModuleType) -> type:
@@ -148,5 +148,5 @@ def _title(entry: metadata.EntryPoint) -> str:
 def _blamed(entry: metadata.EntryPoint, what: str) -> PluginError:
     return PluginError(
         f"The package {_title(entry)}, which brings '{entry.name}' ({entry.group}), {what}.",
-        "tell its authors, or uninstall it",
+        "report it to its authors, or uninstall it",
     )

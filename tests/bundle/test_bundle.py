@@ -140,7 +140,7 @@ def test_damage_is_not_looked_for_when_it_is_not_asked_for(bundle):
 
 
 def test_a_path_that_does_not_exist(tmp_path: Path):
-    with pytest.raises(BundleError, match="There is no bundle at"):
+    with pytest.raises(BundleError, match="No bundle at"):
         Bundle.open(tmp_path / "nothing")
 
 

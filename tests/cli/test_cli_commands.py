@@ -239,7 +239,7 @@ def test_a_probe_ends_as_load_would(vlatool, float_bundle, copied, also):
     code, out, err = vlatool("inspect", bundle.path, "--probe", *also)
     assert code == 3
     assert "golden error 0.67 (allowed 0.01), in physical units " in out or also
-    assert "another golden action than recorded: relative error 0.667, allowed 0.01." in err
+    assert "a different golden action than recorded: relative error 0.667, allowed 0.01." in err
     with pytest.raises(GraphError) as caught:
         load(bundle.path)
     assert caught.value.message in err

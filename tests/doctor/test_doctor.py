@@ -50,7 +50,7 @@ def test_int8_products_are_measured_for_every_engine(monkeypatch) -> None:
 
 def test_avx2_without_vnni_names_flags_and_the_engine_that_is_exact() -> None:
     found = doctor.instruction_set(["avx2", "fma"])
-    assert "ONNX Runtime is told to be exact" in found.finding
+    assert "ONNX Runtime is set to be exact" in found.finding
     assert {"--layout", "--reduce-range"} <= {*re.findall(r"--[a-z-]+", found.fix)}
 
 

@@ -93,7 +93,7 @@ def test_external_data_that_is_missing(tmp_path: Path, onnx_file):
 
 
 def test_a_missing_file(tmp_path: Path):
-    with pytest.raises(SourceError, match="There is no ONNX file"):
+    with pytest.raises(SourceError, match="No such ONNX file"):
         OnnxFile(model=tmp_path / "absent.onnx").check(None, None)
 
 

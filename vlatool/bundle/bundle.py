@@ -51,7 +51,7 @@ class Bundle:
             verify: Check that the files are those of the manifest, with their sizes and SHA-256, and no others.
 
         Raises:
-            BundleError: when the directory is missing, is no bundle, or a file is missing, changed, a link or unknown.
+            BundleError: when the directory is missing or no bundle, or a file is missing, changed, unknown or a link.
             SpecError: for an impossible spec or program.
         """
         bundle = cls.described(path)
@@ -64,7 +64,7 @@ class Bundle:
         """Read the manifest, hold it against its digest; the files are checked when they are read (``read``).
 
         Raises:
-            BundleError: when the directory is missing or is no bundle, or the manifest is changed or makes no sense.
+            BundleError: when the directory is missing or is not a bundle, or the manifest is changed or invalid.
             SpecError: for an impossible spec or program.
         """
         root = Path(path)
@@ -174,8 +174,8 @@ class Bundle:
         graphs = tuple(graph.file for graph in self.manifest.graphs.values())
         folders = tuple(f"{folder}/" for graph in graphs if (folder := graph.rpartition("/")[0]))
         beside = () if len(folders) == len(graphs) else tuple(name for name in self.manifest.files if "/" not in name)
-        wanted = (*graphs, *folders, *beside)
-        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(wanted))
+        prefixes = (*graphs, *folders, *beside)
+        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(prefixes))
 
 
 def seal(directory: Path, manifest: Manifest) -> Bundle:
@@ -184,9 +184,9 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
         if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
-            found = path.stat()
-            linked = found.st_nlink > 1  # shared among stages of the cache, and read-only
-            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), found.st_size)
+            status = path.stat()
+            linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
+            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), status.st_size)
     sealed = replace(manifest, files=files)
     write_manifest(directory, sealed)
     return Bundle(directory, sealed)
@@ -231,12 +231,12 @@ def _digest(stream: Any) -> str:
 
 def _read_manifest(root: Path) -> Any:
     if not root.exists():
-        raise BundleError(f"There is no bundle at {root}.")
+        raise BundleError(f"No bundle at {root}.")
     path = root / MANIFEST
     if not path.is_file():
-        found = ", ".join(sorted(entry.name for entry in root.iterdir())[:6]) if root.is_dir() else "a file"
+        entries = ", ".join(sorted(entry.name for entry in root.iterdir())[:6]) if root.is_dir() else "a file"
         raise BundleError(
-            f"{root} is not a bundle: it has no {MANIFEST} (found: {found or 'nothing'}).",
+            f"{root} is not a bundle: it has no {MANIFEST} (found: {entries or 'nothing'}).",
             "make one with: vlatool export SOURCE -o BUNDLE",
         )
     content = _read_small(root, MANIFEST, limit("manifest_bytes"))
@@ -248,7 +248,7 @@ def _read_manifest(root: Path) -> Any:
 def _check_digest(root: Path, content: bytes) -> None:
     if not (root / DIGEST).exists():
         raise BundleError(
-            f"{root} has no {DIGEST}: a vlatool before there was one made it, or the file was taken away.",
+            f"{root} has no {DIGEST}: an older vlatool made it, or the file was removed.",
             f"export the policy again; or, if you trust this copy: cd {root} && sha256sum {MANIFEST} > {DIGEST}",
         )
     if _read_small(root, DIGEST, 4096) != digest_of(content):

@@ -83,8 +83,8 @@ class TensorSpec:
         for field, values in allowed.items():
             got = getattr(self, field)
             if got not in values:
-                told = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
-                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {told}.")
+                allowed_values = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
+                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {allowed_values}.")
 
     def _check_shape(self) -> None:
         for axis in self.shape:
@@ -240,17 +240,16 @@ class PolicySpec:
 
 
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
-    if not isinstance(data, Mapping):
-        raise SpecError(f"The {where} must be a mapping; got {type(data).__name__}.")
-    known(data, [field.name for field in fields(cls)], f"The {where}", SpecError)
-    return mapping(data, f"The {where}", SpecError)
+    values = mapping(data, f"The {where}", SpecError)
+    known(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
+    return values
 
 
 def _plain(value: Any) -> dict[str, Any]:
     """Return the non-default fields of a dataclass, tuples as lists (required fields always)."""
-    found = {}
+    plain = {}
     for field in fields(value):
         item = getattr(value, field.name)
         if item != field.default:
-            found[field.name] = list(item) if isinstance(item, tuple) else item
-    return found
+            plain[field.name] = list(item) if isinstance(item, tuple) else item
+    return plain

@@ -81,9 +81,9 @@ OF_FIELDS: dict[str, Callable[[str], list[str]]] = {
 """Field of a stage -> what completes it."""
 
 
-def items(found: list[str]) -> list[Any]:
+def items(values: list[str]) -> list[Any]:
     """Return what click takes from a group."""
-    return [CompletionItem(each) for each in found]
+    return [CompletionItem(value) for value in values]
 
 
 def _names(kind: str, incomplete: str) -> list[str]:
@@ -98,15 +98,15 @@ def _holds(path: str, name: str) -> bool:
     return os.path.isfile(os.path.join(path, name))
 
 
-def _paths(incomplete: str, wanted: Callable[[str], bool]) -> list[str]:
+def _paths(incomplete: str, accepts: Callable[[str], bool]) -> list[str]:
     """Return the paths that begin so and are wanted; folders that are not end in a slash."""
-    found = []
+    paths = []
     for path in _beginning(incomplete):
-        if wanted(path):
-            found.append(path)
+        if accepts(path):
+            paths.append(path)
         elif os.path.isdir(path):
-            found.append(path + os.sep)
-    return found
+            paths.append(path + os.sep)
+    return paths
 
 
 def _beginning(incomplete: str) -> Iterator[str]:

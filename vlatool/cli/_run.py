@@ -13,9 +13,9 @@ import typer
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
+from vlatool.cli._board_summary import for_board
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
-from vlatool.cli._made import for_board, graph_bytes
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.machine.host import MAX_CPU_ISA
@@ -103,20 +103,20 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
                 stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
-        made = run_transform(stage, bundle, out, context, force=force)
-        there = for_board(made, bundle, board, context) if board else None
+        result = run_transform(stage, bundle, out, context, force=force)
+        there = for_board(result, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""
-    summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
-    precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
-    findings = made.manifest.findings
+    summary = {"bundle": str(out), "hash": result.hash, "bytes": result.size_bytes}
+    precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}
+    findings = result.manifest.findings
     if as_json:
         document({**summary, "precision": precision, "findings": findings, "board": there.values() if there else None})
-        _refuse(made, baseline)
+        _refuse(result, baseline)
         return
-    graphs = f"graphs {graph_bytes(made) / 1e6:.2f} MB, " if made.manifest.graphs else ""
-    sizes = f"{graphs}in all {made.size_bytes / 1e6:.1f} MB"
-    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {sizes}")
-    for line in stage.lines(made):
+    graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
+    sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
+    typer.echo(f"{out}: {result.manifest.name} {result.manifest.version}, {sizes}")
+    for line in stage.lines(result):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         if not shares:
@@ -125,7 +125,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
     for line in there.lines() if there else ():
         typer.echo(f"  {line}")
-    _refuse(made, baseline)
+    _refuse(result, baseline)
 
 
 def _onnx_source(export: Transform, source: Transform) -> Transform:
@@ -134,8 +134,8 @@ def _onnx_source(export: Transform, source: Transform) -> Transform:
     return source.model_copy(update={"opset": getattr(export, "opset", None)}) if asked else source
 
 
-def _refuse(made: Bundle, baseline: str = "") -> None:
-    """Leave with an error when a stage found the bundle to be wrong; it is there all the same, to be looked at.
+def _refuse(bundle: Bundle, baseline: str = "") -> None:
+    """Fail when a stage marked the bundle as wrong; it stays where it is, for inspection.
 
     Args:
         made: The new bundle.
@@ -144,18 +144,18 @@ def _refuse(made: Bundle, baseline: str = "") -> None:
     Raises:
         GateFailed: naming the first finding.
     """
-    for finding in made.manifest.findings:
+    for finding in bundle.manifest.findings:
         beside = f" --baseline {shlex.quote(baseline)}" if baseline else ""
         overrule = f"load, optimize and gate refuse the bundle (to overrule: {finding['name']})"
-        fix = f"vlatool explain {made.path}{beside}; {overrule}"
-        raise GateFailed(f"{made.path} was written, but it is wrong: {finding['message']}", fix)
+        fix = f"vlatool explain {bundle.path}{beside}; {overrule}"
+        raise GateFailed(f"{bundle.path} was written, but it is wrong: {finding['message']}", fix)
 
 
 def named_files(stage: Stage) -> tuple[Path, ...]:
     """Return the files and directories that the options of a stage name."""
     values = [getattr(stage, name) for name in type(stage).model_fields]
-    each = [one for value in values for one in (value if isinstance(value, tuple) else (value,))]
-    return tuple(one for one in each if isinstance(one, Path))
+    items = [item for value in values for item in (value if isinstance(value, tuple) else (value,))]
+    return tuple(item for item in items if isinstance(item, Path))
 
 
 def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
@@ -247,14 +247,14 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
 
 
 def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
-    """Add what is predicted for a board; a robot without onnx measures all the same, and is told what is missing."""
+    """Add what is predicted for a board; without onnx, the measurement stands, with a warning."""
     from vlatool.boards.predict import predictions
 
     row = report.rows[-1] if report.kind == "evaluate" else report.rows[0]
     try:
-        told = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
+        predicted = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
     except MissingExtra as error:
         return replace(report, warnings=(*report.warnings, f"nothing is predicted for {board.name}: {error.message}"))
-    rows = tuple(told if each is row else each for each in report.rows)
+    rows = tuple(predicted if other is row else other for other in report.rows)
     first, *more = (*report.summary, "")
-    return replace(report, rows=rows, summary=(first + foretold(told, told, board.name), *filter(None, more)))
+    return replace(report, rows=rows, summary=(first + foretold(predicted, predicted, board.name), *filter(None, more)))

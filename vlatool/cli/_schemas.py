@@ -53,10 +53,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 """Command, or group of commands -> what it prints when it ends well; the first is the usual one."""
 
 
-def a(told: str, /, **properties: Schema) -> Schema:
+def a(description: str, /, **properties: Schema) -> Schema:
     """Return the schema of an object with exactly these keys; an error may stand beside them."""
     return {
-        "type": "object", "description": told, "properties": {**properties, "error": ERROR},
+        "type": "object", "description": description, "properties": {**properties, "error": ERROR},
         "required": list(properties), "additionalProperties": False,
     }  # fmt: skip
 
@@ -189,7 +189,7 @@ def _inlined(schema: Schema) -> Schema:
     def walk(value: Any) -> Any:
         if isinstance(value, dict):
             named = str(value.get("$ref", "")).removeprefix("#/$defs/")
-            return walk(defs[named]) if named else {key: walk(each) for key, each in value.items() if key != "$defs"}
-        return [walk(each) for each in value] if isinstance(value, list) else value
+            return walk(defs[named]) if named else {key: walk(item) for key, item in value.items() if key != "$defs"}
+        return [walk(item) for item in value] if isinstance(value, list) else value
 
     return dict(walk(schema))

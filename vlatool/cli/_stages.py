@@ -54,7 +54,7 @@ class StageGroup(TyperGroup):
         if args and args[0] != "--help" and args[0].replace("_", "-") not in known:
             likely = difflib.get_close_matches(args[0], known, n=1)
             if likely and not ctx.resilient_parsing and not Path(args[0]).exists():
-                raise UsageError(f"There is no {self.name} method '{args[0]}'; {nearest(args[0], known)}.")
+                raise UsageError(f"Unknown {self.name} method '{args[0]}'; {nearest(args[0], known)}.")
             args = [DEFAULTS[self.name or ""], *args]
         return super().parse_args(ctx, args)
 
@@ -73,7 +73,7 @@ def built(function: Callable[..., Any], name: str, text: str | None = None, **se
 
 
 def failing(name: str, error: PluginError) -> Any:
-    """Return a command of another package that says why it is none; so that ``--help`` lists all others."""
+    """Return a command that says why another package's cannot run, so that ``--help`` lists all others."""
 
     def fails(words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
         raise error
@@ -87,15 +87,15 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
     measures = issubclass(stage, Measure)
     common = _run.MEASURE_FLAGS if measures else _run.TRANSFORM_FLAGS
 
-    def command(**given: Any) -> None:
-        context: typer.Context = given.pop("context")
-        options = {name: given.pop(name) for name in own}
+    def command(**arguments: Any) -> None:
+        context: typer.Context = arguments.pop("context")
+        options = {name: arguments.pop(name) for name in own}
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         built = validated(stage, chosen, f"vlatool {stage.kind()} {registry_name(stage)}")
         if measures:
-            _run.measure(typing.cast(Measure, built), **given)
+            _run.measure(typing.cast(Measure, built), **arguments)
         else:
-            _run.transform(typing.cast(Any, built), **given)
+            _run.transform(typing.cast(Any, built), **arguments)
 
     if issubclass(stage, Measure) and stage.remotely:
         common = (*common, *_run.REMOTE_FLAGS)
@@ -133,6 +133,6 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
 
 
 def _typed(context: typer.Context, name: str) -> bool:
-    """Say whether an option was given, here or by a variable, so that a board's wishes do not count."""
+    """Return whether an option was given, here or by a variable, so that a board's wishes do not count."""
     source = context.get_parameter_source(name)
     return source is not None and "DEFAULT" not in source.name

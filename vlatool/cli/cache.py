@@ -18,7 +18,7 @@ from vlatool.files.printable import printable
 if TYPE_CHECKING:
     from vlatool.stage.cache import Contents, Entry, Removed
 
-app = typer.Typer(help="Look at finished stages that are kept, and remove them.", no_args_is_help=True,
+app = typer.Typer(help="List and remove finished stages that are kept.", no_args_is_help=True,
                   rich_markup_mode=None)  # fmt: skip
 SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
@@ -28,14 +28,14 @@ AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 
 @app.command("size")
 def size(cache: Place = None, as_json: AsJson = False) -> None:
-    """Say how large the cache is, stage by stage; a recording that stages share is counted once."""
+    """Print how large the cache is, stage by stage; a recording that stages share is counted once."""
     held = _contents(cache)
     if as_json:
         document(_head(held) | {"stages": [_sum(held, what) for what in _kinds(held)]})
         return
     for what in _kinds(held):
-        told = _sum(held, what)
-        typer.echo(f"{what:28} {told['entries']:5d} kept  {_human(told['bytes']):>9} of their own")
+        stage = _sum(held, what)
+        typer.echo(f"{what:28} {stage['entries']:5d} kept  {_human(stage['bytes']):>9} of their own")
     typer.echo(f"{'shared':28} {'':10}  {_human(_head(held)['shared_bytes']):>9}")
     typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
     _tell_unknown(held)
@@ -46,7 +46,7 @@ def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
     """List what is kept, the least recently used first: age, size of its own, size that it shares, name."""
     held = _contents(cache)
     if as_json:
-        document(_head(held) | {"entries": [_told(held, entry) for entry in held.entries]})
+        document(_head(held) | {"entries": [_entry_row(held, entry) for entry in held.entries]})
         return
     typer.echo(f"{'age':>6}  {'own':>9}  {'shared':>9}  name")
     for entry in held.entries:
@@ -79,7 +79,7 @@ def prune(
     removed = kept.prune(place, older_than_s=age, most_bytes=most, dry_run=dry_run)
     left = kept.contents(place).bytes - (removed.freed if dry_run else 0)
     if as_json:
-        document(_told_removed(place, removed, left, dry_run))
+        document(_removed_row(place, removed, left, dry_run))
         return
     for entry in removed.entries:
         typer.echo(f"{'would remove' if dry_run else 'removed'} {entry.name}")
@@ -95,9 +95,9 @@ def _place(cache: Path | None) -> Path:
 
     place = cache or cache_directory()
     if (cache is not None or place.exists()) and not place.is_dir():
-        raise DataError(f"There is no directory {place}.", "name the directory of a cache")
+        raise DataError(f"No such directory: {place}.", "name the directory of a cache")
     if cache is not None and not is_cache(place):
-        raise DataError(f"{place} is no cache: vlatool keeps nothing in it.", "name the directory of a cache")
+        raise DataError(f"{place} is not a cache: vlatool keeps nothing in it.", "name the directory of a cache")
     return place
 
 
@@ -109,13 +109,13 @@ def _contents(cache: Path | None) -> Contents:
 
 def _amount(option: str, text: str, units: dict[str, int], example: str) -> float:
     """Return what a person wrote as a number and a unit, in the smallest unit."""
-    found = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", text)
-    if found is None:
+    match = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", text)
+    if match is None:
         raise UsageError(f"{option} is '{text[:40]}'; it must be a number and a unit, such as {example}.")
-    unit = next((name for name in units if name.lower() == found[2].lower()), None)
+    unit = next((name for name in units if name.lower() == match[2].lower()), None)
     if unit is None:
-        raise UsageError(f"{option} is '{text[:40]}'; {nearest(found[2], units)}.")
-    value = float(found[1]) * units[unit]
+        raise UsageError(f"{option} is '{text[:40]}'; {nearest(match[2], units)}.")
+    value = float(match[1]) * units[unit]
     if not math.isfinite(value):
         raise UsageError(f"{option} is '{text[:40]}', which is too large.")
     return value
@@ -136,13 +136,13 @@ def _head(held: Contents) -> dict[str, Any]:
             "unknown": list(held.unknown)}  # fmt: skip
 
 
-def _told(held: Contents, entry: Entry) -> dict[str, Any]:
+def _entry_row(held: Contents, entry: Entry) -> dict[str, Any]:
     own, shared = held.sizes(entry)
     used = datetime.fromtimestamp(entry.used, timezone.utc).isoformat(timespec="seconds")
     return {"name": entry.name, "stage": entry.what, "used": used, "bytes": own, "shared_bytes": shared}
 
 
-def _told_removed(place: Path, removed: Removed, left: int, dry_run: bool) -> dict[str, Any]:
+def _removed_row(place: Path, removed: Removed, left: int, dry_run: bool) -> dict[str, Any]:
     return {"cache": str(place), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
             "freed_bytes": removed.freed, "bytes": left, "stays": removed.stays}  # fmt: skip
 

@@ -41,7 +41,7 @@ def compare(
     refuse_existing(output, force, *paths)
     for path in paths:
         if not path.exists():
-            raise DataError(f"There is no report at {path}, and no bundle.")
+            raise DataError(f"No report or bundle at {path}.")
     bundles = [(path / MANIFEST).is_file() for path in paths]
     if all(bundles):
         with progress() as context:

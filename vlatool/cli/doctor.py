@@ -11,7 +11,7 @@ from vlatool.cli._document import document
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
-    """Say what this machine has: engines, instruction sets, telemetry, clocks, missing extras; and how to fix it."""
+    """Show what this machine has: engines, instruction sets, telemetry, clocks, missing extras; and how to fix it."""
     from vlatool.doctor.doctor import diagnose
 
     checks = diagnose()

@@ -30,7 +30,7 @@ def explain(
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
-    """Say which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
+    """Show which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
     from vlatool.explain import Options
     from vlatool.explain import explain as found_out
 

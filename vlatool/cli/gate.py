@@ -54,7 +54,7 @@ def run(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="of observations, noise and order; fresh, and told in the report, if unset"),
+        typer.Option(min=0, help="of observations, noise and order; fresh, and recorded in the report, if unset"),
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
@@ -72,9 +72,11 @@ def run(
     gate = _gate(config, margin)
     base = baseline or gate.baseline
     if base is None:
-        raise UsageError("There is no baseline.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)")
+        raise UsageError(
+            "No baseline to compare with.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)"
+        )
     if not base.exists():
-        raise BundleError(f"There is no baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
+        raise BundleError(f"No baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
     refuse_existing(output, force, candidate, *_read_by(gate, base), config)
     if junit is not None:
         _place(junit, candidate, *_read_by(gate, base), config)
@@ -123,8 +125,10 @@ def init(
 @contextlib.contextmanager
 def _folders(files: Iterable[Path]) -> Iterator[None]:
     """Make the folders of files; of these, remove what stays empty when they cannot be written."""
-    wanted = sorted({folder for path in files for folder in path.absolute().parents}, key=lambda each: len(each.parts))
-    absent = [folder for folder in wanted if not folder.exists()]
+    folders = sorted(
+        {folder for path in files for folder in path.absolute().parents}, key=lambda folder: len(folder.parts)
+    )
+    absent = [folder for folder in folders if not folder.exists()]
     try:
         for folder in absent:
             with output_errors(folder):
@@ -153,7 +157,7 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
 
 
 def _place(junit: Path, *inputs: str | Path | None) -> None:
-    """Say before the work that the file cannot be written, is or lies in an input, or is not vlatool's to replace.
+    """Refuse, before the work, a file that cannot be written, is or lies in an input, or is not vlatool's to replace.
 
     Raises:
         OutputError: when it cannot.
@@ -162,7 +166,7 @@ def _place(junit: Path, *inputs: str | Path | None) -> None:
         raise OutputError(f"--junit {junit} is a directory.", "name a file")
     above = next(folder for folder in junit.absolute().parents if folder.exists())
     if not (above.is_dir() and os.access(above, os.W_OK)):
-        raise OutputError(f"--junit {junit} cannot be written: {above} is no directory that may be written to.")
+        raise OutputError(f"--junit {junit} cannot be written: {above} is not a writable directory.")
     refuse_inputs(junit, inputs)
     if os.path.lexists(junit):
         refuse_file(junit, force=True)

@@ -22,12 +22,12 @@ def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JS
     """List the profiles."""
     from vlatool.hardware.profile import load_profile, names
 
-    found = [load_profile(name) for name in names()]
+    profiles = [load_profile(name) for name in names()]
     if as_json:
-        document([profile.model_dump(mode="json") for profile in found])
+        document([profile.model_dump(mode="json") for profile in profiles])
         return
-    width = max((len(profile.name) for profile in found), default=0)
-    for profile in found:
+    width = max((len(profile.name) for profile in profiles), default=0)
+    for profile in profiles:
         typer.echo(f"{profile.name:{width}}  {profile.title}")
 
 
@@ -67,17 +67,17 @@ def diff_profiles(
     from vlatool.hardware.profile import load_profile
 
     pair = [dict(_leaves(load_profile(name).model_dump(mode="json", exclude={"sources"}))) for name in (first, second)]
-    found = [
+    rows = [
         {"field": field, first: pair[0].get(field), second: pair[1].get(field)}
         for field in dict.fromkeys([*pair[0], *pair[1]])
         if pair[0].get(field) != pair[1].get(field)
     ]
     if as_json:
-        document(found)
+        document(rows)
         return
-    for each in found:
-        typer.echo(f"{each['field']:44} {_told(each[first]):>24} {_told(each[second]):>24}")
-    if not found:
+    for row in rows:
+        typer.echo(f"{row['field']:44} {_cell(row[first]):>24} {_cell(row[second]):>24}")
+    if not rows:
         typer.echo("no difference")
 
 
@@ -98,18 +98,18 @@ def validate_profiles(
     valid, wrong = [], []
     for name in files:
         path = Path(name)
-        inside = sorted(each for each in path.iterdir() if each.suffix in SUFFIXES) if path.is_dir() else [name]
+        inside = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES) if path.is_dir() else [name]
         if not inside:
-            raise ProfileError(f"There is no profile in {path}.", "its files end in .yaml")
-        for each in inside:
+            raise ProfileError(f"No profiles in {path}.", "its files end in .yaml")
+        for place in inside:
             try:
-                found = load_profile(each)
+                profile = load_profile(place)
             except ProfileError as error:
                 wrong.append(error.message)
             else:
-                valid.append(found.name)
+                valid.append(profile.name)
                 if not as_json:
-                    typer.echo(f"ok  {found.name}")
+                    typer.echo(f"ok  {profile.name}")
     if as_json:
         document({"valid": valid, "wrong": wrong})
     if wrong:
@@ -158,12 +158,12 @@ def calibrate_profile(
 
     load = workload(Bundle.open(bundle)) if bundle else None
     profile = load_profile(name)
-    found = measured_in(report, profile, mode, load)
-    file = store(found)
+    measured = measured_in(report, profile, mode, load)
+    file = store(measured)
     if as_json:
-        document({"kept_in": str(file), "measured": [asdict(each) for each in found]})
-    for each in [] if as_json else found:
-        typer.echo(f"{each.profile}, {each.mode}, {each.engine}, {each.precision}: {each.ms:.4g} ms measured")
+        document({"kept_in": str(file), "measured": [asdict(point) for point in measured]})
+    for point in [] if as_json else measured:
+        typer.echo(f"{point.profile}, {point.mode}, {point.engine}, {point.precision}: {point.ms:.4g} ms measured")
     if made_on := elsewhere(report, profile):
         typer.echo(f"warning: the report was made on {made_on}, which {name} does not name in model_strings", err=True)
     if not as_json:
@@ -183,7 +183,7 @@ def _leaves(values: Any, where: str = "") -> Iterator[tuple[str, Any]]:
         yield where, values
 
 
-def _told(value: Any) -> str:
+def _cell(value: Any) -> str:
     text = "–" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 24 else text[:23] + "…"
 

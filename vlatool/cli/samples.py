@@ -24,8 +24,8 @@ def list_samples(
     """List the shapes that can be made."""
     if as_json:
         known = registry.names("samples")
-        found = [(name.replace("_", "-"), registry.module("samples", name).DESCRIPTION) for name in known]
-        document([{"name": name, "description": text} for name, text in found])
+        samples = [(name.replace("_", "-"), registry.module("samples", name).DESCRIPTION) for name in known]
+        document([{"name": name, "description": text} for name, text in samples])
         return
     for name in registry.names("samples"):
         typer.echo(f"{name.replace('_', '-'):16} {registry.module('samples', name).DESCRIPTION}")
@@ -50,7 +50,7 @@ def make(
 
     known = [entry.replace("_", "-") for entry in registry.names("samples")]
     if name.replace("_", "-") not in known:
-        raise UsageError(f"There is no sample '{name}'; {nearest(name, known)}.")
+        raise UsageError(f"Unknown sample '{name}'; {nearest(name, known)}.")
     refuse_existing(output, force, kind="")
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)

@@ -30,9 +30,9 @@ def simulate(
     from vlatool.boards.answer import simulated, simulation_lines
 
     with progress() as context:
-        found = simulated(source, profile, mode, engine, precision, context)
+        prediction = simulated(source, profile, mode, engine, precision, context)
     if as_json:
-        document(found)
+        document(prediction)
         return
-    for line in simulation_lines(found):
+    for line in simulation_lines(prediction):
         typer.echo(line)

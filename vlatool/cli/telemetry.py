@@ -32,30 +32,32 @@ def telemetry(
         if not (math.isfinite(value) and 0 < value <= LONGEST_S):
             raise UsageError(f"--{name} is {value:g}; allowed: above 0, up to {LONGEST_S:g}.")
     if not root.is_dir():
-        raise DataError(f"There is no directory {root}.")
+        raise DataError(f"No such directory: {root}.")
     with Recorder(open_all(root), period) as recorder:
         time.sleep(seconds)
-    found = recorder.recorded
+    recorded = recorder.recorded
     if as_json:
-        document(found.to_dict())
+        document(recorded.to_dict())
         return
-    for line in lines(found):
+    for line in lines(recorded):
         typer.echo(line)
 
 
-def lines(found: Recorded) -> Iterator[str]:
+def lines(recorded: Recorded) -> Iterator[str]:
     """Return what a person reads: energy first, then every reading, then what is unmeasured and why."""
-    for energy in found.energy:
-        told = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"
-        yield f"{told}: {energy.label} ({energy.source})"
-    said = {None: "nothing on this machine tells", False: "no"}.get(found.throttled, "; ".join(found.throttling))
-    yield f"throttled: {said}"
-    for name, gauge in sorted(found.gauges.items()):
+    for energy in recorded.energy:
+        power = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"
+        yield f"{power}: {energy.label} ({energy.source})"
+    throttled = {None: "nothing on this machine tells", False: "no"}.get(
+        recorded.throttled, "; ".join(recorded.throttling)
+    )
+    yield f"throttled: {throttled}"
+    for name, gauge in sorted(recorded.gauges.items()):
         span = f" ({gauge.min:.4g} to {gauge.max:.4g})" if gauge.min != gauge.max else ""
         yield f"  {name}: {gauge.mean:.4g} {gauge.unit}{span}"
-    for name, counter in sorted(found.counters.items()):
+    for name, counter in sorted(recorded.counters.items()):
         yield f"  {name}: +{counter.difference:.4g} {counter.unit} in {counter.seconds:.1f} s"
-    if found.absent:
+    if recorded.absent:
         yield "unmeasured:"
-    for absent in found.absent:
+    for absent in recorded.absent:
         yield f"  {absent.reader}: {absent.reason}"

@@ -25,7 +25,7 @@ def verify(
     force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
 ) -> None:
-    """Say whether a policy gives what the code that it was made from gives, and if not, which stage differs.
+    """Check whether a policy gives what the code that it was made from gives, and if not, show which stage differs.
 
     FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the action in physical
     units. Exits 1 when the actions differ.

@@ -54,7 +54,7 @@ def load(
         SpecError: normalisation statistics or a tokenizer are missing or do not fit.
         GraphError: the engine refuses a graph, the graph does not take and give what the spec declares, it computes
             something else than the graph says, a stage found the bundle to be wrong, or a limit is reached.
-        UsageError: an argument makes no sense.
+        UsageError: an argument is invalid.
         MissingExtra: the engine is not installed.
 
     Example:

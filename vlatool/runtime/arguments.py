@@ -13,7 +13,7 @@ MOST_THREADS = 1024
 
 
 def check_path(path: Any) -> None:
-    """Refuse what is no path.
+    """Refuse anything but a path.
 
     Raises:
         UsageError: naming what it is.
@@ -23,7 +23,7 @@ def check_path(path: Any) -> None:
 
 
 def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, optional: bool = False) -> None:
-    """Refuse what is no whole number from ``least`` to ``most``; None too, unless it is optional.
+    """Refuse anything but a whole number from ``least`` to ``most``; None too, unless it is optional.
 
     Raises:
         UsageError: naming the argument, what it is and what is allowed.
@@ -38,7 +38,7 @@ def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, op
 
 
 def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False) -> None:
-    """Refuse what is no number above 0 (from 0 where ``zero``); None too, unless it is optional.
+    """Refuse anything but a number above 0 (from 0 where ``zero``); None too, unless it is optional.
 
     Raises:
         UsageError: naming the argument, what it is and what is allowed.
@@ -57,7 +57,7 @@ def check_load(
     """Check all arguments of ``load``.
 
     Raises:
-        UsageError: for the first that makes no sense.
+        UsageError: for the first invalid one.
     """
     check_path(path)
     check_whole("threads", threads, 1, MOST_THREADS, optional=True)

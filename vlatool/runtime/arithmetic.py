@@ -80,8 +80,16 @@ def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float
         return math.nan
 
 
-def said(product: float) -> str:
-    """Say what a smallest element of the product means."""
+def ort_exactness(ort: Any, written: bool = False) -> str:
+    """Return whether integer products are exact in ONNX Runtime on this machine, or saturate; see ``ort_product``."""
+    plain = exactness(ort_product(ort, written=written))
+    if plain != SATURATING:
+        return plain
+    return EXACT_BY_OPTION if ort_product(ort, precise=True, written=written) == WANTED else plain
+
+
+def exactness(product: float) -> str:
+    """Return what a smallest element of the product means."""
     if math.isnan(product):
         return UNKNOWN
     return EXACT if product == WANTED else SATURATING
@@ -103,12 +111,12 @@ def as_written(ort: Any, options: Any, precise: bool) -> None:
 
 
 def is_int8(manifest: Manifest) -> bool:
-    """Say whether a graph of a bundle has int8 products."""
+    """Return whether a graph of a bundle has int8 products."""
     return any("int8" in graph.precision for graph in manifest.graphs.values())
 
 
-def told(manifest: Manifest, engine: str) -> tuple[str, str]:
-    """Say how an engine computes the int8 products of a bundle on this machine, and what to do about it.
+def int8_trouble(manifest: Manifest, engine: str) -> tuple[str, str]:
+    """Return how an engine computes the int8 products of a bundle on this machine, and what to do about it.
 
     Returns:
         A sentence and a remedy; both are empty where the bundle has no such products, and where they are exact.
@@ -119,10 +127,10 @@ def told(manifest: Manifest, engine: str) -> tuple[str, str]:
     if not is_int8(manifest):
         return "", ""
     library = engine_class(engine)
-    found = str(library.arithmetic())
-    if found == EXACT:
+    products = str(library.arithmetic())
+    if products == EXACT:
         return "", ""
-    return f"Its int8 products are {found}.", library.remedy if found == SATURATING else ""
+    return f"Its int8 products are {products}.", library.remedy if products == SATURATING else ""
 
 
 def machine(engine: str) -> str:

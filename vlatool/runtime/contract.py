@@ -37,7 +37,7 @@ class Port(NamedTuple):
         return self.dtype if self.axes is None else f"{self.dtype} [{', '.join(_axis(axis) for axis in self.axes)}]"
 
     def fits(self, other: Port) -> bool:
-        """Say whether both can be the same array."""
+        """Return whether both can be the same array."""
         if self.dtype != other.dtype:
             return False
         if self.axes is None or other.axes is None:
@@ -57,7 +57,7 @@ class Port(NamedTuple):
 
 
 def port(axes: Sequence[Any], dtype: str) -> Port:
-    """Return a port; whatever is no whole number stands for a free axis."""
+    """Return a port; anything but a whole number stands for a free axis."""
     return Port(tuple(axis if isinstance(axis, int) else None for axis in axes), dtype)
 
 
@@ -98,7 +98,7 @@ def check_sizes(manifest: Manifest, limit_mb: float) -> None:
     spec = manifest.spec
     named = {tensor.name: _declared(tensor) for tensor in (*spec.inputs, *spec.outputs)}
     for step in manifest.program:
-        named |= _sources(step)
+        named |= sources_of(step)
     _check_total(named, "The program", limit_mb)
 
 
@@ -114,19 +114,19 @@ def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: floa
         GraphError: naming graph and tensor, what it is and what is declared.
     """
     for name, session in sessions.items():
-        told = {**getattr(session, "takes", {}), **getattr(session, "gives", {})}
-        _check_total(told, f"The graph '{name}'", limit_mb)
+        ports = {**getattr(session, "takes", {}), **getattr(session, "gives", {})}
+        _check_total(ports, f"The graph '{name}'", limit_mb)
     values: dict[str, tuple[str, Port]] = {
         tensor.name: ("the spec declares", _declared(tensor)) for tensor in manifest.spec.inputs
     }
     for step in manifest.program:
         _follow(step, sessions[step.graph], values)
     for tensor in manifest.spec.outputs:
-        origin, found = values.get(tensor.name, ("", _declared(tensor)))
-        if not found.fits(_declared(tensor)):
+        origin, actual = values.get(tensor.name, ("", _declared(tensor)))
+        if not actual.fits(_declared(tensor)):
             raise GraphError(
-                f"The output '{tensor.name}' is declared as {_declared(tensor)} in the spec, but {origin} {found}.",
-                _remedy(found.dtype, tensor.dtype),
+                f"The output '{tensor.name}' is declared as {_declared(tensor)} in the spec, but {origin} {actual}.",
+                _remedy(actual.dtype, tensor.dtype),
             )
 
 
@@ -138,7 +138,7 @@ def _follow(step: ProgramStep, session: Any, values: dict[str, tuple[str, Port]]
             values.pop(name, None)
         return
     _check_names(step, takes, gives)
-    values.update({name: ("the program makes", found) for name, found in _sources(step).items()})
+    values.update({name: ("the program makes", drawn) for name, drawn in sources_of(step).items()})
     for turn in range(min(step.repeat, 2)):
         for name, value in step.feeds.items():
             _check_feed(step.graph, name, takes[name], value, values, turn)
@@ -149,13 +149,13 @@ def _follow(step: ProgramStep, session: Any, values: dict[str, tuple[str, Port]]
 
 
 def _check_feed(
-    graph: str, name: str, wanted: Port, value: str, values: Mapping[str, tuple[str, Port]], turn: int
+    graph: str, name: str, expected: Port, value: str, values: Mapping[str, tuple[str, Port]], turn: int
 ) -> None:
-    origin, found = values.get(value, ("", wanted))
-    if not found.fits(wanted):
+    origin, actual = values.get(value, ("", expected))
+    if not actual.fits(expected):
         when = " in the next repeat" if turn else ""
         raise GraphError(
-            f"The graph '{graph}' takes '{name}' as {wanted}, but {origin} '{value}' as {found}{when}.", AGAIN
+            f"The graph '{graph}' takes '{name}' as {expected}, but {origin} '{value}' as {actual}{when}.", AGAIN
         )
 
 
@@ -169,17 +169,17 @@ def _check_names(step: ProgramStep, takes: Mapping[str, Port], gives: Mapping[st
             raise GraphError(f"The graph '{step.graph}' takes '{name}', which the program does not feed.", AGAIN)
 
 
-def _sources(step: ProgramStep) -> dict[str, Port]:
+def sources_of(step: ProgramStep) -> dict[str, Port]:
     """Return what a step brings into being: noise, kept values and schedules."""
-    found = {name: port(noise["shape"], "float32") for name, noise in step.noise.items()}
-    found |= {name: port(kept["shape"], str(kept.get("dtype", "float32"))) for name, kept in step.keep.items()}
+    ports = {name: port(noise["shape"], "float32") for name, noise in step.noise.items()}
+    ports |= {name: port(kept["shape"], str(kept.get("dtype", "float32"))) for name, kept in step.keep.items()}
     for name, numbers in step.schedule.items():
-        found[name] = Port((1,), "int64" if all(isinstance(number, int) for number in numbers) else "float32")
-    return found
+        ports[name] = Port((1,), "int64" if all(isinstance(number, int) for number in numbers) else "float32")
+    return ports
 
 
 def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
-    total = sum(each.bytes for each in named.values())
+    total = sum(tensor.bytes for tensor in named.values())
     if total > limit_mb * 1e6:
         largest = max(named, key=lambda name: named[name].bytes)
         raise GraphError(
@@ -200,7 +200,7 @@ def written_as_declared(manifest: Manifest, sessions: Mapping[str, Any]) -> set[
         bound = getattr(sessions[step.graph], "bound", False)
         for name in step.gives.values():
             makers.setdefault(name, []).append(bound)
-        for name in (*step.carry.values(), *_sources(step)):
+        for name in (*step.carry.values(), *sources_of(step)):
             makers.setdefault(name, []).append(False)
     return {tensor.name for tensor in manifest.spec.outputs if makers.get(tensor.name) == [True]}
 

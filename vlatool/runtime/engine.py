@@ -1,4 +1,4 @@
-"""What every engine says of itself: the build side asks, and names none.
+"""What every engine declares about itself, so that the build side names no engine.
 
 A file in ``vlatool/runtime/engines/`` (or one that another package brings, see ``vlatool.registry``) defines one class
 that opens a graph (``vlatool.runtime.program.Session``) and overrides what it does otherwise than said here.
@@ -100,6 +100,15 @@ class Engine:
         return require(cls.package, cls.extra)
 
     @classmethod
+    def version(cls) -> str:
+        """Return the release of the library, without its build.
+
+        Raises:
+            MissingExtra: when it is not installed.
+        """
+        return str(cls.library().__version__).partition("-")[0]
+
+    @classmethod
     def execution_providers(cls) -> list[str] | None:
         """Return what the installed library runs on, None where it does not say so.
 
@@ -135,7 +144,7 @@ class Engine:
 
     @classmethod
     def slow(cls, node: Node, computed: str, product: bool, zero_points: int) -> str:
-        """Say why an int8 node of a profile is not the fast kernel; nothing where it is.
+        """Return why an int8 node of a profile is not the fast kernel; nothing where it is.
 
         Args:
             node: Of the profile.
@@ -150,13 +159,13 @@ def engine_class(name: str = "") -> Any:
     """Return the class of an engine, of the default one when empty.
 
     Raises:
-        UsageError: when there is none of that name.
+        UsageError: for an unknown engine.
     """
     return registry.load("engines", name or DEFAULT_ENGINE)
 
 
 def class_for(name: str) -> type[Engine]:
-    """Return the class of an engine of a board; what is said of any engine for one that vlatool does not run."""
+    """Return the class of a board's engine; the base class for an engine that vlatool does not run."""
     return engine_class(name) if name in engine_names() else Engine
 
 
@@ -202,6 +211,6 @@ def computing(dtype: str) -> str:
 
 
 def installed(name: str) -> bool:
-    """Say whether the library of an engine is installed; not, where another package's engine cannot be imported."""
+    """Return whether the library of an engine is installed; not, where another package's engine cannot be imported."""
     library = usable_engines().get(name)
     return library is not None and importlib.util.find_spec(library.package) is not None

@@ -16,7 +16,7 @@ from vlatool.files.typed import outside, shown
 from vlatool.runtime.external_data import OpenFile, external_files
 
 WHOLE = 4 * MIB
-"""Bytes of a graph up to which the engine gets its content; a larger one would be in the memory twice."""
+"""Bytes of a graph up to which the engine gets its content; a larger one would be in memory twice."""
 
 
 def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None) -> Any:
@@ -68,7 +68,7 @@ def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
         BundleError: when one is not inside, or not recorded.
     """
     folder = file.rpartition("/")[0]
-    found = []
+    files = []
     for location in sorted(locations):
         name = f"{folder}/{location}" if folder else location
         reason = outside(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
@@ -77,5 +77,5 @@ def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
                 f"The graph {file} of {bundle.path} keeps weights in {shown(location)}: {reason}.",
                 "export the policy again",
             )
-        found.append(name)
-    return found
+        files.append(name)
+    return files

@@ -109,24 +109,24 @@ def _search_path() -> list[str]:
 
 def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) -> dict[str, Any]:
     """Return what the child found, or raise what it raised."""
-    told: dict[str, Any] = {}
+    answer: dict[str, Any] = {}
     with contextlib.suppress(ValueError):
-        told = json.loads(done.stdout.rstrip("\n").rpartition("\n")[2])
-    said = str(told.get("message", "")) or done.stderr[-2000:]
-    if ("error" in told or done.returncode) and any(sign in said for sign in NO_MEMORY):
+        answer = json.loads(done.stdout.rstrip("\n").rpartition("\n")[2])
+    message = str(answer.get("message", "")) or done.stderr[-2000:]
+    if ("error" in answer or done.returncode) and any(sign in message for sign in NO_MEMORY):
         raise GraphError(
             f"{path}: the first run needs more than {allowed:,.0f} MB of memory.",
             "allow more with load(..., memory_mb=...) or vlatool inspect --probe --memory MB",
         )
-    if "error" in told:
-        kind = getattr(errors, str(told["error"]), GraphError)
-        raise kind(said, str(told.get("fix", "")))
+    if "error" in answer:
+        kind = getattr(errors, str(answer["error"]), GraphError)
+        raise kind(message, str(answer.get("fix", "")))
     if done.returncode < 0:
         raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
-    if done.returncode or not told:
-        last = (said.strip() or f"exit code {done.returncode}").splitlines()[-1]
+    if done.returncode or not answer:
+        last = (message.strip() or f"exit code {done.returncode}").splitlines()[-1]
         raise GraphError(f"{path} cannot be run in a process of its own: {last}")
-    return told
+    return answer
 
 
 def _too_long(path: Path, seconds: float) -> GraphError:

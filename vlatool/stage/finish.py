@@ -14,7 +14,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle, restate, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
-from vlatool.runtime.arithmetic import SATURATING, is_int8, machine, told
+from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
@@ -50,10 +50,10 @@ two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed b
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")
-HANDED_OUT = "optimize"
-"""In a build record, the entry of the step in which ``optimize`` hands a candidate out."""
+FINALIZED = "optimize"
+"""In a build record, the entry of the step in which ``optimize`` finalizes a candidate."""
 DECIDED = ("accuracy", "engine")
-"""Fields of a manifest that ``optimize`` sets when it hands a candidate out."""
+"""Fields of a manifest that ``optimize`` sets when it finalizes a candidate."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Golden:
 
     Args:
         samples: Observations with the noise of each.
-        wanted: What the graphs say.
+        expected: What the graphs say.
         difference: Largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
         of_chunk: The same of the chunks in physical units.
     """
 
     samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]
-    wanted: Sequence[Action]
+    expected: Sequence[Action]
     difference: float
     of_chunk: float
 
@@ -113,57 +113,57 @@ def finish(
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
     seen = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
-    made = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
-    limit = _limit(source, made, seen)
-    redrawn = seen.difference > limit and _rounds_otherwise(source, made, observations)
-    found = [] if seen.difference <= limit or redrawn else [_engine_difference(made, seen.difference, limit)]
-    if is_int8(made.manifest) and reference().arithmetic() == SATURATING:
-        found.append(_inexact_reference(made))
-    kept = [each for each in source.manifest.findings if each["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
-    discrete = made.manifest.spec.action.kind == "discrete"
-    return restate(made, replace(
-        made.manifest, golden_tolerance=_tolerance(seen.difference, made, redrawn),
-        golden_chunk_tolerance=0.0 if discrete else _tolerance(seen.of_chunk, made, redrawn), findings=(*kept, *found),
+    bundle = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
+    limit = _limit(source, bundle, seen)
+    redrawn = seen.difference > limit and _rounds_otherwise(source, bundle, observations)
+    new = [] if seen.difference <= limit or redrawn else [_engine_difference(bundle, seen.difference, limit)]
+    if is_int8(bundle.manifest) and reference().arithmetic() == SATURATING:
+        new.append(_inexact_reference(bundle))
+    kept = [finding for finding in source.manifest.findings if finding["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
+    discrete = bundle.manifest.spec.action.kind == "discrete"
+    return restate(bundle, replace(
+        bundle.manifest, golden_tolerance=_tolerance(seen.difference, bundle, redrawn),
+        golden_chunk_tolerance=0.0 if discrete else _tolerance(seen.of_chunk, bundle, redrawn), findings=(*kept, *new),
     ))  # fmt: skip
 
 
-def _tolerance(seen: float, made: Bundle, redrawn: bool) -> float:
+def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:
     """Return what a machine may differ where the engine was seen to differ so much, in three decimals; at most 1.
 
     What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding, or one that is
     drawn again on each machine.
     """
-    computed = {name for graph in made.manifest.graphs.values() for name in graph.precision}
+    computed = {name for graph in bundle.manifest.graphs.values() for name in graph.precision}
     least = max([LEAST_TOLERANCE, *(COARSE_TOLERANCE[name] for name in computed & set(COARSE_TOLERANCE))])
-    wanted = max(least, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING))
-    return math.ceil(wanted * 1000) / 1000 if math.isfinite(wanted) else 1.0
+    tolerance = max(least, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING))
+    return math.ceil(tolerance * 1000) / 1000 if math.isfinite(tolerance) else 1.0
 
 
-def _limit(source: Bundle, made: Bundle, seen: Golden) -> float:
+def _limit(source: Bundle, bundle: Bundle, seen: Golden) -> float:
     """Return how far the engine may be from what the graphs say: as far as the graphs are from those of the source.
 
     What is computed in bfloat16 differs by what bfloat16 costs, which is judged as accuracy.
     """
-    if any(graph.compute == "bfloat16" for graph in made.manifest.graphs.values()):
+    if any(graph.compute == "bfloat16" for graph in bundle.manifest.graphs.values()):
         return math.inf
     if seen.difference <= ROUNDING or not source.manifest.graphs:
         return ROUNDING
     before = _outputs(reference_policy(source), seen.samples)
-    return max(ROUNDING, _worst(_apart(seen.wanted, before, made.manifest.spec.action.name)))
+    return max(ROUNDING, _worst(_apart(seen.expected, before, bundle.manifest.spec.action.name)))
 
 
-def _rounds_otherwise(source: Bundle, made: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
-    """Say whether an engine that is far from the graphs is as near to their source as they are.
+def _rounds_otherwise(source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether an engine that is far from the graphs is as near to their source as they are.
 
     Then it computes the same policy with other roundings, and no other one.
     """
     if not source.manifest.graphs:
         return False
-    samples = _samples(made.manifest, observations, TRIALS)
+    samples = _samples(bundle.manifest, observations, TRIALS)
     before = _outputs(reference_policy(source), samples)
-    name = made.manifest.spec.action.name
-    graphs = _apart(_outputs(reference_policy(made), samples), before, name)
-    engine = _apart(_outputs(Policy.open(made, threads=1, seed=SEED), samples), before, name)
+    name = bundle.manifest.spec.action.name
+    graphs = _apart(_outputs(reference_policy(bundle), samples), before, name)
+    engine = _apart(_outputs(Policy.open(bundle, threads=1, seed=SEED), samples), before, name)
     return float(np.linalg.norm(engine)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
 
 
@@ -172,48 +172,48 @@ def _samples(
 ) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
     """Return so many observations, from the first on again where there are fewer, with noise for each."""
     random = np.random.default_rng(SEED)
-    wanted = [pair for step in manifest.program for pair in step.noise.items()]
+    noises = [pair for step in manifest.program for pair in step.noise.items()]
     chosen = [observations[index % len(observations)] for index in range(count)]
-    return [(each, {name: draw(noise, random) for name, noise in wanted}) for each in chosen]
+    return [(observation, {name: draw(noise, random) for name, noise in noises}) for observation in chosen]
 
 
-def _apart(given: Sequence[Action], wanted: Sequence[Action], name: str) -> list[float]:
+def _apart(actions: Sequence[Action], expected: Sequence[Action], name: str) -> list[float]:
     """Return the relative L2 difference of an output, for each action."""
-    return [relative_error(a.outputs[name], b.outputs[name]) for a, b in zip(given, wanted, strict=True)]
+    return [relative_error(a.outputs[name], b.outputs[name]) for a, b in zip(actions, expected, strict=True)]
 
 
-def _engine_difference(made: Bundle, difference: float, limit: float) -> dict[str, Any]:
-    engine = made.manifest.engine or DEFAULT_ENGINE
+def _engine_difference(bundle: Bundle, difference: float, limit: float) -> dict[str, Any]:
+    engine = bundle.manifest.engine or DEFAULT_ENGINE
     words = f"the engine {engine} computes another action than the graphs say on this {machine(engine)}: relative "
     words += f"difference {difference:.2g}, allowed {limit:.2g}. Do not trust this bundle; "
-    cause, remedy = told(made.manifest, engine)
+    cause, remedy = int8_trouble(bundle.manifest, engine)
     words += remedy or "leave layers out with --exclude, or use another layout or engine"
     words += f". {cause}".rstrip()
     value = round(difference, 4) if math.isfinite(difference) else 1e9
-    stage = str(made.manifest.made_by.get("stage", ""))
+    stage = str(bundle.manifest.made_by.get("stage", ""))
     return {"name": ENGINE_DIFFERENCE, "message": words, "value": value, "allowed": round(limit, 4), "stage": stage}
 
 
-def _inexact_reference(made: Bundle) -> dict[str, Any]:
+def _inexact_reference(bundle: Bundle) -> dict[str, Any]:
     words = "the golden action of this bundle was computed where int8 products are not exact, with any option of ONNX "
     words += "Runtime that was tried: it may be another one than the graphs say. Make the bundle on another machine."
-    return {"name": INEXACT, "message": words, "stage": str(made.manifest.made_by.get("stage", ""))}
+    return {"name": INEXACT, "message": words, "stage": str(bundle.manifest.made_by.get("stage", ""))}
 
 
 def history(bundle: Bundle) -> tuple[dict[str, Any], ...]:
     """Return the build record of a bundle: one entry for each stage from the source to this bundle.
 
-    A source bundle has no ``build`` of its own, and ``optimize`` hands a bundle out without a stage; their entries are
+    A source bundle has no ``build`` of its own, and ``optimize`` finalizes a bundle without a stage; their entries are
     what their manifests say. A bundle from before there was a record has an incomplete one, or none.
     """
     manifest = bundle.manifest
-    made, recorded = manifest.made_by, manifest.build
-    if not recorded and str(made.get("stage", "")).startswith("sources."):
-        recorded = ({**made, "factory": manifest.source.get("factory", "")},)
-    if "candidate" not in made or (recorded and recorded[-1]["stage"] == HANDED_OUT):
+    made_by, recorded = manifest.made_by, manifest.build
+    if not recorded and str(made_by.get("stage", "")).startswith("sources."):
+        recorded = ({**made_by, "factory": manifest.source.get("factory", "")},)
+    if "candidate" not in made_by or (recorded and recorded[-1]["stage"] == FINALIZED):
         return recorded
-    options = {name: made[name] for name in ("candidate", "profile") if name in made}
-    handed = {"vlatool": made.get("vlatool", ""), "stage": HANDED_OUT, "options": options, "input": manifest.parent}
+    options = {name: made_by[name] for name in ("candidate", "profile") if name in made_by}
+    handed = {"vlatool": made_by.get("vlatool", ""), "stage": FINALIZED, "options": options, "input": manifest.parent}
     decided = {name: getattr(manifest, name) for name in DECIDED if getattr(manifest, name)}
     return (*recorded, {**handed, **decided})
 
@@ -248,17 +248,17 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     name = draft.manifest.spec.action.name
     policy = Policy.open(draft, threads=1, seed=SEED)
     own = _outputs(policy, samples)
-    wanted = _outputs(reference_policy(draft), samples)
+    expected = _outputs(reference_policy(draft), samples)
     arrays: dict[str, list[Any]] = {}
-    for (observation, noise), action in zip(samples, wanted, strict=True):
+    for (observation, noise), action in zip(samples, expected, strict=True):
         parts = (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", {name: action.chunk}))
         for prefix, values in parts:
-            for each, value in values.items():
-                arrays.setdefault(f"{prefix}.{each}", []).append(value)
+            for key, value in values.items():
+                arrays.setdefault(f"{prefix}.{key}", []).append(value)
     (out / GOLDEN).parent.mkdir(exist_ok=True)
-    save_npz(out / GOLDEN, {each: np.stack([np.asarray(item) for item in items]) for each, items in arrays.items()})
-    of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, wanted, strict=True))
-    return Golden(samples, wanted, _worst(_apart(own, wanted, name)), of_chunk)
+    save_npz(out / GOLDEN, {key: np.stack([np.asarray(item) for item in items]) for key, items in arrays.items()})
+    of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, expected, strict=True))
+    return Golden(samples, expected, _worst(_apart(own, expected, name)), of_chunk)
 
 
 def _worst(errors: Iterable[float]) -> float:

@@ -32,7 +32,7 @@ def run_transform(
         stage: What runs.
         source: Its input; None for a stage that starts a chain.
         out: The new bundle.
-        context: Whom to tell.
+        context: For progress.
         force: Replace a directory that vlatool wrote.
         damaged: See ``vlatool.files.writing.writing``.
 
@@ -56,7 +56,7 @@ def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
 
 
 def is_cached(stage: Stage, source_hash: str, cache: Path) -> bool:
-    """Say whether the output of a stage is there."""
+    """Return whether the output of a stage is there."""
     return cached_path(stage, source_hash, cache).is_dir()
 
 
@@ -69,9 +69,9 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
         except BundleError:
             context.tell(f"the cached {stage.name()} is damaged; making it again", None)
     tag(cache)
-    made = run_transform(stage, source, path, context, damaged=True)
+    bundle = run_transform(stage, source, path, context, damaged=True)
     hold(path)
-    return made
+    return bundle
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:

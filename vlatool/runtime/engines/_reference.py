@@ -25,25 +25,18 @@ class ReferenceSession(OrtCpuSession):
     @staticmethod
     def _ways(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
-        wanted = [True, False] if _exact(ort) == arithmetic.EXACT_BY_OPTION else [False]
-        ways = [session_options(ort, threads) for _ in wanted]
-        for options, precise in zip(ways, wanted, strict=True):
+        exact_by_option = arithmetic.ort_exactness(ort, written=True) == arithmetic.EXACT_BY_OPTION
+        precisions = [True, False] if exact_by_option else [False]
+        ways = [session_options(ort, threads) for _ in precisions]
+        for options, precise in zip(ways, precisions, strict=True):
             arithmetic.as_written(ort, options, precise)
         return ways
 
     @staticmethod
     def arithmetic() -> str:
-        """Say whether integer products of the reference are exact on this machine, or saturate.
+        """Return whether integer products of the reference are exact on this machine, or saturate.
 
         Raises:
             MissingExtra: when onnxruntime is not installed.
         """
-        return _exact(require("onnxruntime", "ort"))
-
-
-def _exact(ort: Any) -> str:
-    plain = arithmetic.said(arithmetic.ort_product(ort, written=True))
-    if plain != arithmetic.SATURATING:
-        return plain
-    exact = arithmetic.ort_product(ort, precise=True, written=True) == arithmetic.WANTED
-    return arithmetic.EXACT_BY_OPTION if exact else plain
+        return arithmetic.ort_exactness(require("onnxruntime", "ort"), written=True)

@@ -88,7 +88,6 @@ class OrtCpuSession(Engine):
         self.deadline: float | None = None
         self._run = self._session.run
         self.outputs = [node.name for node in self._session.get_outputs()]
-        self.inputs = {node.name: (list(node.shape), str(node.type)) for node in self._session.get_inputs()}
         self.takes = {node.name: _port(node) for node in self._session.get_inputs()}
         self.gives = {node.name: _port(node) for node in self._session.get_outputs()}
         self._bound = _Bound.of(self._session, ort)
@@ -135,7 +134,7 @@ class OrtCpuSession(Engine):
 
     @classmethod
     def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
-        """Open a session, with other options where the first break the graph; their error is the one that is told."""
+        """Open a session, with other options where the first break the graph; the first error is reported."""
         ways = cls._ways(ort, threads)
         try:
             return _session(ort, model, ways[0])
@@ -163,27 +162,13 @@ class OrtCpuSession(Engine):
         return ways
 
     @staticmethod
-    def version() -> str:
-        """Version of the engine.
-
-        Raises:
-            MissingExtra: when onnxruntime is not installed.
-        """
-        return str(require("onnxruntime", "ort").__version__)
-
-    @staticmethod
     def arithmetic() -> str:
-        """Say whether integer products are exact on this machine, or saturate.
+        """Return whether integer products are exact on this machine, or saturate.
 
         Raises:
             MissingExtra: when onnxruntime is not installed.
         """
-        ort = require("onnxruntime", "ort")
-        plain = arithmetic.said(arithmetic.ort_product(ort))
-        if plain != arithmetic.SATURATING:
-            return plain
-        exact = arithmetic.ort_product(ort, precise=True) == arithmetic.WANTED
-        return arithmetic.EXACT_BY_OPTION if exact else plain
+        return arithmetic.ort_exactness(require("onnxruntime", "ort"))
 
     @classmethod
     def execution_providers(cls) -> list[str]:
@@ -197,10 +182,10 @@ class OrtCpuSession(Engine):
     @classmethod
     def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
         """Return int8 at run time, and with ranges from a recording: plain, by their error, attention too."""
-        found: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
+        plans: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
-            found[f"static_int8{name}"] = ({"quantize.static_int8": dict(options)},)
-        return found
+            plans[f"static_int8{name}"] = ({"quantize.static_int8": dict(options)},)
+        return plans
 
     @classmethod
     def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
@@ -209,7 +194,8 @@ class OrtCpuSession(Engine):
         Raises:
             GraphError: when ONNX Runtime refuses it.
         """
-        return OrtProfiled(cls.library(), path, threads, scratch, left_out(path))
+        ort = cls.library()
+        return OrtProfiled(ort, path, session_options(ort, threads), scratch, left_out(path))
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
@@ -274,8 +260,8 @@ class _Bound:
 
 def _port(node: Any) -> Port:
     dtype = NUMPY_OF.get(str(node.type))
-    told = str(node.type) if dtype is None else dtype.name
-    return port(node.shape, told) if node.shape else Port(None, told)  # a scalar looks like an unknown number of axes
+    name = str(node.type) if dtype is None else dtype.name
+    return port(node.shape, name) if node.shape else Port(None, name)  # a scalar looks like an unknown number of axes
 
 
 def _buffer(node: Any) -> Array | None:
@@ -310,9 +296,9 @@ def left_out(model: Path | bytes) -> list[str]:
 
 
 def _session(ort: Any, model: Path | bytes, options: Any) -> Any:
-    wanted = model if isinstance(model, bytes) else str(model)
-    given = {"disabled_optimizers": left_out(model)}
-    session = ort.InferenceSession(wanted, options, providers=[PROVIDER], enable_fallback=0, **given)
+    content = model if isinstance(model, bytes) else str(model)
+    optimizers = {"disabled_optimizers": left_out(model)}
+    session = ort.InferenceSession(content, options, providers=[PROVIDER], enable_fallback=0, **optimizers)
     if getattr(session, "_model_bytes", None):
         session._model_bytes = b""  # Python's wrapper would keep the whole content for a fallback, which is off
     return session

@@ -9,7 +9,7 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._made import ForBoard, for_board
+from vlatool.cli._board_summary import ForBoard, for_board
 from vlatool.errors import GraphError
 from vlatool.hardware.profile import load_profile
 from vlatool.quantize.dynamic_int8 import DynamicInt8
