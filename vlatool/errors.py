@@ -122,7 +122,7 @@ class Inconclusive(VlatoolError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a sentence part that lists what is known, with the nearest name first.
+    """Return part of a sentence that lists what is known, with the nearest name first.
 
     Example:
         >>> nearest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])

@@ -33,6 +33,11 @@ def package_of(kind: str) -> str:
     return PACKAGES.get(kind, f"vlatool.{kind}")
 
 
+def noun_of(kind: str) -> str:
+    """Return what an entry of a kind is called in messages."""
+    return NOUNS.get(kind, kind.removesuffix("s"))
+
+
 def names(kind: str) -> list[str]:
     """List the entries of a kind by file name, importing none of them, and those of other packages.
 
@@ -62,15 +67,14 @@ def module(kind: str, name: str) -> ModuleType:
     if own_name in _own(kind):
         return importlib.import_module(f"{package_of(kind)}.{own_name}")
     if own_name not in plugins(kind):
-        noun = NOUNS.get(kind, kind.removesuffix("s"))
-        raise UsageError(f"Unknown {noun} '{name}'; {nearest(own_name, names(kind))}.")
+        raise UsageError(f"Unknown {noun_of(kind)} '{name}'; {nearest(own_name, names(kind))}.")
     entry = plugins(kind)[own_name]
     try:
         return importlib.import_module(entry.module)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: another package's code raises what it likes
-        raise _blamed(entry, f"cannot be imported: {type(error).__name__}: {error}") from error
+        raise _plugin_error(entry, f"cannot be imported: {type(error).__name__}: {error}") from error
 
 
 def load(kind: str, name: str) -> type:
@@ -91,7 +95,7 @@ def load(kind: str, name: str) -> type:
         if not inspect.isclass(entry_class):
             raise TypeError(f"{entry.value} is not a class")
     except (AttributeError, TypeError) as error:
-        raise _blamed(entry, f"does not name a class: {error}") from error
+        raise _plugin_error(entry, f"does not name a class: {error}") from error
     _FOREIGN[entry_class] = f"{kind}.{own_name}"
     return entry_class
 
@@ -145,7 +149,7 @@ def _title(entry: metadata.EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
 
 
-def _blamed(entry: metadata.EntryPoint, what: str) -> PluginError:
+def _plugin_error(entry: metadata.EntryPoint, what: str) -> PluginError:
     return PluginError(
         f"The package {_title(entry)}, which brings '{entry.name}' ({entry.group}), {what}.",
         "report it to its authors, or uninstall it",

@@ -44,7 +44,7 @@ class Bundle:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], *, verify: bool = True) -> Bundle:
-        """Read the manifest, hold it against its digest, and check every file before anything else is parsed.
+        """Read the manifest, check it against its digest, and check every file before anything else is parsed.
 
         Args:
             path: The directory.
@@ -61,7 +61,7 @@ class Bundle:
 
     @classmethod
     def described(cls, path: str | os.PathLike[str]) -> Bundle:
-        """Read the manifest, hold it against its digest; the files are checked when they are read (``read``).
+        """Read the manifest, check it against its digest; the files are checked when they are read (``read``).
 
         Raises:
             BundleError: when the directory is missing or is not a bundle, or the manifest is changed or invalid.
@@ -170,7 +170,7 @@ class Bundle:
 
     @property
     def graph_bytes(self) -> int:
-        """Bytes of all graphs, with the weights that lie beside them, whatever their files are called."""
+        """Bytes of all graphs, with the weights beside them, whatever their files are called."""
         graphs = tuple(graph.file for graph in self.manifest.graphs.values())
         folders = tuple(f"{folder}/" for graph in graphs if (folder := graph.rpartition("/")[0]))
         beside = () if len(folders) == len(graphs) else tuple(name for name in self.manifest.files if "/" not in name)
@@ -217,15 +217,10 @@ def digest_of(content: bytes) -> bytes:
 
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file as hex."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _digest(stream)
-
-
-def _digest(stream: Any) -> str:
-    """``hashlib.file_digest`` for Python 3.10."""
     digest = hashlib.sha256()
-    while block := stream.read(1 << 20):
-        digest.update(block)
+    with path.open("rb", buffering=0) as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
     return digest.hexdigest()
 
 

@@ -204,7 +204,7 @@ def check_schema(schema: Any) -> None:
 
 
 def _check_type(name: str, value: Any, item: Any) -> None:
-    """Hold a value against the type that its field has by default: text, a mapping or a list."""
+    """Check a value against the type that its field has by default: text, a mapping or a list."""
     where = f"The manifest's '{name}'"
     if name in ("spec", "schema"):
         return

@@ -65,7 +65,7 @@ class TensorSpec:
             if reason := outside(file):
                 raise SpecError(
                     f"'{self.name}' names the file {shown(file)}: {reason}.",
-                    "statistics and tokenizers lie in the policy's folder; name them relative to it",
+                    "statistics and tokenizers belong in the policy's folder; name them relative to it",
                 )
 
     def _check_words(self) -> None:
@@ -135,7 +135,7 @@ class TensorSpec:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TensorSpec:
-        """Build from a mapping as it stands in ``manifest.json`` or ``policy.yaml``.
+        """Build from a mapping as in ``manifest.json`` or ``policy.yaml``.
 
         Raises:
             SpecError: for an unknown key or an impossible value.

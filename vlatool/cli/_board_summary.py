@@ -1,4 +1,4 @@
-"""What ``export`` and ``quantize`` say of a bundle for a board: its size, what is predicted, what its actions lose."""
+"""What ``export`` and ``quantize`` print about a bundle for a board: size, predictions, and how its actions differ."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SHOWN = {"latency_p50": "latency p50", "memory": "memory"}
 
 
 @dataclass(frozen=True)
-class ForBoard:
+class BoardSummary:
     """A new bundle beside the one that it was made from.
 
     Args:
@@ -44,7 +44,7 @@ class ForBoard:
         predicted = [
             f"{SHOWN[number.name]} on {self.board}, predicted: {_number(number)}" for number in self.predictions
         ]
-        error = [_words(self.error)] if self.error is not None else []
+        error = [_error_text(self.error)] if self.error is not None else []
         return [*([self._size()] if self.after else []), *predicted, *error, *self.missing]
 
     def _size(self) -> str:
@@ -64,7 +64,7 @@ class ForBoard:
                 "actions": error, "missing": [*self.missing]}  # fmt: skip
 
 
-def for_board(bundle: Bundle, source: Bundle | None, profile: Profile, context: Context) -> ForBoard:
+def board_summary(bundle: Bundle, source: Bundle | None, profile: Profile, context: Context) -> BoardSummary:
     """Compare a new bundle with its source, and predict it on a board.
 
     The bundle is written by now: what cannot be predicted or compared is listed, and does not fail the command.
@@ -81,7 +81,7 @@ def for_board(bundle: Bundle, source: Bundle | None, profile: Profile, context: 
     else:
         missing.append(f"nothing is predicted for {profile.name} before the export")
     before = source.graph_bytes if source is not None and source.manifest.graphs else None
-    return ForBoard(profile.name, before, bundle.graph_bytes, numbers, error, tuple(missing))
+    return BoardSummary(profile.name, before, bundle.graph_bytes, numbers, error, tuple(missing))
 
 
 @contextlib.contextmanager
@@ -108,7 +108,7 @@ def _error(bundle: Bundle, source: Bundle | None, context: Context) -> Measureme
     return error if error is not None and error.known else None
 
 
-def _words(error: Measurement) -> str:
+def _error_text(error: Measurement) -> str:
     of = f"{error.samples} recorded observations"
     if error.name.startswith("agreement"):
         return f"the same actions as the source: {error.value:.1%} of {of}"

@@ -9,12 +9,12 @@ import typer
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.cli._stages import StageGroup, built, failing
+from vlatool.cli._stages import DEFAULTS, StageGroup, built, failing
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import stage_kinds
 
 FIRST = "optimize"
-"""What most people want stands first in the help."""
+"""What most people want comes first in the help."""
 HIDDEN = ("sources",)
 """Kinds of stages that are not commands: a source is an argument of every command."""
 
@@ -41,8 +41,8 @@ class Commands(TyperGroup):
         if cmd_name in stage_kinds():
             package = importlib.import_module(registry.package_of(cmd_name))
             text = (package.__doc__ or "").strip().splitlines()[0]
-            group = typer.main.get_group(typer.Typer(cls=StageGroup, help=text, rich_markup_mode=None))
-            group.name = cmd_name
+            group: Any = typer.main.get_group(typer.Typer(cls=StageGroup, help=text, rich_markup_mode=None))
+            group.name, group.default = cmd_name, DEFAULTS[cmd_name]
             return group
         try:
             source = registry.module("commands", cmd_name)

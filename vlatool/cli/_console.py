@@ -98,7 +98,7 @@ def _plain_lines() -> Tell:
 
 @contextlib.contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Show what vlatool warns of on stderr, as one sentence and once, however often a stage says it."""
+    """Show vlatool's warnings on stderr, each as one sentence and once, however often a stage repeats it."""
     shown: set[str] = set()
     elsewhere = warnings.showwarning
 
@@ -180,7 +180,7 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
             write_reports(report, draft)
     if out is not None and not as_json:
         put(f"report: {out / 'report.html'}\n")
-    leave(report)
+    raise_verdict(report)
 
 
 def terminal_text(report: Report, *, brief: bool = False) -> str:
@@ -195,7 +195,7 @@ def terminal_text(report: Report, *, brief: bool = False) -> str:
 
 
 def _printable(value: Any) -> Any:
-    """Return a report whose texts may stand on a terminal."""
+    """Return a report whose texts are safe to print on a terminal."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, (tuple, list)):
@@ -208,7 +208,7 @@ def _printable(value: Any) -> Any:
     return value
 
 
-def leave(report: Report) -> None:
+def raise_verdict(report: Report) -> None:
     """Raise for a verdict that is not good.
 
     Raises:

@@ -14,7 +14,6 @@ from vlatool.errors import VlatoolError
 from vlatool.files.printable import message_of
 
 OK = 0
-USAGE = 2
 INPUT = 3
 OUR_BUG = 70
 INTERRUPTED = 130
@@ -86,7 +85,7 @@ def _plugin(error: BaseException) -> str:
 
 
 def _usage(error: Any) -> Failure:
-    """Return what click says of a command line that it refuses."""
+    """Return click's reason for refusing a command line."""
     context = getattr(error, "ctx", None)
     fix = f"{context.command_path} --help" if context else ""
     return Failure("UsageError", error.format_message(), fix, int(error.exit_code))

@@ -7,15 +7,16 @@ import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
-from vlatool.cli._board_summary import for_board
+from vlatool.cli._board_summary import board_summary
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson, Force, Raw
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.machine.host import MAX_CPU_ISA
@@ -29,58 +30,44 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 
-def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any) -> inspect.Parameter:
-    option = typer.Option(default, *flags, **settings)
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
+def _flag(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-SOURCE_FLAG = inspect.Parameter(
-    "source",
-    inspect.Parameter.KEYWORD_ONLY,
-    default=typer.Argument(
-        ...,
-        show_default=False,
-        help="a bundle, a policy directory, path.py:make or an .onnx file",
-        autocompletion=_complete.sources,
-    ),
-    annotation=str,
+def _board_flag(about: str) -> inspect.Parameter:
+    option = typer.Option("--profile", help=about, autocompletion=_complete.profiles)
+    return _flag("profile", Annotated[str | None, option], None)
+
+
+SOURCE = typer.Argument(
+    show_default=False,
+    help="a bundle, a policy directory, path.py:make or an .onnx file",
+    autocompletion=_complete.sources,
 )
-_FORCE = _flag("force", bool, False, "--force", help="replace an output that exists")
-_JSON = _flag("as_json", bool, False, "--json", help="print JSON on stdout")
+SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
+NEW_BUNDLE = typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)
+REPORTS = typer.Option("-o", "--output", help="directory for report.html, report.md and report.json")
+WORKERS = typer.Option("--workers", min=1, help="processes for closed-loop episodes; all cores if unset")
+TARGET = typer.Option("--target", help="run there, through ssh: user@host, or a Host of your ssh config")
+REMOTE_PYTHON = typer.Option("--remote-python", help="Python of the target, such as ~/venv/bin/python")
+COMMON_FLAGS = (_flag("force", Force, False), _flag("as_json", AsJson, False))
 TRANSFORM_FLAGS = (
-    _flag("out", Path, ..., "-o", "--output", help="directory of the new bundle", show_default=False),
-    _flag(
-        "profile",
-        str | None,
-        None,
-        "--profile",
-        help="make it as this board takes it, and say what to expect there (see: vlatool profiles list)",
-        autocompletion=_complete.profiles,
-    ),
-    _FORCE,
-    _JSON,
+    _flag("out", Annotated[Path, NEW_BUNDLE]),
+    _board_flag("make it the way this board runs it, and show what to expect there (see: vlatool profiles list)"),
+    *COMMON_FLAGS,
 )
 MEASURE_FLAGS = (
-    _flag("out", Path | None, None, "-o", "--output", help="directory for report.html, report.md and report.json"),
-    _flag(
-        "profile",
-        str | None,
-        None,
-        "--profile",
-        help="add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set",
-        autocompletion=_complete.profiles,
+    _flag("out", Annotated[Path | None, REPORTS], None),
+    _board_flag(
+        "add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set"
     ),
-    _flag(
-        "workers",
-        int | None,
-        None,
-        "--workers",
-        min=1,
-        help="processes for closed-loop episodes; all cores if unset",
-    ),
-    _FORCE,
-    _JSON,
-    _flag("raw", bool, False, "--raw", help="keep every raw sample in the JSON of --json"),
+    _flag("workers", Annotated[int | None, WORKERS], None),
+    *COMMON_FLAGS,
+    _flag("raw", Raw, False),
+)
+REMOTE_FLAGS = (
+    _flag("target", Annotated[str | None, TARGET], None),
+    _flag("remote_python", Annotated[str | None, REMOTE_PYTHON], None),
 )
 
 
@@ -104,13 +91,14 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         result = run_transform(stage, bundle, out, context, force=force)
-        there = for_board(result, bundle, board, context) if board else None
+        on_board = board_summary(result, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""
-    summary = {"bundle": str(out), "hash": result.hash, "bytes": result.size_bytes}
     precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}
-    findings = result.manifest.findings
     if as_json:
-        document({**summary, "precision": precision, "findings": findings, "board": there.values() if there else None})
+        document({
+            "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
+            "findings": result.manifest.findings, "board": on_board.values() if on_board else None,
+        })  # fmt: skip
         _refuse(result, baseline)
         return
     graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
@@ -123,7 +111,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
             typer.echo(f"  {name}: no matrix product or convolution")
             continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
-    for line in there.lines() if there else ():
+    for line in on_board.lines() if on_board else ():
         typer.echo(f"  {line}")
     _refuse(result, baseline)
 
@@ -186,18 +174,6 @@ def opened(source: str, context: Context) -> Bundle:
     from vlatool.sources import is_bundle
 
     return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
-
-
-REMOTE_FLAGS = (
-    _flag(
-        "target",
-        str | None,
-        None,
-        "--target",
-        help="run there, through ssh: user@host, or a Host of your ssh config",
-    ),
-    _flag("remote_python", str | None, None, "--remote-python", help="Python of the target, such as ~/venv/bin/python"),
-)
 
 
 def measure(

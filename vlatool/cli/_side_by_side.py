@@ -119,7 +119,7 @@ def differences(labels: Sequence[str], reports: Sequence[Report]) -> list[Findin
 
 
 def _validity(judged: Sequence[str], findings: Sequence[Finding]) -> str:
-    """Return the worst judgement; nothing when a report was not judged and nothing speaks against it."""
+    """Return the worst judgement; empty when a report was not judged and no finding is against it."""
     worst = max([*judged, *(finding.effect for finding in findings if finding.effect != "note")], key=VALIDITIES.index)
     return "" if worst == "valid" and "" in judged else worst
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import typer
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
-from typer.core import TyperGroup
 
 from vlatool import registry
 from vlatool.cli import _complete, _run
+from vlatool.cli._default import DefaultGroup
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import Measure, Stage, validated
 
@@ -31,7 +31,7 @@ DEFAULTS = {
 """The method that is meant when a command names none."""
 
 
-class StageGroup(TyperGroup):
+class StageGroup(DefaultGroup):
     """A group whose commands are the files of its kind; each is imported only when it is named."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -49,18 +49,12 @@ class StageGroup(TyperGroup):
         return built(stage_function(stage), cmd_name, stage.__doc__)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the default method when the first word is not a method."""
+        """Refuse a first word that is nearly a method."""
         known = self.list_commands(ctx)
-        if args and args[0] != "--help" and args[0].replace("_", "-") not in known:
-            likely = difflib.get_close_matches(args[0], known, n=1)
-            if likely and not ctx.resilient_parsing and not Path(args[0]).exists():
-                raise UsageError(f"Unknown {self.name} method '{args[0]}'; {nearest(args[0], known)}.")
-            args = [DEFAULTS[self.name or ""], *args]
+        other = "" if self.names_command(ctx, args) or ctx.resilient_parsing else args[0]
+        if difflib.get_close_matches(other, known, n=1) and not Path(other).exists():
+            raise UsageError(f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.")
         return super().parse_args(ctx, args)
-
-    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return methods, and what the default method takes in their place."""
-        return [*super().shell_complete(ctx, incomplete), *_complete.items(_complete.sources(incomplete))]
 
 
 def built(function: Callable[..., Any], name: str, text: str | None = None, **settings: Any) -> Any:
@@ -133,6 +127,6 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
 
 
 def _typed(context: typer.Context, name: str) -> bool:
-    """Return whether an option was given, here or by a variable, so that a board's wishes do not count."""
+    """Return whether an option was given, here or by a variable, so that a board's preferences do not count."""
     source = context.get_parameter_source(name)
     return source is not None and "DEFAULT" not in source.name

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson
 from vlatool.errors import DataError, UsageError, nearest
 from vlatool.files.printable import printable
 
 if TYPE_CHECKING:
-    from vlatool.stage.cache import Contents, Entry, Removed
+    from vlatool.stage.cache import Contents, Entry
 
 app = typer.Typer(help="List and remove finished stages that are kept.", no_args_is_help=True,
                   rich_markup_mode=None)  # fmt: skip
 SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 Place = Annotated[Path | None, typer.Option("--cache", help="the cache; $VLATOOL_CACHE or the user's if unset")]
-AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 
 
 @app.command("size")
@@ -37,8 +37,7 @@ def size(cache: Place = None, as_json: AsJson = False) -> None:
         stage = _sum(held, what)
         typer.echo(f"{what:28} {stage['entries']:5d} kept  {_human(stage['bytes']):>9} of their own")
     typer.echo(f"{'shared':28} {'':10}  {_human(_head(held)['shared_bytes']):>9}")
-    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
-    _tell_unknown(held)
+    _print_total(held)
 
 
 @app.command("list")
@@ -52,16 +51,15 @@ def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
     for entry in held.entries:
         own, shared = held.sizes(entry)
         typer.echo(f"{_age(time.time_ns() / 1e9 - entry.used):>6}  {_human(own):>9}  {_human(shared):>9}  {entry.name}")
-    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
-    _tell_unknown(held)
+    _print_total(held)
 
 
 @app.command("prune")
 def prune(
-    older_than: Annotated[str, typer.Option(help="remove what was not used for so long: 30d, 12h, 2w")] = "",
-    max_size: Annotated[str, typer.Option(help="remove the least recently used until so much is left: 5GB")] = "",
+    older_than: Annotated[str, typer.Option(help="remove what was not used for this long: 30d, 12h, 2w")] = "",
+    max_size: Annotated[str, typer.Option(help="remove the least recently used until this much is left: 5GB")] = "",
     everything: Annotated[bool, typer.Option("--all", help="remove all that no running process uses")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be removed, and remove nothing")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="show what would be removed, and remove nothing")] = False,
     cache: Place = None,
     as_json: AsJson = False,
 ) -> None:
@@ -79,7 +77,8 @@ def prune(
     removed = kept.prune(place, older_than_s=age, most_bytes=most, dry_run=dry_run)
     left = kept.contents(place).bytes - (removed.freed if dry_run else 0)
     if as_json:
-        document(_removed_row(place, removed, left, dry_run))
+        document({"cache": str(place), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
+                  "freed_bytes": removed.freed, "bytes": left, "stays": removed.stays})  # fmt: skip
         return
     for entry in removed.entries:
         typer.echo(f"{'would remove' if dry_run else 'removed'} {entry.name}")
@@ -142,12 +141,8 @@ def _entry_row(held: Contents, entry: Entry) -> dict[str, Any]:
     return {"name": entry.name, "stage": entry.what, "used": used, "bytes": own, "shared_bytes": shared}
 
 
-def _removed_row(place: Path, removed: Removed, left: int, dry_run: bool) -> dict[str, Any]:
-    return {"cache": str(place), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
-            "freed_bytes": removed.freed, "bytes": left, "stays": removed.stays}  # fmt: skip
-
-
-def _tell_unknown(held: Contents) -> None:
+def _print_total(held: Contents) -> None:
+    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
     if held.unknown:
         more = f" and {len(held.unknown) - 6} more" if len(held.unknown) > 6 else ""
         typer.echo(f"not vlatool's, never removed: {', '.join(map(_on_one_line, held.unknown[:6]))}{more}")

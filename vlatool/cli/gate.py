@@ -18,6 +18,7 @@ from vlatool.cli import _complete
 from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
+from vlatool.cli._options import AsJson, Force, Raw, ReportFolder
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files.edited import refuse_file, write_own
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=group_with("run"), no_args_is_help=True, rich_markup_mode=None,
-    help="Hold a candidate against a baseline, both measured side by side: vlatool gate CANDIDATE --baseline BUNDLE.",
+    help="Compare a candidate with a baseline, both measured side by side: vlatool gate CANDIDATE --baseline BUNDLE.",
 )  # fmt: skip
 CONFIG = Path("gate.yaml")
 
@@ -56,14 +57,14 @@ def run(
         int | None,
         typer.Option(min=0, help="of observations, noise and order; fresh, and recorded in the report, if unset"),
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    output: ReportFolder = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
-    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+    raw: Raw = False,
 ) -> None:
-    """Measure the baseline anew beside the candidate, and exit with 0 (pass), 1 (fail) or 5 (inconclusive).
+    """Measure the baseline again beside the candidate, and exit with 0 (pass), 1 (fail) or 5 (inconclusive).
 
     In a job of GitHub Actions it also prints annotations and writes the step summary.
     """
@@ -88,7 +89,7 @@ def run(
         _tell_github(report)
     try:
         show(report, as_json=as_json, out=output, force=force, raw=raw)
-    finally:  # after the directory of reports, for the file may lie in it
+    finally:  # after the directory of reports: the file may be in it
         if junit is not None:
             _write_junit(report, junit)
 
@@ -99,9 +100,11 @@ def init(
     baseline: Annotated[Path, typer.Option(help="bundle to compare with, relative to the repository")] = Path(
         "models/baseline"
     ),
-    candidate: Annotated[Path, typer.Option(help="what a change makes, relative to the repository")] = Path("policy"),
+    candidate: Annotated[Path, typer.Option(help="what a change produces, relative to the repository")] = Path(
+        "policy"
+    ),
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
     from vlatool.gate.files import gate_files

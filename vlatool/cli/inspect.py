@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -12,8 +11,8 @@ import typer
 from vlatool.bundle.bundle import Bundle, manifest_bytes
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
-from vlatool.cli import _complete
 from vlatool.cli._document import document
+from vlatool.cli._options import BundlePath
 from vlatool.errors import BundleError, GraphError
 from vlatool.files.printable import printable
 from vlatool.files.sealed import open_inside
@@ -24,7 +23,7 @@ from vlatool.runtime.probe import probe as try_once
 
 
 def inspect(
-    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)],
+    bundle: BundlePath,
     as_json: Annotated[bool, typer.Option("--json", help="print the manifest as JSON")] = False,
     probe: Annotated[
         bool,

@@ -11,6 +11,7 @@ import typer
 
 from vlatool.cli import _complete
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson, ProfileName
 
 app = typer.Typer(
     help="Hardware profiles: what a board has and what it allows.", no_args_is_help=True, rich_markup_mode=None
@@ -18,7 +19,7 @@ app = typer.Typer(
 
 
 @app.command("list")
-def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
+def list_profiles(as_json: AsJson = False) -> None:
     """List the profiles."""
     from vlatool.hardware.profile import load_profile, names
 
@@ -33,11 +34,8 @@ def list_profiles(as_json: Annotated[bool, typer.Option("--json", help="print JS
 
 @app.command("show")
 def show_profile(
-    name: Annotated[
-        str,
-        typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles),
-    ],
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    name: ProfileName,
+    as_json: AsJson = False,
 ) -> None:
     """Print one profile with the source of every figure."""
     from vlatool.hardware.profile import load_profile
@@ -56,12 +54,9 @@ def show_profile(
 
 @app.command("diff")
 def diff_profiles(
-    first: Annotated[
-        str,
-        typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles),
-    ],
+    first: ProfileName,
     second: Annotated[str, typer.Argument(help="another one", show_default=False, autocompletion=_complete.profiles)],
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print where two profiles differ: field, first, second."""
     from vlatool.hardware.profile import load_profile
@@ -89,7 +84,7 @@ def validate_profiles(
             help="YAML files, directories of them, or names", show_default=False, autocompletion=_complete.profiles
         ),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check profiles against the schema; exit 3 when one is wrong, naming every field that is."""
     from vlatool.errors import ProfileError
@@ -124,7 +119,7 @@ def new_profile(
     ] = "raspberry-pi-5",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="file; NAME.yaml when not given")] = None,
     force: Annotated[bool, typer.Option("--force", help="replace a file that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a profile of your own to begin with: another one's figures under a new name."""
     from vlatool.hardware.profile import copy_profile
@@ -140,17 +135,15 @@ def new_profile(
 
 @app.command("calibrate")
 def calibrate_profile(
-    name: Annotated[
-        str, typer.Argument(help="the board's profile", show_default=False, autocompletion=_complete.profiles)
-    ],
+    name: ProfileName,
     report: Annotated[
         Path, typer.Option("--from", help="report of `vlatool benchmark` on the board", show_default=False)
     ],
     mode: Annotated[str | None, typer.Option(help="power mode that it ran in; the default one when not given")] = None,
     bundle: Annotated[Path | None, typer.Option(help="what was measured, when the report does not say")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Tell the latency model what was measured on a board: predictions for it rest on that from now on."""
+    """Give the latency model a measurement on a board: predictions for it are based on that from now on."""
     from vlatool.boards.measured import calibrations, elsewhere, measured_in, store
     from vlatool.bundle.bundle import Bundle
     from vlatool.graph.workload import workload

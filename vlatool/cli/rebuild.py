@@ -11,6 +11,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document, put
+from vlatool.cli._options import AsJson, Force
 from vlatool.errors import GateFailed, UsageError
 from vlatool.files.outputs import BUNDLE
 
@@ -39,8 +40,8 @@ def rebuild(
     file: Annotated[
         list[Path] | None, typer.Option(help="a file that an option named (calibration), when not beside the source")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a bundle again from its build record, without the cache, and compare it byte by byte.
 

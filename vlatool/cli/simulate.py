@@ -9,6 +9,7 @@ import typer
 from vlatool.cli import _complete
 from vlatool.cli._console import progress
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson
 
 
 def simulate(
@@ -24,7 +25,7 @@ def simulate(
     precision: Annotated[
         str, typer.Option(help="precision; as the policy is stored when not given", autocompletion=_complete.precisions)
     ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
     from vlatool.boards.answer import simulated, simulation_lines

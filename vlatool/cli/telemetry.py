@@ -25,7 +25,7 @@ def telemetry(
     root: Annotated[Path, typer.Option(help="file system to read, such as a copied tree")] = Path("/"),
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout, with every sample")] = False,
 ) -> None:
-    """Watch what this machine tells of power, energy, temperatures, clocks and throttling, and what it does not."""
+    """Watch power, energy, temperatures, clocks and throttling, and list what this machine does not report."""
     from vlatool.telemetry import Recorder, open_all
 
     for name, value in (("seconds", seconds), ("period", period)):
@@ -48,7 +48,7 @@ def lines(recorded: Recorded) -> Iterator[str]:
     for energy in recorded.energy:
         power = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"
         yield f"{power}: {energy.label} ({energy.source})"
-    throttled = {None: "nothing on this machine tells", False: "no"}.get(
+    throttled = {None: "not reported by this machine", False: "no"}.get(
         recorded.throttled, "; ".join(recorded.throttling)
     )
     yield f"throttled: {throttled}"

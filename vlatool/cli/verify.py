@@ -9,6 +9,7 @@ import typer
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._options import AsJson, Force, ReportFolder
 from vlatool.sources import is_bundle
 
 
@@ -21,9 +22,9 @@ def verify(
     samples: Annotated[int, typer.Option(min=1, max=100_000, help="observations at most, spread over the data")] = 32,
     tolerance: Annotated[float, typer.Option(help="largest relative error of an action, and of each stage")] = 1e-3,
     seed: Annotated[int, typer.Option(min=0, help="of the noise that both are given")] = 0,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    output: ReportFolder = None,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check whether a policy gives what the code that it was made from gives, and if not, show which stage differs.
 

@@ -1,4 +1,4 @@
-"""Weights that were trained elsewhere, in the place of the policy's own."""
+"""Weights that were trained elsewhere, instead of the policy's own."""
 
 from __future__ import annotations
 

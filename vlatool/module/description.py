@@ -26,7 +26,7 @@ KEYS = (
     "parts", "calibration", "evaluation", "weights", "files",
 )  # fmt: skip
 IN_MANIFEST = ("name", "version", "spec", "program", "environment", "parts", "description", "license")
-"""What a bundle's manifest says as the description does."""
+"""Fields that a bundle's manifest takes from the description."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ CHECKED = Cause(
 CONTROL_FLOW = Cause(
     "data-dependent control flow",
     r"data-dependent|DataDependent|Dynamic control flow|_local_scalar_dense|Tensor-likes? to a (?:bool|number)",
-    "decide with torch.where() in the place of 'if', a fixed number of turns in the place of 'while'; keep int(), "
+    "decide with torch.where() instead of 'if', a fixed number of turns instead of 'while'; keep int(), "
     "float() and .item() of tensors out of forward()",
 )  # fmt: skip
 OTHER = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
@@ -67,7 +67,7 @@ CAUSES = (
     Cause(
         "a shape that depends on values",
         r"Size-like symbols: (?!none)|DynamicOutputShapeException|Unbacked ?[Ss]ym[Nn]ode",
-        "keep tensors in their full shape and multiply by a mask, in the place of x[mask], nonzero() or unique()",
+        "keep tensors in their full shape and multiply by a mask, instead of x[mask], nonzero() or unique()",
     ),
     CONTROL_FLOW,
     Cause(
@@ -125,7 +125,7 @@ CAUSES = (
 
 
 def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
-    """Return what to tell of an export that failed.
+    """Return the error for an export that failed.
 
     Args:
         error: What ``torch.onnx.export`` raised.

@@ -50,7 +50,8 @@ def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
         values |= {name: (tuple(port.axes or ()), np.dtype(port.dtype)) for name, port in sources_of(step).items()}
         module = modules[step.graph]
         with _fake(module) as real:
-            feeds = [_fake_tensor(torch, *values[value]) for value in step.feeds.values()]
+            given = [values[value] for value in step.feeds.values()]
+            feeds = [torch.empty(shape, dtype=getattr(torch, str(dtype)), device="cpu") for shape, dtype in given]
             within = visit(step, module, feeds, real) or contextlib.nullcontext()
             with within, torch.inference_mode(False), torch.no_grad(), exits_caught("the policy's forward()"):
                 outputs = outputs_of(module(*feeds), step)
@@ -108,7 +109,7 @@ def _nothing_drawn(torch: Any) -> Any:
 
 @contextlib.contextmanager
 def _fake(module: Any) -> Iterator[dict[str, Any]]:
-    """Put fake tensors in the place of parameters and buffers; yield the real buffers by name, under the fake mode."""
+    """Replace parameters and buffers by fake tensors; yield the real buffers by name, under the fake mode."""
     from torch._subclasses import FakeTensorMode
 
     real = {name: buffer for name, buffer in module.named_buffers() if not buffer.is_meta}
@@ -139,7 +140,3 @@ def _like(mode: Any, value: Any) -> Any:
     with mode:
         fake = torch.empty(value.shape, dtype=value.dtype, device="cpu")
         return torch.nn.Parameter(fake, requires_grad=False) if isinstance(value, torch.nn.Parameter) else fake
-
-
-def _fake_tensor(torch: Any, shape: tuple[int, ...], dtype: Any) -> Any:
-    return torch.empty(shape, dtype=getattr(torch, str(np.dtype(dtype))), device="cpu")

@@ -1,4 +1,4 @@
-"""A policy's own code is compiled from its source: bytecode in ``__pycache__`` is in no hash, and may say anything."""
+"""A policy's own code is compiled from its source: bytecode in ``__pycache__`` is in no hash, and could do anything."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _usual = SourceFileLoader.get_code
 def compile_afresh(folder: Path) -> None:
     """Keep this process from reading ``__pycache__`` below a policy's folder, however its files are imported.
 
-    Where the folder was trusted before, all that lies outside of Python's own directories is compiled afresh, and
+    Where the folder was trusted before, everything outside of Python's own directories is compiled afresh, and
     Python processes that the policy starts read no such directory at all.
     """
     remembered = not trust.is_named(folder)

@@ -8,7 +8,7 @@ from typing import Any
 def divide_by_roots(model: Any) -> int:
     """Write ``x * (1 / sqrt(y))`` as ``x / sqrt(y)``, in place; return how many products became quotients.
 
-    torch's exporter writes the former for ``rsqrt``, and so for every RMSNorm. ONNX Runtime fuses the latter alone into
+    torch's exporter writes the first for ``rsqrt``, and so for every RMSNorm. ONNX Runtime fuses only the second into
     one operator (``SimplifiedLayerNormalization``); OpenVINO fuses both. The two differ by one rounding.
 
     Args:

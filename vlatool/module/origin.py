@@ -1,4 +1,4 @@
-"""What of a policy's code a source bundle may run: as the policy's own description says it, where that may run."""
+"""What a source bundle may run of a policy's code: what the policy's own description names, where that is trusted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A torch module as an ONNX model: torch's dynamo exporter, kept quiet, its faults in words, nodes named by modules."""
+"""A torch module as an ONNX model: torch's dynamo exporter, quiet, its errors explained, nodes named by modules."""
 
 from __future__ import annotations
 

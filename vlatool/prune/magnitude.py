@@ -1,4 +1,4 @@
-"""Structured pruning by magnitude: whole neurons go, so that every engine is faster without sparse kernels."""
+"""Structured pruning by magnitude: whole neurons are removed, so that every engine is faster without sparse kernels."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ ELEMENTWISE = (
 class Magnitude(ModuleStage):
     """Remove the neurons of least magnitude from the hidden layers of MLPs.
 
-    A hidden layer is what lies between two Linear layers of an ``nn.Sequential`` with nothing but elementwise modules
+    A hidden layer is what is between two Linear layers of an ``nn.Sequential`` with nothing but elementwise modules
     between them. A neuron's magnitude is the product of the L2 norms of its incoming and of its outgoing weights: what
     it can add to the output. Train the policy further afterwards (``vlatool distill weights`` takes the result).
     """
 
-    ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer that goes")
-    multiple: int = Field(8, ge=1, description="neurons that stay are a multiple of this, as vector units want it")
+    ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer to remove")
+    multiple: int = Field(8, ge=1, description="the neurons that stay are a multiple of this, for vector units")
     include: tuple[str, ...] = Field((), description="globs of module names (of the first Linear); all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 

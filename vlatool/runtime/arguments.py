@@ -1,4 +1,4 @@
-"""What a caller passes to ``load``: each value is what it is documented to be, or a sentence says so."""
+"""What a caller passes to ``load``: each value is as documented, or a one-sentence error says what is wrong."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, op
     whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     if not whole or not least <= value <= most:
         upto = "" if most == math.inf else f" to {most:.0f}"
-        other = ", or None" if optional else ""
-        raise UsageError(f"{name} is {value!r}; allowed: a whole number from {least}{upto}{other}.")
+        raise _refused(name, value, f"a whole number from {least}{upto}", optional)
 
 
 def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False) -> None:
@@ -47,8 +46,11 @@ def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, 
         return
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not number or not (value > 0 or (zero and value == 0)):
-        other = ", or None" if optional else ""
-        raise UsageError(f"{name} is {value!r}; allowed: {unit} {'from' if zero else 'above'} 0{other}.")
+        raise _refused(name, value, f"{unit} {'from' if zero else 'above'} 0", optional)
+
+
+def _refused(name: str, value: Any, allowed: str, optional: bool) -> UsageError:
+    return UsageError(f"{name} is {value!r}; allowed: {allowed}{', or None' if optional else ''}.")
 
 
 def check_load(

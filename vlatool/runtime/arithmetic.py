@@ -3,7 +3,7 @@
 x86 without VNNI multiplies uint8 with int8 in pairs and adds both products in 16 bits. Two times 255 x 127 is 64,770
 and becomes 32,767: an int8 policy computes other actions there, in silence. ONNX Runtime has an option that is exact on
 such processors, for uint8 activations and at a cost; int8 activations are exact without it. The option is a rewriting
-of the graph (of its weights to uint8), so that a session that rewrites nothing saturates all the same.
+of the graph (of its weights to uint8), so that a session that rewrites nothing saturates regardless.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PRECISE = ("session.x64quantprecision", "1")
 """The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``)."""
 SIGNED = ("session.qdqisint8allowed", "1")
 """The option of ONNX Runtime that leaves int8 activations of quantize/dequantize pairs int8: on x86 it rewrites them to
-uint8 else, with which convolutions saturate where those of int8 are exact."""
+uint8 otherwise, with which convolutions saturate where those of int8 are exact."""
 UNFUSED = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
 EXACT = "exact"
@@ -76,7 +76,7 @@ def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float
             options.add_session_config_entry(*PRECISE)
         session = ort.InferenceSession(model(written), options, providers=["CPUExecutionProvider"])
         return float(session.run(None, {"x": operand()})[0].min())
-    except Exception:  # the seam: a build without these operators runs float32 all the same
+    except Exception:  # the seam: a build without these operators still runs float32
         return math.nan
 
 
@@ -96,7 +96,7 @@ def exactness(product: float) -> str:
 
 
 def as_written(ort: Any, options: Any, precise: bool) -> None:
-    """Set the options of a session that shall compute the operators of a graph as they are written.
+    """Set the options of a session that is to compute the operators of a graph as they are written.
 
     Args:
         ort: The module.

@@ -1,4 +1,4 @@
-"""What the graphs give and take, held against the spec: when a policy is opened, and at every inference."""
+"""What the graphs give and take, checked against the spec: when a policy is opened, and at every inference."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ class Port(NamedTuple):
     dtype: str
 
     def __str__(self) -> str:
-        return self.dtype if self.axes is None else f"{self.dtype} [{', '.join(_axis(axis) for axis in self.axes)}]"
+        if self.axes is None:
+            return self.dtype
+        return f"{self.dtype} [{', '.join('?' if axis is None else str(axis) for axis in self.axes)}]"
 
     def fits(self, other: Port) -> bool:
         """Return whether both can be the same array."""
@@ -90,7 +92,7 @@ def allowed_mb(manifest: Manifest, memory_mb: float | None) -> float:
 
 
 def check_sizes(manifest: Manifest, limit_mb: float) -> None:
-    """Check what the manifest alone says before anything of that size is made.
+    """Check the sizes in the manifest before anything of that size is allocated.
 
     Raises:
         GraphError: when inputs, outputs, noise and kept values would be larger than ``limit_mb`` (10^6 bytes).
@@ -103,11 +105,11 @@ def check_sizes(manifest: Manifest, limit_mb: float) -> None:
 
 
 def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: float) -> None:
-    """Hold what the open graphs declare against the spec, and against each other along the program.
+    """Check what the open graphs declare against the spec, and against each other along the program.
 
     Args:
         manifest: With spec and program.
-        sessions: Graph name -> session; one that does not tell ``takes`` and ``gives`` is believed.
+        sessions: Graph name -> session; one without ``takes`` and ``gives`` is believed.
         limit_mb: Of what one graph takes and gives together, in 10^6 bytes.
 
     Raises:
@@ -190,10 +192,10 @@ def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
 
 
 def written_as_declared(manifest: Manifest, sessions: Mapping[str, Any]) -> set[str]:
-    """Return the outputs that an engine writes into arrays of the declared shape and dtype, and cannot give otherwise.
+    """Return the outputs that an engine writes into arrays of the declared shape and dtype: it can give nothing else.
 
-    Those are what one graph gives, and nothing else makes, where its session has ``bound`` (``check_graphs`` has held
-    what it gives against the spec).
+    Those are what one graph gives, and nothing else makes, where its session has ``bound`` (``check_graphs`` has
+    checked what it gives against the spec).
     """
     makers: dict[str, list[bool]] = {}
     for step in manifest.program:
@@ -206,29 +208,29 @@ def written_as_declared(manifest: Manifest, sessions: Mapping[str, Any]) -> set[
 
 
 class Outputs:
-    """Holds the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
+    """Checks the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
 
     Args:
         outputs: What is declared.
-        action: Whether the first is looked at for finite numbers, too; a policy does that in physical units.
-        certain: Names of outputs whose shape and dtype need not be looked at.
+        action: Whether the first is checked for finite numbers, too; a policy does that in physical units.
+        certain: Names of outputs whose shape and dtype need no check.
     """
 
     def __init__(self, outputs: Iterable[TensorSpec], *, action: bool = True, certain: Collection[str] = ()) -> None:
         self.names = []
-        self._wanted = []
+        self._checked = []
         for number, tensor in enumerate(outputs):
             dtype = np.dtype(tensor.dtype)
             fixed = tensor.shape if all(isinstance(axis, int) for axis in tensor.shape) else None
             floating = dtype.kind == "f" and (action or number > 0)
             self.names.append(tensor.name)
             if floating or tensor.name not in certain:
-                self._wanted.append((tensor.name, fixed, dtype, floating, tensor))
+                self._checked.append((tensor.name, fixed, dtype, floating, tensor))
 
     @property
     def certain(self) -> bool:
-        """Whether there is nothing to look at."""
-        return not self._wanted
+        """Whether there is nothing to check."""
+        return not self._checked
 
     def __call__(self, values: Mapping[str, Any], who: str = "The policy") -> dict[str, Array]:
         """Return the outputs by name.
@@ -236,7 +238,7 @@ class Outputs:
         Raises:
             GraphError: naming the output, what it is and what is declared.
         """
-        for name, shape, dtype, floating, tensor in self._wanted:
+        for name, shape, dtype, floating, tensor in self._checked:
             array = values[name]
             if array.dtype != dtype or (array.shape != shape and (shape or not _fits(array, tensor))):
                 raise _misfit(array, tensor, who)
@@ -270,7 +272,3 @@ def _remedy(got: str, declared: str) -> str:
 
 def _declared(tensor: TensorSpec) -> Port:
     return port(tensor.shape, tensor.dtype)
-
-
-def _axis(axis: int | None) -> str:
-    return "?" if axis is None else str(axis)

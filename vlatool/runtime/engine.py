@@ -1,7 +1,7 @@
 """What every engine declares about itself, so that the build side names no engine.
 
 A file in ``vlatool/runtime/engines/`` (or one that another package brings, see ``vlatool.registry``) defines one class
-that opens a graph (``vlatool.runtime.program.Session``) and overrides what it does otherwise than said here.
+that opens a graph (``vlatool.runtime.program.Session``) and overrides what differs from the defaults here.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Engine:
 
     @classmethod
     def execution_providers(cls) -> list[str] | None:
-        """Return what the installed library runs on, None where it does not say so.
+        """Return what the installed library runs on, None where it does not tell.
 
         Raises:
             MissingExtra: when it cannot be imported.

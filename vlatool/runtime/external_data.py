@@ -62,7 +62,7 @@ MayHold = Callable[[bytes | OpenFile, int, int], bool]
 
 
 def external_files(model: bytes | OpenFile) -> set[str]:
-    """Return the locations of all external data that a serialized ``ModelProto`` names, as they stand there.
+    """Return the locations of all external data that a serialized ``ModelProto`` names, as written there.
 
     Initialisers, attributes, subgraphs, functions and training graphs are gone through, as far as the key stands in
     them. Time is linear in the number of parts, and in the size of those that name weights beside the graph.
@@ -145,7 +145,7 @@ def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int
 
 
 def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
-    """Return a number of at most so many bytes, and where it ends."""
+    """Return a number of at most ``longest`` bytes, and where it ends."""
     value = 0
     for number in range(longest):
         if at >= len(head):

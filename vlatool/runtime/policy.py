@@ -55,7 +55,7 @@ class Policy:
     It may be opened in one thread and used in another. Calls from several threads at once take turns, so that each gets
     the answer to its own observation: an error instead would hit a control loop at random, whenever calls happen to
     overlap, and a lock costs it less than a microsecond. Calls that overlap on a policy that keeps values from step to
-    step are refused all the same: they would mix two episodes, which no order makes right. One policy for each thread
+    step are refused nevertheless: they would mix two episodes, which no order makes right. One policy for each thread
     also spares them the waiting.
     """
 
@@ -86,7 +86,7 @@ class Policy:
         seed: int | None = None,
         memory_mb: float | None = None,
     ) -> Policy:
-        """Open every graph of a verified bundle and hold it against the spec; see ``vlatool.runtime.load``."""
+        """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
             raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
@@ -109,7 +109,7 @@ class Policy:
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
-            noise: Value name -> float32 array, in the place of what the program would draw.
+            noise: Value name -> float32 array, instead of what the program would draw.
 
         Raises:
             DataError: when the observation or the noise does not fit.
@@ -194,7 +194,7 @@ class Policy:
         """Run the golden observations one after the other, as they were recorded, and compare the actions.
 
         Args:
-            inferences: At least so many, and each golden observation once; none when 0.
+            inferences: At least this many, and each golden observation once; none when 0.
             tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
             first_run_s: Seconds that each may take.
 
@@ -229,7 +229,7 @@ class Policy:
         self.check_golden(tolerance)
 
     def check_golden(self, tolerance: float | None = None) -> None:
-        """Hold what the warm-up found against what is allowed.
+        """Check the differences of the warm-up against what is allowed.
 
         Args:
             tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.

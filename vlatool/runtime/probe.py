@@ -56,13 +56,13 @@ def probe(
         VlatoolError: what the bundle raises, of the same class.
     """
     allowed = allowed_mb(Bundle.open(path, verify=False).manifest, memory_mb)
-    asked = {
+    job = {
         "path": str(path), "engine": engine, "threads": threads, "first_run_s": first_run_s, "memory_mb": allowed,
     }  # fmt: skip
     try:
         done = subprocess.run(
             [sys.executable, "-I", "-c", CHILD.format(path=_search_path())],
-            input=json.dumps(asked), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
+            input=json.dumps(job), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise _too_long(path, START_S + first_run_s) from None
@@ -71,14 +71,14 @@ def probe(
 
 def main() -> None:
     """Answer one question: the child's side."""
-    asked = json.loads(sys.stdin.readline())
-    size = int(asked["memory_mb"] * 1e6)
+    job = json.loads(sys.stdin.readline())
+    size = int(job["memory_mb"] * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = math.ceil((START_S + asked["first_run_s"]) * len(os.sched_getaffinity(0)))
+    seconds = math.ceil((START_S + job["first_run_s"]) * len(os.sched_getaffinity(0)))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # should the parent not live to end this process
     try:
-        answer = _run(**asked)
+        answer = _run(**job)
     except VlatoolError as error:
         answer = {"error": type(error).__name__, "message": error.message, "fix": error.fix}
     except MemoryError:

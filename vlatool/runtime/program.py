@@ -87,7 +87,7 @@ class Program:
 
         Args:
             values: Value name -> array.
-            noise: Value name -> floating array, in the place of what the program would draw.
+            noise: Value name -> floating array, instead of what the program would draw.
             finish: Makes the result from all values.
 
         Raises:
@@ -110,7 +110,7 @@ class Program:
             if before is not None:
                 self._random.bit_generator.state = before
             if isinstance(error, VlatoolError) and (before or self._kept):
-                _tell_rolled_back(error)
+                _note_rollback(error)
             raise
         self._kept = kept
         return result
@@ -183,7 +183,7 @@ def _checked(name: str, value: Array, zero: Array) -> Array:
     return value
 
 
-def _tell_rolled_back(error: VlatoolError) -> None:
+def _note_rollback(error: VlatoolError) -> None:
     """Add to an error that the inference counts as if it had never been."""
     error.message += " The state that the policy keeps is as it was before this inference."
-    error.fix = "; ".join(filter(None, [error.fix, "go on with a good observation, or start anew with reset()"]))
+    error.fix = "; ".join(filter(None, [error.fix, "continue with a good observation, or start over with reset()"]))

@@ -17,7 +17,7 @@ def fix_axes(model: Any, spec: PolicySpec | None) -> dict[str, dict[int, int]]:
     """Give the free axes of a model's inputs their lengths, in place: input -> axis -> length.
 
     An axis has the length that the spec gives; else the first one is the batch, which is 1. An axis that is named like
-    one of these has that length too. What depends on them is inferred anew.
+    one of these has that length too. What depends on them is inferred again.
 
     Args:
         model: A ``ModelProto``.
@@ -104,7 +104,7 @@ def _infer(model: Any) -> None:
     onnx = require("onnx", "build")
     try:
         inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
-    except Exception:  # the seam: a model that onnx cannot infer may run all the same
+    except Exception:  # the seam: a model that onnx cannot infer may still run
         return
     outputs = {value.name: value for value in inferred.graph.output}
     for value in model.graph.output:

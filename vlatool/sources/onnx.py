@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Graph, Manifest
 from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -109,7 +109,7 @@ class OnnxFile(Source):
         made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
         with _named_after(self.model, out / "graphs/main.onnx"):
             graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
-            observations = _observations(described, out, manifest)
+            observations = observations_for(seal(out, manifest), 2)
             if converted:
                 _compare(self.model, out, manifest, observations, further)
             return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
@@ -187,7 +187,7 @@ def _named_after(model: Path, copy: Path) -> Iterator[None]:
 def _compare(
     before: Path, out: Path, manifest: Manifest, observations: list[dict[str, Any]], unbatched: list[str]
 ) -> None:
-    """Hold the converted graph against the file that it came from, which has no batch axis in some tensors.
+    """Compare the converted graph with the file that it came from, which has no batch axis in some tensors.
 
     Raises:
         SourceError: when ONNX Runtime computes something else.
@@ -211,12 +211,6 @@ def _compare(
                 f"allowed {TOLERANCE:g}.",
                 "leave --opset out, or export the file again where it was made",
             )
-
-
-def _observations(described: Description, out: Path, manifest: Manifest) -> list[dict[str, Any]]:
-    from vlatool.bundle.bundle import seal
-
-    return observations_for(seal(out, manifest), 2)
 
 
 def _refuse_bare(folder: Path) -> None:

@@ -128,7 +128,7 @@ class TorchModule(Source):
             files = {file for file in described.folder.resolve().glob(pattern) if file.is_file()}
             if not files or not all(file.is_relative_to(folder) for file in files):
                 raise SourceError(
-                    f"{described.folder} says files: {pattern}, of which there is none beside the factory.",
+                    f"{described.folder} says files: {pattern}, which matches nothing beside the factory.",
                     "name files or globs below the folder of the factory",
                 )
             data |= files

@@ -1,4 +1,4 @@
-"""A stage in a child process, for it runs a user's code or needs variables of its own: what asks, and what answers."""
+"""A stage in a child process, since it runs a user's code or needs its own environment: both sides of the call."""
 
 from __future__ import annotations
 

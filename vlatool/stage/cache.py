@@ -2,7 +2,7 @@
 
 Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
 list of its files, work that waits to be continued by its lock, a count by its content, a shared recording by its hash.
-Everything else that lies there is named and left alone. What a running process uses is locked, and stays.
+Everything else there is listed and left alone. What a running process uses is locked, and stays.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Contents:
         cache: Where it is.
         entries: The least recently used one first.
         kept: Shared files: name below the cache -> inode and bytes.
-        unknown: Names below the cache of what vlatool did not write, as far as it lies beside entries.
+        unknown: Names below the cache of what vlatool did not write, as far as it is beside entries.
     """
 
     cache: Path
@@ -131,7 +131,7 @@ def contents(cache: Path) -> Contents:
 
 
 def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
-    """Return the shared files by their names below the cache, and the names of what lies beside them."""
+    """Return the shared files by their names below the cache, and the names of what else is there."""
     kept, unknown = {}, []
     for path in _below(cache / FILES):
         name = path.relative_to(cache).as_posix()
@@ -151,7 +151,7 @@ def prune(
 
     Args:
         cache: The cache.
-        older_than_s: Remove what was not used for so many seconds; 0 for everything.
+        older_than_s: Remove what was not used for this many seconds; 0 for everything.
         most_bytes: Remove until no more than that is left.
         dry_run: Only say what would be removed.
     """

@@ -30,7 +30,7 @@ ROUNDING = 0.045
 right engines and processors it was seen to be at most 0.035, on wrong ones at least 0.09, and where int8 products
 saturate from 0.045 on."""
 FARTHER = 1.2
-"""How many times as far from the source as the graphs an engine may be that rounds otherwise, as root mean square of
+"""How many times as far from the source as the graphs an engine may be that rounds differently, as root mean square of
 ``TRIALS`` observations: it draws an error of the same size again. A loop over int8 layers carries a rounding that falls
 the other way into all that follow: in ten steps of a denoising UNet the engine was as far from the graphs (up to 0.09)
 as either was from float32. Of its observations 99 in 100 choices of 8 give at most 1.18; a fault of the engine's own
@@ -42,11 +42,11 @@ REDRAWN = 1.5
 was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
 LEAST_TOLERANCE = 0.01
 COARSE_TOLERANCE = {"float16": 0.03, "int4": 0.03, "int4 weights": 0.03, "float8": 0.06}
-"""The same for graphs whose kernels round otherwise by design from processor to processor: float16 is computed as such
-where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8 where
-there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72). A sum that
-is added up in another order falls on the other side of a step of float8, which is an eighth of a value: between one and
-two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029."""
+"""The same for graphs whose kernels round differently by design from processor to processor: float16 is computed as
+such where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8
+where there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72). A sum
+that is added up in another order falls on the other side of a step of float8, which is an eighth of a value: between
+one and two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029."""
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")
@@ -111,19 +111,19 @@ def finish(
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
-    seen = write_golden(draft, observations, out)
+    golden = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
     bundle = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
-    limit = _limit(source, bundle, seen)
-    redrawn = seen.difference > limit and _rounds_otherwise(source, bundle, observations)
-    new = [] if seen.difference <= limit or redrawn else [_engine_difference(bundle, seen.difference, limit)]
+    limit = _limit(source, bundle, golden)
+    redrawn = golden.difference > limit and _rounds_differently(source, bundle, observations)
+    new = [] if golden.difference <= limit or redrawn else [_engine_difference(bundle, golden.difference, limit)]
     if is_int8(bundle.manifest) and reference().arithmetic() == SATURATING:
         new.append(_inexact_reference(bundle))
     kept = [finding for finding in source.manifest.findings if finding["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
     discrete = bundle.manifest.spec.action.kind == "discrete"
     return restate(bundle, replace(
-        bundle.manifest, golden_tolerance=_tolerance(seen.difference, bundle, redrawn),
-        golden_chunk_tolerance=0.0 if discrete else _tolerance(seen.of_chunk, bundle, redrawn), findings=(*kept, *new),
+        bundle.manifest, findings=(*kept, *new), golden_tolerance=_tolerance(golden.difference, bundle, redrawn),
+        golden_chunk_tolerance=0.0 if discrete else _tolerance(golden.of_chunk, bundle, redrawn),
     ))  # fmt: skip
 
 
@@ -139,20 +139,20 @@ def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:
     return math.ceil(tolerance * 1000) / 1000 if math.isfinite(tolerance) else 1.0
 
 
-def _limit(source: Bundle, bundle: Bundle, seen: Golden) -> float:
+def _limit(source: Bundle, bundle: Bundle, golden: Golden) -> float:
     """Return how far the engine may be from what the graphs say: as far as the graphs are from those of the source.
 
     What is computed in bfloat16 differs by what bfloat16 costs, which is judged as accuracy.
     """
     if any(graph.compute == "bfloat16" for graph in bundle.manifest.graphs.values()):
         return math.inf
-    if seen.difference <= ROUNDING or not source.manifest.graphs:
+    if golden.difference <= ROUNDING or not source.manifest.graphs:
         return ROUNDING
-    before = _outputs(reference_policy(source), seen.samples)
-    return max(ROUNDING, _worst(_apart(seen.expected, before, bundle.manifest.spec.action.name)))
+    before = _outputs(reference_policy(source), golden.samples)
+    return max(ROUNDING, _worst(_differences(golden.expected, before, bundle.manifest.spec.action.name)))
 
 
-def _rounds_otherwise(source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
+def _rounds_differently(source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether an engine that is far from the graphs is as near to their source as they are.
 
     Then it computes the same policy with other roundings, and no other one.
@@ -162,22 +162,22 @@ def _rounds_otherwise(source: Bundle, bundle: Bundle, observations: Sequence[Map
     samples = _samples(bundle.manifest, observations, TRIALS)
     before = _outputs(reference_policy(source), samples)
     name = bundle.manifest.spec.action.name
-    graphs = _apart(_outputs(reference_policy(bundle), samples), before, name)
-    engine = _apart(_outputs(Policy.open(bundle, threads=1, seed=SEED), samples), before, name)
+    graphs = _differences(_outputs(reference_policy(bundle), samples), before, name)
+    engine = _differences(_outputs(Policy.open(bundle, threads=1, seed=SEED), samples), before, name)
     return float(np.linalg.norm(engine)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
 
 
 def _samples(
     manifest: Manifest, observations: Sequence[Mapping[str, Any]], count: int
 ) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
-    """Return so many observations, from the first on again where there are fewer, with noise for each."""
+    """Return ``count`` observations, starting over where there are fewer, with noise for each."""
     random = np.random.default_rng(SEED)
     noises = [pair for step in manifest.program for pair in step.noise.items()]
     chosen = [observations[index % len(observations)] for index in range(count)]
     return [(observation, {name: draw(noise, random) for name, noise in noises}) for observation in chosen]
 
 
-def _apart(actions: Sequence[Action], expected: Sequence[Action], name: str) -> list[float]:
+def _differences(actions: Sequence[Action], expected: Sequence[Action], name: str) -> list[float]:
     """Return the relative L2 difference of an output, for each action."""
     return [relative_error(a.outputs[name], b.outputs[name]) for a, b in zip(actions, expected, strict=True)]
 
@@ -258,7 +258,7 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     (out / GOLDEN).parent.mkdir(exist_ok=True)
     save_npz(out / GOLDEN, {key: np.stack([np.asarray(item) for item in items]) for key, items in arrays.items()})
     of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, expected, strict=True))
-    return Golden(samples, expected, _worst(_apart(own, expected, name)), of_chunk)
+    return Golden(samples, expected, _worst(_differences(own, expected, name)), of_chunk)
 
 
 def _worst(errors: Iterable[float]) -> float:
@@ -271,7 +271,7 @@ def _outputs(policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[
 
 
 def reference_policy(bundle: Bundle) -> Policy:
-    """Open a bundle in what computes its graphs as they are written, whatever engine it was made for."""
+    """Open a bundle in the reference engine, which computes graphs as written, whatever engine it was made for."""
     graphs = bundle.manifest.graphs.items()
     sessions = {name: open_graph(bundle, replace(graph, compute=""), reference(), 1) for name, graph in graphs}
     return Policy(bundle, Program(bundle.manifest.program, sessions, SEED), "reference")

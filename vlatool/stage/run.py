@@ -55,11 +55,6 @@ def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
     return cache / "stages" / f"{stage.name()}-{stage.key(source_hash)}"
 
 
-def is_cached(stage: Stage, source_hash: str, cache: Path) -> bool:
-    """Return whether the output of a stage is there."""
-    return cached_path(stage, source_hash, cache).is_dir()
-
-
 def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
     """Return the stage's bundle from the cache, or run the stage into the cache."""
     path = cached_path(stage, source.hash if source else "", cache)

@@ -1,7 +1,7 @@
 """What a graph says: ONNX Runtime on the CPU, which computes each operator as it is written.
 
-No engine to run a robot on, but the one that others are held against: an engine that rewrites a graph may compute other
-numbers than the graph says, and an answer of its own would not show it.
+Not an engine to run a robot on, but the one that others are compared with: an engine that rewrites a graph may compute
+other numbers than the graph says, and its own answer would not show it.
 
 Where integer operators saturate, they do so in a session that rewrites nothing, too, and a saturated answer is not what
 the graph says. There the option that makes them exact is set, with the rewriting that it takes and no more

@@ -52,7 +52,7 @@ class OpenvinoSession(Engine):
         path: The ONNX file; external data is found beside it.
         threads: Threads; the cores that this process may use when None.
         compute: Dtype of what is not quantized: ``float32`` (also when empty) or ``bfloat16``.
-        opened: What is opened in the place of ``path``: the content of the file, or another name of it.
+        opened: What is opened instead of ``path``: the content of the file, or another name of it.
 
     Raises:
         GraphError: when OpenVINO refuses the file or computes in another dtype than asked for.
@@ -165,7 +165,7 @@ class OpenvinoSession(Engine):
         return buffers
 
     def _fill(self, feeds: Mapping[str, Any]) -> bool:
-        """Copy the feeds into the request's inputs; say no, for OpenVINO to name the mistake, when one does not fit."""
+        """Copy the feeds into the request's inputs; False when one does not fit, so that OpenVINO names the mistake."""
         if len(feeds) != len(self._buffers):
             return False
         for name, buffer in self._buffers.items():
@@ -262,9 +262,7 @@ def _remedy(error: Exception) -> str:
         return ""
     lacks = "instructions that OpenVINO needs for it: quantize with --layout ort"
     if confined := onednn_max_cpu_isa():
-        return (
-            f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if it stands for no board"
-        )
+        return f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if no board is meant"
     return f"this processor lacks {lacks}"
 
 

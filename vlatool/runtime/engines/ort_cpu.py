@@ -51,10 +51,10 @@ class OrtCpuSession(Engine):
         path: The ONNX file; external data is found beside it.
         threads: Intra-op threads; the cores that this process may use when None.
         compute: ``float32`` or empty.
-        opened: What is opened in the place of ``path``: the content of the file, or another name of it.
+        opened: What is opened instead of ``path``: the content of the file, or another name of it.
 
     Raises:
-        GraphError: when ONNX Runtime refuses the file, opened it on another provider, or shall compute in another
+        GraphError: when ONNX Runtime refuses the file, opened it on another provider, or is to compute in another
             dtype: it has no other one.
         MissingExtra: when onnxruntime is not installed.
     """
@@ -213,7 +213,7 @@ class OrtCpuSession(Engine):
 class _Bound:
     """Buffers that are bound to the inputs and outputs of a small graph once, for all runs.
 
-    ``run()`` of ONNX Runtime wraps every array anew; writing into bound buffers instead takes some 20 us less right
+    ``run()`` of ONNX Runtime wraps every array again; writing into bound buffers instead takes some 20 us less right
     after an inference, when the processor's caches hold the network (``vlatool benchmark overhead``). Large tensors
     would pay more for the copy than that.
     """
@@ -244,7 +244,7 @@ class _Bound:
         return cls(session, ort, small, results)
 
     def takes(self, feeds: Mapping[str, Any]) -> bool:
-        """Copy the feeds into the buffers; say no, for ONNX Runtime to name the mistake, when one does not fit."""
+        """Copy the feeds into the buffers; False when one does not fit, so that ONNX Runtime names the mistake."""
         for name, buffer, shape, dtype in self._inputs:
             value = feeds.get(name)
             if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype != dtype:
