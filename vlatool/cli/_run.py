@@ -126,7 +126,7 @@ def _refuse(bundle: Bundle, baseline: str = "") -> None:
     """Fail when a stage marked the bundle as wrong; it stays where it is, for inspection.
 
     Args:
-        made: The new bundle.
+        bundle: The new bundle.
         baseline: The bundle that it was made from, where a path leads to it.
 
     Raises:

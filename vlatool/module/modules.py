@@ -13,8 +13,8 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     """Return the modules that a program runs: graph name -> torch module in evaluation mode.
 
     Args:
-        made: A module, a program of ``torch.export``, or a mapping of graph names to them.
-        wanted: Names of the program's graphs.
+        product: A module, a program of ``torch.export``, or a mapping of graph names to them.
+        graphs: Names of the program's graphs.
 
     Raises:
         SourceError: when one is missing or is something else.

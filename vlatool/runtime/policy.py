@@ -266,7 +266,7 @@ class Policy:
 
         Args:
             got: (T, A) in the units of the spec.
-            wanted: What was recorded of it, the same.
+            expected: What was recorded of it, the same.
         """
         normaliser = self._decode.normaliser
         if normaliser is None or got.shape != expected.shape:
