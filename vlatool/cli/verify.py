@@ -34,12 +34,12 @@ def verify(
     from vlatool.machine.host import cache_directory
     from vlatool.sources import sourced
     from vlatool.verify import Options, check
-    from vlatool.verify import verify as verified
+    from vlatool.verify import verify as verify_policy
 
     refuse_existing(output, force, source, data)
     options = Options(against, data, samples, tolerance, seed)
     check(options)
     with progress() as context:
         bundle = Bundle.open(source) if is_bundle(source) else sourced(source, cache_directory(), context)
-        report = verified(bundle, options, context)
+        report = verify_policy(bundle, options, context)
     show(report, as_json=as_json, out=output, force=force)

@@ -140,7 +140,7 @@ def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
     for name, library in usable_engines().items():
         try:
-            products = str(library.arithmetic())  # type: ignore[attr-defined]
+            products = library.arithmetic()
         except VlatoolError:
             continue
         finding = f"products of uint8 and int8 are {products}"

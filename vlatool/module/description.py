@@ -91,7 +91,9 @@ def read_description(path: Path) -> Description:
         SpecError: when the spec or the program is impossible.
     """
     file = description_file(path)
-    data = _mapping(file)
+    if not file.exists():
+        raise SourceError(f"No such file: {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
+    data = read_mapping(file, str(file), SourceError)
     for key in data:
         if key not in KEYS:
             raise SourceError(f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.")
@@ -168,12 +170,6 @@ def read_location(bundle: Path) -> Path:
     if not folder.is_dir():
         raise SourceError(f"The policy's code was in {folder}, which is gone.", "start again from the source")
     return folder
-
-
-def _mapping(file: Path) -> Mapping[str, Any]:
-    if not file.exists():
-        raise SourceError(f"No such file: {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
-    return read_mapping(file, str(file), SourceError)
 
 
 def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:

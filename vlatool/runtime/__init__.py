@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
+from vlatool.bundle.bundle import Bundle
 from vlatool.runtime.arguments import check_load
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
@@ -62,16 +63,14 @@ def load(
         >>> policy.infer({"image": frames, "instruction": "go to the red ball"}).labels  # doctest: +SKIP
         ('forward',)
     """
-    from vlatool.bundle.bundle import Bundle
-
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.described(path)
     refuse_findings(bundle, accept)
     bundle.verify("data/")
     if probe:
-        from vlatool.runtime.probe import probe as tried
+        from vlatool.runtime.probe import probe as run_once
 
-        tried(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
+        run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
     bundle.verify()
     policy.warm_up(warmup, golden_tolerance, first_run_s)

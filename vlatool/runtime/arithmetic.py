@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.manifest import Manifest
+from vlatool.runtime.engine import UNKNOWN as UNKNOWN
 from vlatool.runtime.engine import engine_class
 
 MODEL = (
@@ -44,7 +45,6 @@ UNFUSED = ("session.disable_quant_qdq", "1")
 EXACT = "exact"
 EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
 SATURATING = "saturating: they are added in pairs of 16 bits"
-UNKNOWN = "not known: the engine does not compute the product that would show it"
 
 
 def model(written: bool = False) -> bytes:

@@ -28,6 +28,8 @@ MOVES = frozenset({
 """Operators that compute nothing."""
 QUANTIZES = frozenset(("QuantizeLinear", "DequantizeLinear", "DynamicQuantizeLinear", "FakeQuantize"))
 STANDARD_LAYOUT = "qdq"
+UNKNOWN = "not known: the engine does not compute the product that would show it"
+"""How an engine computes integer products, where that is not measured."""
 Stages = tuple[dict[str, dict[str, Any]], ...]
 """Names of stages, each with its options, as a recipe lists them."""
 Node = tuple[str, str, str]
@@ -107,6 +109,16 @@ class Engine:
             MissingExtra: when it is not installed.
         """
         return str(cls.library().__version__).partition("-")[0]
+
+    @classmethod
+    def arithmetic(cls) -> str:
+        """Return how integer products are computed on this machine; not known, unless the engine measures it.
+
+        Raises:
+            MissingExtra: when the library is not installed.
+        """
+        cls.library()
+        return UNKNOWN
 
     @classmethod
     def execution_providers(cls) -> list[str] | None:

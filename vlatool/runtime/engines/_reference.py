@@ -23,14 +23,14 @@ class ReferenceSession(OrtCpuSession):
     optimized = False
 
     @staticmethod
-    def _ways(ort: Any, threads: int | None) -> list[Any]:
+    def _option_sets(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
         exact_by_option = arithmetic.ort_exactness(ort, written=True) == arithmetic.EXACT_BY_OPTION
-        precisions = [True, False] if exact_by_option else [False]
-        ways = [session_options(ort, threads) for _ in precisions]
-        for options, precise in zip(ways, precisions, strict=True):
-            arithmetic.as_written(ort, options, precise)
-        return ways
+        option_sets = []
+        for precise in [True, False] if exact_by_option else [False]:
+            option_sets.append(session_options(ort, threads))
+            arithmetic.as_written(ort, option_sets[-1], precise)
+        return option_sets
 
     @staticmethod
     def arithmetic() -> str:

@@ -90,7 +90,7 @@ class OrtCpuSession(Engine):
         self.outputs = [node.name for node in self._session.get_outputs()]
         self.takes = {node.name: _port(node) for node in self._session.get_inputs()}
         self.gives = {node.name: _port(node) for node in self._session.get_outputs()}
-        self._bound = _Bound.of(self._session, ort)
+        self._bound = _BoundBuffers.of(self._session, ort)
         self.bound = self._bound is not None
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -135,17 +135,17 @@ class OrtCpuSession(Engine):
     @classmethod
     def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
         """Open a session, with other options where the first break the graph; the first error is reported."""
-        ways = cls._ways(ort, threads)
+        first, *others = cls._option_sets(ort, threads)
         try:
-            return _session(ort, model, ways[0])
+            return _session(ort, model, first)
         except Exception:
-            for way in ways[1:]:
+            for options in others:
                 with contextlib.suppress(Exception):
-                    return _session(ort, model, way)
+                    return _session(ort, model, options)
             raise
 
     @staticmethod
-    def _ways(ort: Any, threads: int | None) -> list[Any]:
+    def _option_sets(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try, one after the other.
 
         Exact products of uint8 activations refuse a graph with int8 ones, which are exact as long as they stay int8.
@@ -153,13 +153,12 @@ class OrtCpuSession(Engine):
         no such type.
         """
         saturates = arithmetic.ort_product(ort) < arithmetic.WANTED
-        first = [arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]
-        entries = [*first, arithmetic.UNFUSED]
-        ways = [session_options(ort, threads) for _ in entries]
-        for options, entry in zip(ways, entries, strict=True):
+        option_sets = []
+        for entry in (*([arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]), arithmetic.UNFUSED):
+            option_sets.append(session_options(ort, threads))
             if entry is not None:
-                options.add_session_config_entry(*entry)
-        return ways
+                option_sets[-1].add_session_config_entry(*entry)
+        return option_sets
 
     @staticmethod
     def arithmetic() -> str:
@@ -210,7 +209,7 @@ class OrtCpuSession(Engine):
         return SIGNED_PRODUCT if signed and platform.machine() in X86 else ""
 
 
-class _Bound:
+class _BoundBuffers:
     """Buffers that are bound to the inputs and outputs of a small graph once, for all runs.
 
     ``run()`` of ONNX Runtime wraps every array again; writing into bound buffers instead takes some 20 us less right
@@ -232,7 +231,7 @@ class _Bound:
             self._start, self._bindings = session._sess.run_with_iobinding, binding._iobinding
 
     @classmethod
-    def of(cls, session: Any, ort: Any) -> _Bound | None:
+    def of(cls, session: Any, ort: Any) -> _BoundBuffers | None:
         """Return buffers for a session, or None when a shape is dynamic, a type is not numpy's, or they are large."""
         inputs = {node.name: _buffer(node) for node in session.get_inputs()}
         outputs = {node.name: _buffer(node) for node in session.get_outputs()}
