@@ -1,4 +1,4 @@
-"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or what another package brings; loads only what is named.
+"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or what another package adds; loads only what is named.
 
 One thing, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` is a shared
 part of its folder, not an entry. Another package adds an entry by an entry point of the group ``vlatool.<kind>``
@@ -61,7 +61,7 @@ def module(kind: str, name: str) -> ModuleType:
 
     Raises:
         UsageError: for an unknown entry; suggests the nearest one.
-        PluginError: when another package brings it, and cannot be imported.
+        PluginError: when another package adds it, and cannot be imported.
     """
     own_name = name.replace("-", "_")
     if own_name in _own(kind):
@@ -73,7 +73,7 @@ def module(kind: str, name: str) -> ModuleType:
         return importlib.import_module(entry.module)
     except VlatoolError:
         raise
-    except Exception as error:  # the seam: another package's code raises what it likes
+    except Exception as error:  # the seam: another package's code may raise anything
         raise _plugin_error(entry, f"cannot be imported: {type(error).__name__}: {error}") from error
 
 
@@ -82,7 +82,7 @@ def load(kind: str, name: str) -> type:
 
     Raises:
         UsageError: for an unknown entry.
-        PluginError: when another package brings it, and it is not such a class.
+        PluginError: when another package adds it, and it is not such a class.
         TypeError: when the file defines no public class, or several (a fault of the file).
     """
     source = module(kind, name)
@@ -115,7 +115,7 @@ def all_plugins() -> dict[str, list[str]]:
 
 
 def owner(module_name: str) -> str:
-    """Return which other package brings a module (``acme 1.2``); empty for vlatool's own, and for any that brings none.
+    """Return which other package a module is from (``acme 1.2``); empty for vlatool's own, and for any that adds none.
 
     Args:
         module_name: Of any module of that package.
@@ -151,6 +151,6 @@ def _title(entry: metadata.EntryPoint) -> str:
 
 def _plugin_error(entry: metadata.EntryPoint, what: str) -> PluginError:
     return PluginError(
-        f"The package {_title(entry)}, which brings '{entry.name}' ({entry.group}), {what}.",
+        f"The package {_title(entry)}, which adds '{entry.name}' ({entry.group}), {what}.",
         "report it to its authors, or uninstall it",
     )

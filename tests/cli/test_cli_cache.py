@@ -75,8 +75,8 @@ def test_prune_removes_what_was_asked_for(vlatool, cache, asked, removed) -> Non
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [
-        ([], 2, "Say what to remove"),
-        (["--all", "--max-size", "1GB"], 2, "Say what to remove"),
+        ([], 2, "Nothing is chosen for removal"),
+        (["--all", "--max-size", "1GB"], 2, "Nothing is chosen for removal"),
         (["--older-than", "30"], 2, "--older-than is '30'; it must be a number and a unit, such as 30d"),
         (["--older-than", "-3d"], 2, "it must be a number and a unit"),
         (["--older-than", "3y"], 2, "--older-than is '3y'"),

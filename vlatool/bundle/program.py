@@ -101,7 +101,7 @@ class ProgramStep:
         check_step(self)
 
     def sources(self) -> set[str]:
-        """Values that this entry brings into being before its graph runs."""
+        """Values that this entry creates before its graph runs."""
         return {*self.schedule, *self.noise, *self.keep}
 
 

@@ -105,7 +105,7 @@ def _with_trust_first(arguments: list[str]) -> list[str]:
 
 
 def _end_on_signals() -> None:
-    """Make SIGTERM and SIGHUP end the program as Ctrl-C does: what it started is ended, what it began is removed."""
+    """Make SIGTERM and SIGHUP end the program as Ctrl-C does: child processes are ended, drafts are removed."""
 
     def end(number: int, _frame: object) -> None:
         sys.exit(128 + number)

@@ -16,7 +16,7 @@ from vlatool.stage.base import Context
 SAMPLES = 64
 """Recorded observations that the actions are compared on."""
 SMALLER = 1.05
-"""Ratio from which on a bundle is called smaller than what it was made from."""
+"""Smallest ratio at which a bundle is reported as smaller than its source."""
 SHOWN = {"latency_p50": "latency p50", "memory": "memory"}
 
 

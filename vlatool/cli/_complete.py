@@ -18,7 +18,7 @@ MOST = 200
 """Of a folder."""
 _CLICK: Any = TyperGroup.__mro__[1].__module__.rpartition(".")[0]
 CompletionItem: Any = importlib.import_module(f"{_CLICK}.shell_completion").CompletionItem
-"""Of the click that typer brings, or of the one that it imports, by its version."""
+"""From the click inside typer, or the one that it imports, depending on its version."""
 
 
 def profiles(incomplete: str) -> list[str]:

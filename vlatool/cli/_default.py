@@ -1,4 +1,4 @@
-"""A group of commands whose first word may be something else: then its default command is meant."""
+"""A group of commands with a default: where the first word names no command, the default one runs."""
 
 from __future__ import annotations
 

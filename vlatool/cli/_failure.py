@@ -18,7 +18,7 @@ INPUT = 3
 OUR_BUG = 70
 INTERRUPTED = 130
 CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
-"""The base of usage errors: of the click that typer brings, or of the one that it imports, by its version."""
+"""The base of usage errors: from the click inside typer, or the one that it imports, depending on its version."""
 KEEPING = frozenset(("optimize", "export", "quantize"))
 """Commands whose finished stages stay in the cache when they are interrupted."""
 TYPES = ("OSError", "MemoryError", "Interrupted", "Terminated", "InternalError")

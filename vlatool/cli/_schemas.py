@@ -50,7 +50,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "samples list": ("samples",),
     "samples make": ("sample",),
 }
-"""Command, or group of commands -> what it prints when it ends well; the first is the usual one."""
+"""Command, or group of commands -> what it prints on success; the first is the usual one."""
 
 
 def document(description: str, /, **properties: Schema) -> Schema:
@@ -113,7 +113,7 @@ def definitions(report: Schema) -> dict[str, Schema]:
 
 
 def _documents() -> dict[str, Schema]:
-    """Return what is made for the command line alone."""
+    """Return the documents that only the command line has."""
     files = many(record(file=TEXT, bytes=INTEGER, identical=FLAG, why=TEXT))
     status = {"enum": ["ok", "warn", "missing"]}
     both = {"type": "array", "items": NUMBER}

@@ -177,7 +177,7 @@ def _threads(report: Report) -> dict[str, Any]:
 
 
 def _circumstances(report: Report) -> tuple[str, str]:
-    """Return machine and pace: latencies of others give no speed-up."""
+    """Return machine and pace: latencies from other ones give no speed-up."""
     return str(_facts(report, MACHINE)), str(_run(report).get("rate_hz", "none"))
 
 

@@ -28,7 +28,7 @@ DEFAULTS = {
     "distill": "weights",
     "evaluate": "recorded",
 }
-"""The method that is meant when a command names none."""
+"""The method of a command that names none."""
 
 
 class StageGroup(DefaultGroup):

@@ -70,7 +70,9 @@ def prune(
     from vlatool.stage import cache as kept
 
     if everything == bool(older_than or max_size):
-        raise UsageError("Say what to remove.", "pass --older-than 30d, --max-size 5GB, or both; or --all alone")
+        raise UsageError(
+            "Nothing is chosen for removal.", "pass --older-than 30d, --max-size 5GB, or both; or only --all"
+        )
     age = 0.0 if everything else _amount("--older-than", older_than, SECONDS, "30d") if older_than else None
     most = int(_amount("--max-size", max_size, BYTES, "5GB")) if max_size else None
     place = _place(cache)

@@ -14,7 +14,7 @@ from vlatool.cli._document import document
 from vlatool.cli._options import AsJson, ProfileName
 
 app = typer.Typer(
-    help="Hardware profiles: what a board has and what it allows.", no_args_is_help=True, rich_markup_mode=None
+    help="Hardware profiles: what a board has and what its limits are.", no_args_is_help=True, rich_markup_mode=None
 )
 
 

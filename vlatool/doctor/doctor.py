@@ -33,7 +33,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "text": ("tokenizers",),
     "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
 }
-"""Extra -> the distributions that it brings, as in ``pyproject.toml``."""
+"""Extra -> the distributions that it installs, as in ``pyproject.toml``."""
 PYTHON = (3, 10)
 FREE_GB = 5.0
 """Below this a build (export, several candidates, reports) of a 0.5 GB policy runs out of disk."""
@@ -124,7 +124,7 @@ def _engine(
         providers = ask(library)
     except MissingExtra as error:
         return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
-    except Exception as error:  # the seam: a library, or another package's engine, raises what it likes
+    except Exception as error:  # the seam: a library, or another package's engine, may raise anything
         return Check(title, "warn", f"{words} fails: {type(error).__name__}: {message_of(error)}", "update it")
     if providers is None:
         return Check(title, "ok", words)

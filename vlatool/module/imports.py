@@ -12,7 +12,7 @@ BY_FILE = {"spec_from_file_location", "run_path", "SourceFileLoader"}
 HIDDEN_NAMES = BY_FILE | {
     "import_module", "run_module", "load_source", "find_spec",
 }  # fmt: skip
-"""What imports without an import statement: then each Python file beside the code may be meant."""
+"""What imports without an import statement: then any Python file beside the code may be imported."""
 
 
 def imported_files(roots: Iterable[Path], folder: Path) -> set[Path]:

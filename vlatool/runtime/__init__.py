@@ -41,7 +41,7 @@ def load(
             graphs give it and in physical units; what was measured of each when the bundle was made when None.
         accept: Names of findings in the manifest that are overruled, see ``vlatool inspect``.
         first_run_s: Seconds that an inference of the warm-up may take before it is stopped. Inside this process ONNX
-            Runtime can be stopped between two nodes of a graph alone: one node that takes hours is waited for, by
+            Runtime can only be stopped between two nodes of a graph: one node that takes hours is waited for, by
             Ctrl-C as well. OpenVINO is not waited for, but may compute on until the process ends. The opening of a
             graph cannot be stopped.
         memory_mb: Most that inputs and outputs of a graph may declare, and that the probe may take, in 10^6 bytes;

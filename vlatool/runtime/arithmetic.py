@@ -1,7 +1,7 @@
 """Whether integer products are exact on this machine, or saturate: asked of an engine by a product that would.
 
 x86 without VNNI multiplies uint8 with int8 in pairs and adds both products in 16 bits. Two times 255 x 127 is 64,770
-and becomes 32,767: an int8 policy computes other actions there, in silence. ONNX Runtime has an option that is exact on
+and becomes 32,767: an int8 policy silently computes other actions there. ONNX Runtime has an option that is exact on
 such processors, for uint8 activations and at a cost; int8 activations are exact without it. The option is a rewriting
 of the graph (of its weights to uint8), so that a session that rewrites nothing saturates regardless.
 """

@@ -172,7 +172,7 @@ def _check_names(step: ProgramStep, takes: Mapping[str, Port], gives: Mapping[st
 
 
 def sources_of(step: ProgramStep) -> dict[str, Port]:
-    """Return what a step brings into being: noise, kept values and schedules."""
+    """Return what a step creates: noise, kept values and schedules."""
     ports = {name: port(noise["shape"], "float32") for name, noise in step.noise.items()}
     ports |= {name: port(kept["shape"], str(kept.get("dtype", "float32"))) for name, kept in step.keep.items()}
     for name, numbers in step.schedule.items():

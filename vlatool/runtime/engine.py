@@ -1,6 +1,6 @@
 """What every engine declares about itself, so that the build side names no engine.
 
-A file in ``vlatool/runtime/engines/`` (or one that another package brings, see ``vlatool.registry``) defines one class
+A file in ``vlatool/runtime/engines/`` (or one that another package adds, see ``vlatool.registry``) defines one class
 that opens a graph (``vlatool.runtime.program.Session``) and overrides what differs from the defaults here.
 """
 
@@ -74,7 +74,7 @@ class Engine:
     package: ClassVar[str] = ""
     """What is imported; also the name of the distribution."""
     extra: ClassVar[str] = ""
-    """The extra of vlatool that brings it."""
+    """The extra of vlatool that installs it."""
     substitutes: ClassVar[tuple[str, ...]] = ()
     """Distributions of other names that bring the same package."""
     advice: ClassVar[str] = ""

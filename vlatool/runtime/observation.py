@@ -48,7 +48,7 @@ class ObservationEncoder:
         for name, encode in self._encoders:
             try:
                 value = observation[name]
-            except Exception:  # the seam: a mapping says KeyError, anything else raises what it likes
+            except Exception:  # the seam: a mapping raises KeyError, anything else may raise anything
                 raise self._lacking(observation, name) from None
             try:
                 values[name] = encode(value)

@@ -108,7 +108,7 @@ def _search_path() -> list[str]:
 
 
 def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) -> dict[str, Any]:
-    """Return what the child found, or raise what it raised."""
+    """Return the child's answer, or raise its error."""
     answer: dict[str, Any] = {}
     with contextlib.suppress(ValueError):
         answer = json.loads(done.stdout.rstrip("\n").rpartition("\n")[2])

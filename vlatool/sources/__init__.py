@@ -53,6 +53,6 @@ def sourced(source: str, cache: Path, context: Context) -> Bundle:
 
 
 def brings_calibration(source: str) -> bool:
-    """Return whether SOURCE brings calibration data, which static quantization needs."""
+    """Return whether SOURCE has calibration data, which static quantization needs."""
     policy = source_stage(source).policy
     return policy is not None and read_description(policy).calibration is not None

@@ -129,8 +129,8 @@ def _description(path: Path) -> Description:
     further = next((step.graph for step in described.program if step.graph != "main"), None)
     if further is not None:
         raise SourceError(
-            f"The program in {path} runs the graph '{further}'; a policy that is one ONNX file has the graph 'main' "
-            "alone.",
+            f"The program in {path} runs the graph '{further}'; a policy that is one ONNX file only has the graph "
+            "'main'.",
             "write graph: main in each step, or leave the program out",
         )
     return described

@@ -152,7 +152,7 @@ class Transform(Stage):
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
     def on(self, profile: Profile) -> Self:
-        """Return the stage as a board takes what it makes; options that were given stay."""
+        """Return the stage with the options that a board needs; options that were given stay."""
         return self
 
     def runs(self, source: Bundle | None) -> str:

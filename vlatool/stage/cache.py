@@ -1,7 +1,7 @@
 """What the cache holds, how large it is, and how it is made smaller.
 
 Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
-list of its files, work that waits to be continued by its lock, a count by its content, a shared recording by its hash.
+list of its files, unfinished work by its lock, a count by its content, a shared recording by its hash.
 Everything else there is listed and left alone. What a running process uses is locked, and stays.
 """
 

@@ -257,7 +257,7 @@ def _remedy(error: Exception) -> str:
     The kernel may also be missing in what a variable confines it to.
     """
     if PARTIAL_BLOCK in str(error):
-        return "OpenVINO takes whole blocks alone: use the engine ort_cpu, or leave the narrower layers out (--exclude)"
+        return "OpenVINO only takes whole blocks: use the engine ort_cpu, or leave the narrower layers out (--exclude)"
     if not any(sign in str(error) for sign in NO_KERNEL):
         return ""
     lacks = "instructions that OpenVINO needs for it: quantize with --layout ort"
