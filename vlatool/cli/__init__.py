@@ -60,7 +60,7 @@ def _root(
     """Make a trained robot policy run, fast and safely, on the board that the robot carries."""
 
 
-def _standard_files() -> None:
+def _open_standard_files() -> None:
     """Open what the shell has closed (``2>&-``): files that are opened later would take the numbers, and the prints."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -71,7 +71,7 @@ def _standard_files() -> None:
             setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
 
 
-def _flushed() -> None:
+def _flush_streams() -> None:
     """Discard what cannot be written: a full disk or a closed pipe does not change the exit code at the very end."""
     for stream in (sys.stdout, sys.stderr):
         try:
@@ -126,7 +126,7 @@ def main(arguments: list[str] | None = None) -> None:
     Args:
         arguments: Its words; when None, those that the process was started with, and the process ends with this call.
     """
-    _standard_files()
+    _open_standard_files()
     _end_on_signals()
     words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
     for_good = arguments is None
@@ -135,7 +135,7 @@ def main(arguments: list[str] | None = None) -> None:
     if unprinted := lost():
         _say(str(unprinted), unprinted.fix)
         code = code or unprinted.exit_code
-    _flushed()
+    _flush_streams()
     sys.exit(code)
 
 

@@ -36,17 +36,17 @@ def command_line() -> str:
     for before, word in zip(["", *words], words, strict=False):
         name, sign, value = word.partition("=")
         if before in PLACES:
-            shown.append(_neutral(word))
+            shown.append(_without_folders(word))
         elif sign and name in PLACES:
-            shown.append(f"{name}={_neutral(value)}")
+            shown.append(f"{name}={_without_folders(value)}")
         elif word.startswith("-o") and not word.startswith("--"):
-            shown.append(f"-o{_neutral(word[2:])}" if word[2:] else word)
+            shown.append(f"-o{_without_folders(word[2:])}" if word[2:] else word)
         else:
             shown.append(word)
     return shlex.join(shown)
 
 
-def _neutral(path: str) -> str:
+def _without_folders(path: str) -> str:
     """Return the last part of an absolute path, or of one that leaves the current directory."""
     return Path(path).name or path if os.path.isabs(path) or path.startswith(("..", "~")) else path
 

@@ -56,7 +56,7 @@ def read_reports(paths: Sequence[Path]) -> list[Report]:
 def side_by_side(paths: Sequence[Path], reports: Sequence[Report]) -> Report:
     """Return one report with the rows of all, the first row with a latency as the reference."""
     labels = short_names(paths)
-    findings = [*differences(labels, reports), *_carried(labels, reports)]
+    findings = [*differences(labels, reports), *_findings(labels, reports)]
     same = len({_circumstances(report) for report in reports}) == 1 and reports[0].environment.get("cpu") is not None
     rows = _rows(labels, reports, same)
     limits = {
@@ -194,7 +194,7 @@ def _read(path: Path) -> Report:
         raise DataError(f"{path}: {error.message}", error.fix) from error
 
 
-def _carried(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
+def _findings(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
     """Return the findings of the reports themselves, with their report's name."""
     return [
         replace(finding, reason=f"{label}: {finding.reason}")

@@ -37,7 +37,7 @@ def imported_files(roots: Iterable[Path], folder: Path) -> set[Path]:
         except (SyntaxError, ValueError, RecursionError):  # importing it says what is wrong
             files.update(folder.glob("*.py"))
             continue
-        if _hides(tree):
+        if _has_hidden_imports(tree):
             waiting += folder.glob("*.py")
         waiting += [imported for names, base in _imports(tree, file, folder) for imported in _files(names, base)]
     return files
@@ -80,7 +80,7 @@ def _literal_import(node: ast.Call) -> list[str]:
     return [str(literal)] if alone and not str(literal).startswith(".") else []
 
 
-def _hides(tree: ast.AST) -> bool:
+def _has_hidden_imports(tree: ast.AST) -> bool:
     """Return whether code imports, or may import, what no statement names."""
     known = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call) and _literal_import(node)}
     for node in ast.walk(tree):

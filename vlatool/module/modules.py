@@ -30,7 +30,7 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
             module = module.module()
         if not isinstance(module, torch.nn.Module):
             raise SourceError(f"The factory gave a {type(module).__name__} for '{name}'; wanted a torch module.")
-        modules[name] = _evaluating(module)
+        modules[name] = _in_eval_mode(module)
     return modules
 
 
@@ -46,7 +46,7 @@ def outputs_of(result: Any, step: ProgramStep) -> list[Any]:
     return outputs
 
 
-def _evaluating(module: Any) -> Any:
+def _in_eval_mode(module: Any) -> Any:
     """Put a module into evaluation mode; a part that torch.export made has the mode in which it was exported."""
     try:
         return module.eval()

@@ -49,7 +49,7 @@ class ObservationEncoder:
             try:
                 value = observation[name]
             except Exception:  # the seam: a mapping raises KeyError, anything else may raise anything
-                raise self._lacking(observation, name) from None
+                raise self._missing_input(observation, name) from None
             try:
                 values[name] = encode(value)
             except (RuntimeWarning, FloatingPointError):  # where the caller lets numpy raise
@@ -58,7 +58,7 @@ class ObservationEncoder:
                 ) from None
         return values
 
-    def _lacking(self, observation: Any, name: str) -> DataError:
+    def _missing_input(self, observation: Any, name: str) -> DataError:
         takes = f"the policy takes {', '.join(self.names)}."
         if not isinstance(observation, Mapping):
             return DataError(

@@ -174,7 +174,7 @@ def prune(
             uses.subtract(files.keys())
             left -= sum(size for inode, size in files.items() if not uses[inode])
     if not dry_run:
-        stays |= _swept(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
+        stays |= _sweep(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
     return Removed(tuple(removed), held.bytes - left, stays)
 
 
@@ -255,7 +255,7 @@ def _remove_folders(path: Path) -> None:
             os.rmdir(folder)
 
 
-def _swept(cache: Path, unused: Iterable[str]) -> dict[str, str]:
+def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
     """Remove shared files without links, and what killed writers left; return why something stays."""
     stays = {}
     for name in unused:
