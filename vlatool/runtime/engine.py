@@ -103,12 +103,12 @@ class Engine:
 
     @classmethod
     def version(cls) -> str:
-        """Return the release of the library, without its build.
+        """Return the release of the library, without its build; empty where it does not tell.
 
         Raises:
             MissingExtra: when it is not installed.
         """
-        return str(cls.library().__version__).partition("-")[0]
+        return str(getattr(cls.library(), "__version__", "")).partition("-")[0]
 
     @classmethod
     def arithmetic(cls) -> str:
