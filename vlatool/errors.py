@@ -1,8 +1,8 @@
 """The tree of user faults: what was wrong, what to do, and the exit code.
 
 VlatoolError                 70  our bug, unless a subclass says otherwise
-├── UsageError                2  the command line or call makes no sense
-├── InputError                3  something that was handed in is bad
+├── UsageError                2  an invalid command line or call
+├── InputError                3  an input is bad
 │   ├── BundleError              a bundle directory: missing, corrupt, half, too new
 │   ├── SpecError                a policy spec: names, shapes, dtypes, statistics
 │   ├── SourceError              a policy source: factory, weights, ONNX file
@@ -52,13 +52,13 @@ class VlatoolError(Exception):
 
 
 class UsageError(VlatoolError):
-    """The command line or the call makes no sense."""
+    """The command line or the call is invalid."""
 
     exit_code = 2
 
 
 class InputError(VlatoolError):
-    """Something that was handed in is missing, corrupt or of the wrong kind."""
+    """An input is missing, corrupt or of the wrong kind."""
 
     exit_code = 3
 
@@ -122,7 +122,7 @@ class Inconclusive(VlatoolError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a sentence part that lists what is known, with the nearest name first.
+    """Return part of a sentence that lists what is known, with the nearest name first.
 
     Example:
         >>> nearest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
@@ -135,7 +135,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def require_present(module: str, extra: str) -> None:
-    """Say which extra provides a module that is absent, without importing it.
+    """Raise for a module that is absent, without importing it; names the extra that provides it.
 
     Raises:
         MissingExtra: when the module is not installed.
@@ -145,13 +145,15 @@ def require_present(module: str, extra: str) -> None:
     except ImportError:
         absent = True
     if absent or sys.modules.get(module, ...) is None:
-        raise MissingExtra(
-            f"This needs the package '{module}', which the extra '{extra}' provides.", f"pip install 'vlatool[{extra}]'"
-        )
+        raise _missing(f"This needs the package '{module}', which the extra '{extra}' provides.", extra)
+
+
+def _missing(message: str, extra: str) -> MissingExtra:
+    return MissingExtra(message, f"pip install 'vlatool[{extra}]'")
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import ``module``, or say which extra provides it.
+    """Import ``module``; where that fails, name the extra that provides it.
 
     Raises:
         MissingExtra: when the module is not installed.
@@ -161,11 +163,5 @@ def require(module: str, extra: str) -> ModuleType:
     except ImportError as error:
         top = module.partition(".")[0]
         if error.name is not None and error.name.partition(".")[0] != top:
-            raise MissingExtra(
-                f"'{module}' is installed, but '{error.name}', which it needs, is not.",
-                f"pip install 'vlatool[{extra}]'",
-            ) from error
-        raise MissingExtra(
-            f"This needs the package '{top}', which the extra '{extra}' provides.",
-            f"pip install 'vlatool[{extra}]'",
-        ) from error
+            raise _missing(f"'{module}' is installed, but '{error.name}', which it needs, is not.", extra) from error
+        raise _missing(f"This needs the package '{top}', which the extra '{extra}' provides.", extra) from error

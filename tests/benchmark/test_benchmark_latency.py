@@ -119,7 +119,7 @@ def test_the_further_bundles_belong_to_the_key_and_are_opened_first(float_bundle
     assert stage.inputs() == (int8_bundle.path / "manifest.json",)
     assert stage.key("a") != Latency().key("a")
     assert stage.key("a") == stage.key("a") != stage.key("b")
-    with pytest.raises(BundleError, match="There is no bundle"):
+    with pytest.raises(BundleError, match="No bundle"):
         Latency(against=(tmp_path / "none",)).check(float_bundle, None)
 
 
@@ -191,7 +191,7 @@ def test_the_probe_prints_one_line_of_json(int8_bundle):
 
 
 def test_the_probe_says_why_a_bundle_does_not_run(tmp_path):
-    with pytest.raises(BundleError, match=r"There is no bundle at .*none"):
+    with pytest.raises(BundleError, match=r"No bundle at .*none"):
         cold_start(tmp_path / "none", "ort_cpu", 1)
 
 

@@ -167,7 +167,7 @@ def test_init_on_a_full_disk_names_the_file_and_leaves_no_empty_folder(vlatool, 
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [
-        (["{bundle}"], 2, "There is no baseline."),
+        (["{bundle}"], 2, "No baseline to compare with."),
         (["{bundle}", "--baseline", "{tmp}/none"], 3, "fix: make one: vlatool export POLICY -o"),
         (["{bundle}", "--baseline", "{bundle}", "--margin", "inf"], 2, "--margin"),
         (["{bundle}", "--baseline", "{bundle}", "--junit", "{tmp}"], 3, "is a directory"),

@@ -38,7 +38,7 @@ def test_what_does_not_fit_fails(float_bundle):
 
 
 def test_errors_of_the_worker_come_back(tmp_path, float_bundle):
-    with pytest.raises(BundleError, match="There is no bundle at"):
+    with pytest.raises(BundleError, match="No bundle at"):
         measure(LatencyJob((str(tmp_path / "none"),)), quiet)
     with pytest.raises(UsageError, match="Unknown engine 'foo'"):
         measure(LatencyJob((str(float_bundle.path),), engine="foo"), quiet)

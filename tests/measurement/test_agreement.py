@@ -63,7 +63,7 @@ def test_nothing_is_asked_of_a_gate_without_answers_but_the_golden_action(job: P
             **{name: -stored[name] if name == "out.action" else stored[name] for name in stored.files},
         )
     seal(made.path, made.manifest)
-    with pytest.raises(GraphError, match=r"copied: This machine computes another golden action than recorded"):
+    with pytest.raises(GraphError, match=r"copied: This machine computes a different golden action than recorded"):
         run_agreement(PairJob(**{**vars(silent), "candidate": str(made.path)}))
 
 

@@ -263,7 +263,7 @@ def test_a_bundle_that_load_refuses_is_not_timed(job: PairJob, copied, side: str
         arrays = {name: stored[name] for name in stored.files}
     np.savez(made.path / "golden/golden.npz", **{**arrays, "out.action": -arrays["out.action"]})
     sealed = seal(made.path, made.manifest)
-    with pytest.raises(GraphError, match="another golden action than recorded"):
+    with pytest.raises(GraphError, match="a different golden action than recorded"):
         run_job(PairJob(**{**vars(job), side: str(sealed.path)}))
 
 
@@ -277,7 +277,7 @@ def test_a_file_that_was_changed_is_not_timed(job: PairJob, copied, side: str) -
 
 
 def test_a_bundle_that_cannot_run_is_named(job: PairJob, tmp_path) -> None:
-    with pytest.raises(BundleError, match=r"There is no bundle at .*none"):
+    with pytest.raises(BundleError, match=r"No bundle at .*none"):
         measure_pairs(PairJob(**{**vars(job), "candidate": str(tmp_path / "none")}))
 
 

@@ -171,14 +171,14 @@ def test_its_method_takes_the_options_that_select_layers(run: Run, policy_dir: P
 def test_what_cannot_be_imported_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     done = run("quantize", "absent", str(onnx_file), "-o", str(tmp_path / "out"))
     assert done.returncode == 3
-    assert "acme-robotics 1.2, which brings 'absent' (vlatool.quantize), cannot be imported" in done.stderr
+    assert "acme-robotics 1.2, which adds 'absent' (vlatool.quantize), cannot be imported" in done.stderr
 
 
 def test_an_engine_that_cannot_be_imported_stands_in_nobodys_way(run: Run, onnx_file: Path, tmp_path: Path):
     ok(run("quantize", "dynamic-int8", str(onnx_file), "-o", str(tmp_path / "out")))
     done = run("benchmark", str(tmp_path / "out"), "--engine", "absent", "--iterations", "20")
     assert done.returncode == 3
-    assert "acme-robotics 1.2, which brings 'absent' (vlatool.engines), cannot be imported" in done.stderr
+    assert "acme-robotics 1.2, which adds 'absent' (vlatool.engines), cannot be imported" in done.stderr
 
 
 def test_it_replaces_nothing_of_vlatools_own(run: Run):

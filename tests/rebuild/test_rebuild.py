@@ -274,9 +274,9 @@ def test_a_bundle_without_a_record_says_so(int8_bundle, again, copied):
 @pytest.mark.parametrize(
     ("number", "change", "says"),
     [
-        (2, {"options": ["samples"]}, "Entry 2 of the build record .* makes no sense"),
-        (1, {"stage": 3}, "Entry 1 of the build record .* makes no sense"),
-        (2, {"input": 7}, "Entry 2 of the build record .* makes no sense"),
+        (2, {"options": ["samples"]}, "Entry 2 of the build record .* is invalid"),
+        (1, {"stage": 3}, "Entry 1 of the build record .* is invalid"),
+        (2, {"input": 7}, "Entry 2 of the build record .* is invalid"),
         (1, {"stage": "sources.torch_module"}, "Entry 1 .* is a source; only the first may be"),
         (2, {"stage": "quantize.static_in8"}, "did you mean 'quantize.static_int8'"),
         (2, {"stage": "benchmark.latency"}, "benchmark.latency, which measures"),

@@ -59,7 +59,7 @@ def main() -> None:
     imported = time.perf_counter()
     policy = vlatool.load(given.bundle, threads=1)
     loaded = time.perf_counter()
-    from vlatool.runtime.policy import load_golden
+    from vlatool.runtime.golden import load_golden
 
     golden = load_golden(policy.bundle)
     if golden is None:

@@ -345,7 +345,7 @@ def test_the_command_exits_by_the_verdict_and_prints_json(capsys, policy_dir, ag
     ("line", "code", "says"),
     [
         (["--against", "original.py"], 3, "add the function: original.py:NAME"),
-        (["--against", "nowhere.py:act"], 3, "There is no file"),
+        (["--against", "nowhere.py:act"], 3, "No such file"),
         (["--against", "original.py:none"], 3, "has no function 'none'"),
         (["--against", "original.py:act", "--data", "none.npz"], 3, "There is no data file"),
         (["--against", "original.py:act", "--samples", "0"], 2, "samples"),

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def plan_document(plan: Plan) -> dict[str, Any]:
     """Return what ``plan.lines()`` says, as values that JSON can say."""
     effort, loop = plan.recipe.effort, plan.closed_loop
-    told = {
+    plain = {
         "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
         "export": _stages(plan.export),
         "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
@@ -25,7 +25,7 @@ def plan_document(plan: Plan) -> dict[str, Any]:
         "computes": plan.board_set.plan() or None,
         "cache": str(plan.cache),
     }
-    return {"plan": told}
+    return {"plan": plain}
 
 
 def _stages(stages: Iterable[Stage]) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from vlatool.cli import _complete
 from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document
-from vlatool.cli._options import BundleOrSource, Force, Json, ReportOutput
+from vlatool.cli._options import AsJson, BundleOrSource, Force, ReportFolder
 from vlatool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -79,9 +79,9 @@ def select(
             help="write the policy's work to workload.json beside policy.yaml: torch is not needed again",
         ),
     ] = False,
-    output: ReportOutput = None,
+    output: ReportFolder = None,
     force: Force = False,
-    as_json: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Rank the boards that can run a policy at a rate, within power, price and memory. Everything is predicted."""
     from vlatool.boards.answer import Asked, carry_count, select_boards
@@ -178,7 +178,7 @@ def fit(
     anew: Annotated[
         bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
     ] = False,
-    as_json: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.latency_model.fit import fit_files

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli import _complete
-from vlatool.cli._console import default_workers, file_or_none, leave, progress, refuse_existing, terminal_text
+from vlatool.cli._console import default_workers, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
 from vlatool.cli._document import document, put, report_document
 from vlatool.cli._options import Force
 from vlatool.cli._plan import plan_document
@@ -102,7 +102,7 @@ def optimize(
     else:
         put(terminal_text(report, brief=True))
         put(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
-    leave(report)
+    raise_verdict(report)
 
 
 def _limits(

@@ -9,7 +9,7 @@ import typer
 from vlatool.cli import _complete
 from vlatool.cli._console import progress
 from vlatool.cli._document import document
-from vlatool.cli._options import BundleOrSource, Json
+from vlatool.cli._options import AsJson, BundleOrSource
 
 
 def simulate(
@@ -23,15 +23,15 @@ def simulate(
     precision: Annotated[
         str, typer.Option(help="precision; as the policy is stored when not given", autocompletion=_complete.precisions)
     ] = "",
-    as_json: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
     from vlatool.boards.answer import simulated, simulation_lines
 
     with progress() as context:
-        found = simulated(source, profile, mode, engine, precision, context)
+        prediction = simulated(source, profile, mode, engine, precision, context)
     if as_json:
-        document(found)
+        document(prediction)
         return
-    for line in simulation_lines(found):
+    for line in simulation_lines(prediction):
         typer.echo(line)

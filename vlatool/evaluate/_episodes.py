@@ -20,7 +20,7 @@ from vlatool.evaluate._controls import Array, Blind, answers_of
 from vlatool.evaluate._environment import GUIDE, World
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import message_of
-from vlatool.module.factory import call_factory, exits_told
+from vlatool.module.factory import call_factory, exits_caught
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context
@@ -174,7 +174,7 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
 
 def _episode(world: World, queue: ChunkQueue | Blind, task: str, seed: int, limit: int) -> Outcome:
     try:
-        with exits_told(f"the environment of task '{task}', at seed {seed},"):
+        with exits_caught(f"the environment of task '{task}', at seed {seed},"):
             observation = world.reset(seed)
             queue.reset()
             success = Success()

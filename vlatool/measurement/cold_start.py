@@ -115,7 +115,7 @@ def run(job: ColdStartJob) -> ColdStart:
 
 def _observation(policy: Any) -> tuple[Any, Any]:
     """Return the golden observation with its noise, or a recorded or synthetic one where there is no golden."""
-    from vlatool.runtime.policy import load_golden
+    from vlatool.runtime.golden import load_golden
 
     golden = load_golden(policy.bundle)
     if golden is not None:

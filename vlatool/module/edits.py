@@ -44,7 +44,7 @@ class Edit:
 
 
 def is_changed(bundle: Bundle) -> bool:
-    """Say whether a bundle has modules other than those that its factory makes."""
+    """Return whether a bundle has modules other than those that its factory makes."""
     return any(name.startswith(f"{FOLDER}/") for name in bundle.manifest.files)
 
 
@@ -52,7 +52,7 @@ def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
     """Return the structural edits of a bundle.
 
     Raises:
-        SourceError: when the file makes no sense.
+        SourceError: when the file is invalid.
     """
     if EDITS not in bundle.manifest.files:
         return ()
@@ -60,15 +60,17 @@ def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
     listed = read_json(path.read_bytes(), str(path), SourceError, "make the bundle again")
     if not isinstance(listed, list):
         raise SourceError(f"{path} must hold a list of edits; got {type(listed).__name__}.")
-    return tuple(_edit(each, path) for each in listed)
+    return tuple(_edit(entry, path) for entry in listed)
 
 
 def _edit(value: Any, path: Path) -> Edit:
     known = set(Edit.__dataclass_fields__)
     fits = isinstance(value, Mapping) and set(value) == known and isinstance(value["keep"], list)
-    whole = fits and all(isinstance(each, int) and not isinstance(each, bool) and each >= 0 for each in value["keep"])
+    whole = fits and all(
+        isinstance(index, int) and not isinstance(index, bool) and index >= 0 for index in value["keep"]
+    )
     if not whole or not value["keep"] or len(set(value["keep"])) != len(value["keep"]) or value["axis"] not in AXES:
-        raise SourceError(f"{path} has an edit that makes no sense: {json.dumps(value)[:200]}.")
+        raise SourceError(f"{path} has an invalid edit: {json.dumps(value)[:200]}.")
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
 
 
@@ -142,7 +144,7 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
     Raises:
         SourceError: when a tensor is missing or has another shape.
     """
-    found = {}
+    tensors = {}
     for name, value in module.state_dict().items():
         tensor = stored.get(f"{graph}.{name}", stored.get(name))
         if tensor is None:
@@ -150,8 +152,8 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
         if tensor.shape != value.shape:
             got, want = list(tensor.shape), list(value.shape)
             raise SourceError(f"'{name}' has the shape {got} in {where}; the module's is {want}.")
-        found[name] = tensor.to(value.dtype)
-    module.load_state_dict(found)
+        tensors[name] = tensor.to(value.dtype)
+    module.load_state_dict(tensors)
 
 
 def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module]) -> None:

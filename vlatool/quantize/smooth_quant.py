@@ -22,7 +22,8 @@ from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._smooth_groups import Edit, Group, find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
-from vlatool.runtime.policy import load_golden, relative_error
+from vlatool.runtime.golden import load_golden
+from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
 from vlatool.stage.finish import TRIALS
 

@@ -38,7 +38,7 @@ RECORD = 2
 
 
 def _silent(_what: str, _share: float | None) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Transform(Stage):
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
     def on(self, profile: Profile) -> Self:
-        """Return the stage as a board takes what it makes; options that were given stay."""
+        """Return the stage with the options that a board needs; options that were given stay."""
         return self
 
     def runs(self, source: Bundle | None) -> str:
@@ -163,7 +163,7 @@ class Transform(Stage):
         """
         return ""
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
+    def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return what else a person wants to know about the new bundle, a sentence for each line."""
         return ()
 
@@ -171,14 +171,14 @@ class Transform(Stage):
         """Write the new bundle into the empty directory ``out`` and return it."""
         raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
 
-    def _told_options(self) -> dict[str, Any]:
+    def _recorded_options(self) -> dict[str, Any]:
         """Return the options with files named by name and content: paths are not recorded."""
-        told = self.options()
-        for name in told:
+        options = self.options()
+        for name in options:
             value = getattr(self, name)
             if isinstance(value, Path):
-                told[name] = f"{value.name} sha256:{_content(value)[:16]}"
-        return told
+                options[name] = f"{value.name} sha256:{_content(value)[:16]}"
+        return options
 
     def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
         """Return the ``made_by`` entry of the manifest.
@@ -192,24 +192,24 @@ class Transform(Stage):
             ``files`` (name -> SHA-256 of each file outside the source), ``seed`` and ``calibration``. No paths, no
             times: the same command gives the same entry in another directory and on another day.
         """
-        found = {package: installed_version(package) for package in self.used_packages()}
-        versions = {package: version for package, version in found.items() if version}
-        made: dict[str, Any] = {"vlatool": VERSION, "stage": self.name(), "options": self._told_options()}
+        installed = {package: installed_version(package) for package in self.used_packages()}
+        versions = {package: version for package, version in installed.items() if version}
+        entry: dict[str, Any] = {"vlatool": VERSION, "stage": self.name(), "options": self._recorded_options()}
         files = self.input_hashes()
-        made |= {"versions": versions, **({"files": files} if files else {})}
-        made |= {} if seed is None else {"seed": seed}
-        return made | ({} if calibration is None else {"calibration": calibration.record()})
+        entry |= {"versions": versions, **({"files": files} if files else {})}
+        entry |= {} if seed is None else {"seed": seed}
+        return entry | ({} if calibration is None else {"calibration": calibration.record()})
 
     def input_hashes(self) -> dict[str, str]:
         """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
-        found: dict[str, str] = {}
+        hashes: dict[str, str] = {}
         for path in (path for path in self.inputs() if path.is_file()):
             digest, name, number = hash_file(path), path.name, 1
-            while found.get(name, digest) != digest:
+            while hashes.get(name, digest) != digest:
                 number += 1
                 name = f"{path.name} ({number})"
-            found[name] = digest
-        return found
+            hashes[name] = digest
+        return hashes
 
 
 class Measure(Stage):
@@ -242,14 +242,14 @@ def stage_class(name: str) -> type[Stage]:
     """Return the class of a stage by its recipe name.
 
     Raises:
-        RecipeError: when the name is not ``kind.name`` of a known stage.
+        RecipeError: for a name that is not ``kind.name`` of a known stage.
     """
     kind, _, entry = name.partition(".")
-    known = [f"{each}.{found}" for each in stage_kinds() for found in registry.names(each)]
+    known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
         raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.")
-    found: type[Stage] = registry.load(kind, entry)
-    return found
+    stage: type[Stage] = registry.load(kind, entry)
+    return stage
 
 
 def stage_kinds() -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import exits_told, import_factory
+from vlatool.module.factory import exits_caught, import_factory
 
 Array = NDArray[Any]
 
@@ -90,7 +90,7 @@ class Original:
     ) -> Any:
         where = f"{name}() of '{self._name}'" + (f", on observation {number}," if number >= 0 else "")
         try:
-            with exits_told(where):
+            with exits_caught(where):
                 return function(*(copy.deepcopy(dict(each)) for each in arguments), **more)
         except (VlatoolError, MemoryError):
             raise

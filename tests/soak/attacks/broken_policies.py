@@ -41,7 +41,7 @@ from vlatool.optimize.recipe import Effort, Limits, Recipe
 from vlatool.optimize.summary import verdict_of
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
-from vlatool.runtime.policy import load_goldens
+from vlatool.runtime.golden import load_goldens
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 

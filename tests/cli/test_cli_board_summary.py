@@ -9,7 +9,7 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.cli._made import ForBoard, for_board
+from vlatool.cli._board_summary import BoardSummary, board_summary
 from vlatool.errors import GraphError
 from vlatool.hardware.profile import load_profile
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -79,7 +79,7 @@ def test_an_export_says_it_too_and_an_unknown_board_is_refused(onnx_file: Path, 
 
 
 def test_without_recordings_or_a_source_nothing_is_compared(float_bundle: Bundle, onnx_file: Path) -> None:
-    assert for_board(float_bundle, None, load_profile("pi5"), Context()).error is None
+    assert board_summary(float_bundle, None, load_profile("pi5"), Context()).error is None
 
 
 def test_a_policy_that_is_not_exported_yet_is_not_predicted(policy_dir: Path, tmp_path: Path, capsys) -> None:
@@ -102,5 +102,5 @@ def test_what_cannot_be_predicted_is_said_when_the_bundle_is_written(
 
 
 def test_a_bundle_of_equal_size_is_not_smaller() -> None:
-    assert ForBoard("pi5", 1000, 1000, (), None).lines() == ["graphs 0.00 MB -> 0.00 MB"]
-    assert ForBoard("pi5", 3_000_000, 1_000_000, (), None).lines() == ["graphs 3.00 MB -> 1.00 MB, 3.0x smaller"]
+    assert BoardSummary("pi5", 1000, 1000, (), None).lines() == ["graphs 0.00 MB -> 0.00 MB"]
+    assert BoardSummary("pi5", 3_000_000, 1_000_000, (), None).lines() == ["graphs 3.00 MB -> 1.00 MB, 3.0x smaller"]

@@ -1,4 +1,4 @@
-"""What ``export`` and ``quantize`` say of a bundle for a board: its size, what is predicted, what its actions lose."""
+"""What ``export`` and ``quantize`` print about a bundle for a board: size, predictions, and how its actions differ."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from vlatool.stage.base import Context
 SAMPLES = 64
 """Recorded observations that the actions are compared on."""
 SMALLER = 1.05
-"""From here on a bundle is told to be smaller than what it was made from."""
+"""Smallest ratio at which a bundle is reported as smaller than its source."""
 SHOWN = {"latency_p50": "latency p50", "memory": "memory"}
 
 
 @dataclass(frozen=True)
-class ForBoard:
+class BoardSummary:
     """A new bundle beside the one that it was made from.
 
     Args:
@@ -44,7 +44,7 @@ class ForBoard:
         predicted = [
             f"{SHOWN[number.name]} on {self.board}, predicted: {_number(number)}" for number in self.predictions
         ]
-        error = [_words(self.error)] if self.error is not None else []
+        error = [_error_text(self.error)] if self.error is not None else []
         return [*([self._size()] if self.after else []), *predicted, *error, *self.missing]
 
     def _size(self) -> str:
@@ -64,64 +64,59 @@ class ForBoard:
                 "actions": error, "missing": [*self.missing]}  # fmt: skip
 
 
-def for_board(made: Bundle, source: Bundle | None, profile: Profile, context: Context) -> ForBoard:
+def board_summary(bundle: Bundle, source: Bundle | None, profile: Profile, context: Context) -> BoardSummary:
     """Compare a new bundle with its source, and predict it on a board.
 
-    The bundle is written by now: what cannot be predicted or compared is said, and is no failure.
+    The bundle is written by now: what cannot be predicted or compared is listed, and does not fail the command.
     """
     missing: list[str] = []
     numbers: tuple[Measurement, ...] = ()
     error = None
-    if made.manifest.graphs:
+    if bundle.manifest.graphs:
         context.tell(f"predicting for {profile.name}", None)
-        with _said(missing, f"nothing is predicted for {profile.name}"):
-            numbers = _predicted(made, profile)
-        with _said(missing, "the actions were not compared with the source's"):
-            error = _error(made, source, context)
+        with _noting(missing, f"nothing is predicted for {profile.name}"):
+            numbers = _predicted(bundle, profile)
+        with _noting(missing, "the actions were not compared with the source's"):
+            error = _error(bundle, source, context)
     else:
         missing.append(f"nothing is predicted for {profile.name} before the export")
-    before = graph_bytes(source) if source is not None and source.manifest.graphs else None
-    return ForBoard(profile.name, before, graph_bytes(made), numbers, error, tuple(missing))
+    before = source.graph_bytes if source is not None and source.manifest.graphs else None
+    return BoardSummary(profile.name, before, bundle.graph_bytes, numbers, error, tuple(missing))
 
 
 @contextlib.contextmanager
-def _said(missing: list[str], what: str) -> Iterator[None]:
+def _noting(missing: list[str], what: str) -> Iterator[None]:
     try:
         yield
     except VlatoolError as error:
         missing.append(f"{what}: {error.message}")
 
 
-def _predicted(made: Bundle, profile: Profile) -> tuple[Measurement, ...]:
+def _predicted(bundle: Bundle, profile: Profile) -> tuple[Measurement, ...]:
     from vlatool.boards.predict import predictions
 
-    return tuple(number for number in predictions(profile, made) if number.name in SHOWN)
+    return tuple(number for number in predictions(profile, bundle) if number.name in SHOWN)
 
 
-def graph_bytes(bundle: Bundle) -> int:
-    """Return the size of the graphs and of the weights beside them."""
-    return sum(record.bytes for file, record in bundle.manifest.files.items() if file.startswith("graphs/"))
-
-
-def _error(made: Bundle, source: Bundle | None, context: Context) -> Measurement | None:
+def _error(bundle: Bundle, source: Bundle | None, context: Context) -> Measurement | None:
     from vlatool.evaluate.recorded import Recorded, carries_recordings
 
-    if source is None or not source.manifest.graphs or not carries_recordings(made):
+    if source is None or not source.manifest.graphs or not carries_recordings(bundle):
         return None
-    row = Recorded(baseline=source.path, samples=SAMPLES).run(made, context).rows[-1]
-    found = row.get("agreement_baseline") or row.get("relative_error")
-    return found if found is not None and found.known else None
+    row = Recorded(baseline=source.path, samples=SAMPLES).run(bundle, context).rows[-1]
+    error = row.get("agreement_baseline") or row.get("relative_error")
+    return error if error is not None and error.known else None
 
 
-def _words(error: Measurement) -> str:
+def _error_text(error: Measurement) -> str:
     of = f"{error.samples} recorded observations"
     if error.name.startswith("agreement"):
         return f"the same actions as the source: {error.value:.1%} of {of}"
     return f"relative error of the actions: {error.value:.3g} against the source, on {of}"
 
 
-def _number(each: Measurement) -> str:
-    if not each.known:
-        return each.note or "not known"
-    interval = f" ({each.low:.3g} to {each.high:.3g})" if each.low is not None and each.high is not None else ""
-    return f"{each.value:.3g} {each.unit}{interval}"
+def _number(number: Measurement) -> str:
+    if not number.known:
+        return number.note or "not known"
+    interval = f" ({number.low:.3g} to {number.high:.3g})" if number.low is not None and number.high is not None else ""
+    return f"{number.value:.3g} {number.unit}{interval}"
