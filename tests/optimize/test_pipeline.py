@@ -228,7 +228,7 @@ def test_a_metric_without_observations_is_refused_before_the_search(model, tmp_p
 
 def test_the_summary_says_which_engine_the_robot_needs(run, recipe):
     mine = recipe("candidates: {mine: [quantize.static_int8: {samples: 8, layout: openvino}]}")
-    needs = "It runs on the engine openvino: pip install 'vlatool[openvino]' on the robot."
+    needs = "It runs on the engine openvino: pip install 'vlatool-runtime[openvino]' on the robot."
     assert needs in run(*NEAREST, *mine).report.summary
 
 

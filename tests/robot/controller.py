@@ -14,7 +14,19 @@ import time
 from pathlib import Path
 from typing import Any
 
-BLOCKED = {"torch", "onnx", "onnxscript", "onnx_ir", "pydantic", "typer", "rich", "yaml", "psutil", "tokenizers"}
+BLOCKED = {
+    "torch",
+    "onnx",
+    "onnxscript",
+    "onnx_ir",
+    "pydantic",
+    "typer",
+    "rich",
+    "yaml",
+    "psutil",
+    "scipy",
+    "tokenizers",
+}
 
 
 class Absent:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 Array = NDArray[Any]
 
@@ -164,8 +165,8 @@ class Process:
         self.noise = np.full(len(rows), scales.noise) if noise is None else noise
         covariance = kernel(rows, rows, scales)
         covariance[np.diag_indices(len(rows))] += self.noise**2
-        self._whiten = lower_inverse(np.linalg.cholesky(covariance))
-        self._weights = self._whiten.T @ (self._whiten @ (logs - rows.prior))
+        self._factor = cholesky(covariance, lower=True, overwrite_a=True)
+        self._weights = cho_solve((self._factor, True), logs - rows.prior)
 
     def predict(self, questions: Rows) -> tuple[Array, Array]:
         """Return mean and standard deviation of log(ms) of each question; the noise of a measurement is in it."""
@@ -176,18 +177,5 @@ class Process:
         """Return mean (n,) and covariance (n, n) of log(ms) without noise."""
         across = kernel(self.rows, questions, self.scales)
         mean = questions.prior + across.T @ self._weights
-        half = self._whiten @ across
+        half = solve_triangular(self._factor, across, lower=True)
         return mean, kernel(questions, questions, self.scales) - half.T @ half
-
-
-def lower_inverse(factor: Array) -> Array:
-    """Return the inverse of a lower triangular matrix, by halves: nearly all of it is matrix products."""
-    count = len(factor)
-    if count <= 64:
-        return np.linalg.inv(factor)
-    half = count // 2
-    found = np.zeros_like(factor)
-    found[:half, :half] = lower_inverse(factor[:half, :half])
-    found[half:, half:] = lower_inverse(factor[half:, half:])
-    found[half:, :half] = -found[half:, half:] @ (factor[half:, :half] @ found[:half, :half])
-    return found

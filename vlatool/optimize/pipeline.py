@@ -9,7 +9,7 @@ from typing import Any
 
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, RecipeError, VlatoolError
+from vlatool.errors import DataError, RecipeError, VlatoolError, install
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.explain import explanation
@@ -227,7 +227,7 @@ def _needs(bundle: Bundle) -> tuple[str, ...]:
     engine = bundle.manifest.engine
     if engine in ("", DEFAULT_ENGINE):
         return ()
-    return (f"It runs on the engine {engine}: pip install 'vlatool[{engine}]' on the robot.",)
+    return (f"It runs on the engine {engine}: {install(engine, 'vlatool-runtime')} on the robot.",)
 
 
 def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:

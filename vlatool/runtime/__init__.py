@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
+from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
@@ -56,6 +57,7 @@ def load(
             something else than the graph says, a stage found the bundle to be wrong, or a limit is reached.
         UsageError: an argument makes no sense.
         MissingExtra: the engine is not installed.
+        InstallationError: vlatool and vlatool-runtime are installed side by side.
 
     Example:
         >>> policy = load("out/vln-babyai")                                            # doctest: +SKIP
@@ -64,6 +66,7 @@ def load(
     """
     from vlatool.bundle.bundle import Bundle
 
+    refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.described(path)
     refuse_findings(bundle, accept)

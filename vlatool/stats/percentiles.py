@@ -146,10 +146,12 @@ def independent(series: Array) -> float:
     That is exact for a first-order autoregression; ranks keep one long stall from hiding what the others do. A series
     that alternates counts as independent.
     """
+    from scipy.stats import rankdata  # a target, which has numpy alone, imports this module as well
+
     count = len(series)
     if count < 3:
         return float(count)
-    ranks = midranks(series)
+    ranks = rankdata(series)
     centred = ranks - ranks.mean()
     spread = float(centred @ centred)
     if spread == 0:
@@ -186,10 +188,3 @@ def intraclass(values: Array, processes: Sequence[int]) -> float:
     each = (total - float((counts**2).sum()) / total) / (groups - 1)
     spread = between + (each - 1) * within
     return (between - within) / spread if spread > 0 else 0.0
-
-
-def midranks(series: Array) -> Array:
-    """Return the ranks of a series from 1, equal values sharing their mean."""
-    _, inverse, counts = np.unique(series, return_inverse=True, return_counts=True)
-    last = np.cumsum(counts)
-    return np.asarray((last - (counts - 1) / 2)[inverse], np.float64)
