@@ -174,8 +174,8 @@ def worth_of(series: Array, share: float, processes: Sequence[int] | None) -> fl
         return worth
     exceeds = (series > np.quantile(series, share)).astype(np.float64)
     alike = max(0.0, intraclass(exceeds, processes))
-    each = len(series) / len(set(processes))
-    return min(worth, len(series) / (1 + (each - 1) * alike))
+    size = len(series) / len(set(processes))
+    return min(worth, len(series) / (1 + (size - 1) * alike))
 
 
 def intraclass(values: Array, processes: Sequence[int]) -> float:
@@ -185,6 +185,6 @@ def intraclass(values: Array, processes: Sequence[int]) -> float:
     means = np.bincount(place, values) / counts
     within = float(((values - means[place]) ** 2).sum()) / max(1, total - groups)
     between = float((counts * (means - values.mean()) ** 2).sum()) / (groups - 1)
-    each = (total - float((counts**2).sum()) / total) / (groups - 1)
-    spread = between + (each - 1) * within
+    size = (total - float((counts**2).sum()) / total) / (groups - 1)
+    spread = between + (size - 1) * within
     return (between - within) / spread if spread > 0 else 0.0
