@@ -477,7 +477,7 @@ SOURCES = [
                     "words": dict.fromkeys(WORDS, "two")}), *at.to]),
 ]  # fmt: skip
 DATA = [
-    Row("no data", "There is no data file", 3, lambda at: ["evaluate", at.float, "--data", at.root / "none.npz"]),
+    Row("no data", "none.npz not found", 3, lambda at: ["evaluate", at.float, "--data", at.root / "none.npz"]),
     Row("data of an unknown format", "is of an unknown format; known: npz", 3,
         lambda at: ["evaluate", at.float, "--data", at.file("a.csv", "1,2")]),
     Row("corrupt data", "cannot be read", 3,

@@ -299,7 +299,7 @@ POINTS = [
             "hailort", "abacus")), "-o", at.out, "--seconds", 0]),
 ]  # fmt: skip
 PROFILES_COMMANDS = [
-    Row("a new profile with a bad name", "'My Board' is no name of a profile", 3,
+    Row("a new profile with a bad name", "'My Board' is not a valid profile name", 3,
         lambda at: ["profiles", "new", "My Board", "-o", at.out]),
     Row("a new profile over a file", "exists", 3,
         lambda at: ["profiles", "new", "mine", "-o", at.file("place/mine.yaml", "precious")]),

@@ -12,6 +12,7 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the place to write to: exists, read-only, full
 │   ├── TargetError              the machine that a benchmark should run on: unreachable, or it ends
+│   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
 ├── MissingExtra              4  an optional dependency is absent; names the extra
 ├── GateFailed                1  measured, and outside the limits
@@ -25,7 +26,12 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from types import ModuleType
+
+HERE = Path(__file__).parent
+DISTRIBUTION = "vlatool" if (HERE / "cli").is_dir() else "vlatool-runtime"
+"""What pip calls this installation: all of vlatool, or what a robot needs alone, which has no command line."""
 
 
 class VlatoolError(Exception):
@@ -99,6 +105,10 @@ class TargetError(InputError):
     """The machine that a benchmark should run on cannot be reached or used, or what runs there ends."""
 
 
+class InstallationError(InputError):
+    """Two distributions of vlatool are installed in one environment, each with files of the other."""
+
+
 class PluginError(InputError):
     """Another package that adds something to vlatool cannot be imported, or fails."""
 
@@ -134,6 +144,32 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean '{hits[0]}'? {listing}" if hits else listing
 
 
+def install(extra: str, distribution: str = DISTRIBUTION) -> str:
+    """Return the command that installs an extra of vlatool.
+
+    Example:
+        >>> install("ort")
+        "pip install 'vlatool[ort]'"
+    """
+    return f"pip install '{distribution}[{extra}]'"
+
+
+def refuse_two_distributions(packages: Path = HERE.parent) -> None:
+    """Refuse to go on where vlatool and vlatool-runtime are installed side by side: they own the same files.
+
+    Args:
+        packages: The folder that vlatool is installed in.
+
+    Raises:
+        InstallationError: when both are.
+    """
+    if all(any(packages.glob(f"{name}-*.dist-info")) for name in ("vlatool", "vlatool_runtime")):
+        raise InstallationError(
+            f"Both vlatool and vlatool-runtime are installed in {packages}; either has files of the other.",
+            "pip uninstall -y vlatool vlatool-runtime, then pip install vlatool-runtime on a robot, vlatool elsewhere",
+        )
+
+
 def require_present(module: str, extra: str) -> None:
     """Raise for a module that is absent, without importing it; names the extra that provides it.
 
@@ -145,11 +181,7 @@ def require_present(module: str, extra: str) -> None:
     except ImportError:
         absent = True
     if absent or sys.modules.get(module, ...) is None:
-        raise _missing(f"This needs the package '{module}', which the extra '{extra}' provides.", extra)
-
-
-def _missing(message: str, extra: str) -> MissingExtra:
-    return MissingExtra(message, f"pip install 'vlatool[{extra}]'")
+        raise MissingExtra(f"This needs the package '{module}', which the extra '{extra}' provides.", install(extra))
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -163,5 +195,11 @@ def require(module: str, extra: str) -> ModuleType:
     except ImportError as error:
         top = module.partition(".")[0]
         if error.name is not None and error.name.partition(".")[0] != top:
-            raise _missing(f"'{module}' is installed, but '{error.name}', which it needs, is not.", extra) from error
-        raise _missing(f"This needs the package '{top}', which the extra '{extra}' provides.", extra) from error
+            raise MissingExtra(
+                f"'{module}' is installed, but '{error.name}', which it needs, is not.",
+                install(extra),
+            ) from error
+        raise MissingExtra(
+            f"This needs the package '{top}', which the extra '{extra}' provides.",
+            install(extra),
+        ) from error

@@ -166,7 +166,7 @@ def test_a_file_is_no_bundle(tmp_path: Path):
         (b'{"schema": 1,', "Expecting property name"),
         (b"\xff\xfe", "utf-8"),
         (b'{"schema": 1, "schema": 1}', "'schema' occurs twice"),
-        (b'{"schema": NaN}', "NaN is no number"),
+        (b'{"schema": NaN}', "NaN is not a number"),
         (b'{"schema": 1e999}', "1e999 is too large"),
         (b'{"schema": %s}' % (b"1" * 5000), "a number of 5000 digits"),
         (b'{"name": "\\ud800"}', "half of a character"),

@@ -10,6 +10,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from _llama import make, write_llama
 from safetensors.torch import load_file, save_file
 
 from vlatool.bundle.bundle import Bundle, seal
@@ -20,7 +21,6 @@ from vlatool.quantize.weight_only import LOSSES, WEIGHTS, WeightOnly
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.samples._language import DecoderShape
-from vlatool.samples._llama import make, write_llama
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform

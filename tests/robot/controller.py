@@ -25,6 +25,7 @@ BLOCKED = {
     "yaml",
     "psutil",
     "jinja2",
+    "scipy",
     "tokenizers",
 }
 

@@ -61,7 +61,7 @@ def test_a_stage_that_fails_leaves_what_was_there(float_bundle, copied, resealed
 
 
 def test_a_stage_is_checked_before_anything_is_written(float_bundle, tmp_path):
-    with pytest.raises(DataError, match="There is no data file"):
+    with pytest.raises(DataError, match=r"Data file .* not found"):
         run_transform(StaticInt8(calibration=tmp_path / "none.npz"), float_bundle, tmp_path / "a/b/out", Context())
     assert list(tmp_path.iterdir()) == []
 

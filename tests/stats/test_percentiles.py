@@ -13,7 +13,6 @@ from vlatool.stats.percentiles import (
     floor,
     independent,
     intraclass,
-    midranks,
     percentile,
     proven_above,
 )
@@ -103,8 +102,15 @@ def test_one_long_stall_does_not_hide_that_calls_follow_each_other() -> None:
     assert independent(stalled) == pytest.approx(independent(series), rel=0.05)
 
 
-def test_ranks_share_their_mean() -> None:
-    assert midranks(np.array([3.0, 1.0, 3.0, 2.0])).tolist() == [3.5, 1, 3.5, 2]
+def test_equal_calls_share_a_rank() -> None:
+    coarse = np.round(autoregressive(np.random.default_rng(5), 2000, 0.7), 1)
+    follow = np.corrcoef(*(ranks := midranks(coarse), np.roll(ranks, -1)))[0, 1]
+    assert independent(coarse) == pytest.approx(2000 * (1 - follow) / (1 + follow), rel=0.01)
+
+
+def midranks(series: np.ndarray) -> np.ndarray:
+    """Each value's rank from 1, as it is defined: how many are below it, and half of its equals."""
+    return (series[:, None] > series).sum(1) + ((series[:, None] == series).sum(1) + 1) / 2
 
 
 def test_a_stall_in_a_thousand_calls_shows() -> None:

@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
-from vlatool.stats.sequential import INTERIM_ANALYSES, Decision, jointly, judged, sequential
+from vlatool.stats.sequential import INTERIM_ANALYSES, Decision, jointly, judged
 
 Source = Callable[[int], float]
 
@@ -14,6 +14,14 @@ Source = Callable[[int], float]
 def noisy(shift: float, seed: int, spread: float = 0.022) -> Source:
     random = np.random.default_rng(seed)
     return lambda number: shift + spread * random.standard_t(4) / math.sqrt(2)
+
+
+def sequential(
+    measure: Source, margin: float, interim_analyses: Sequence[int] = INTERIM_ANALYSES
+) -> tuple[Decision, list[float]]:
+    """One statistic alone: its decision, and the log ratio of every process."""
+    decisions, processes = jointly(lambda number: (measure(number),), 1, margin, interim_analyses)
+    return decisions[0], [ratios[0] for ratios in processes]
 
 
 def verdicts(shift: float, margin: float = 0.05, runs: int = 200) -> dict[str, int]:

@@ -202,9 +202,9 @@ def test_a_recipe_names_no_policy(vlatool, mine, policy_template, tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "mode", "says"),
     [
-        ("{}", 0o600, "makes no sense"),
+        ("{}", 0o600, "is malformed"),
         ("[", 0o600, "cannot be read"),
-        ('{"schema": 1, "trusted": {"/a": 3}}', 0o600, "makes no sense"),
+        ('{"schema": 1, "trusted": {"/a": 3}}', 0o600, "is malformed"),
         ('{"schema": 1, "trusted": {}}', 0o622, "can be written by others"),
     ],
 )

@@ -347,7 +347,7 @@ def test_the_command_exits_by_the_verdict_and_prints_json(capsys, policy_dir, ag
         (["--against", "original.py"], 3, "add the function: original.py:NAME"),
         (["--against", "nowhere.py:act"], 3, "No such file"),
         (["--against", "original.py:none"], 3, "has no function 'none'"),
-        (["--against", "original.py:act", "--data", "none.npz"], 3, "There is no data file"),
+        (["--against", "original.py:act", "--data", "none.npz"], 3, "none.npz not found"),
         (["--against", "original.py:act", "--samples", "0"], 2, "samples"),
         (["--against", "original.py:act", "--tolerance", "2"], 2, "--tolerance is 2"),
         (["--against", "os:getcwd"], 3, "standard library"),

@@ -16,6 +16,7 @@ from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, lost, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
+from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
 from vlatool.machine.version import VERSION
 from vlatool.user_code import trust
@@ -143,6 +144,7 @@ def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
     """Run a command line; return what the process ends with."""
     try:
         with plain_warnings(), trust.nothing_named():
+            refuse_two_distributions()
             code = app(words, standalone_mode=False) or 0
         if code == INTERRUPTED:  # typer catches Ctrl-C itself
             raise KeyboardInterrupt

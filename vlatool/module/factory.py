@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, nearest
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, install, nearest
 from vlatool.files.printable import message_of
 from vlatool.module.fresh import compile_afresh
 from vlatool.user_code.children import left
@@ -196,4 +196,4 @@ def _importable(path: Path | None) -> Iterator[None]:
 def _install_hint(package: str) -> str:
     extra = {"torch": "build", "minigrid": "sim", "gymnasium": "sim", "metaworld": "metaworld", "mujoco": "metaworld"}
     known = extra.get(package.partition(".")[0])
-    return f"pip install 'vlatool[{known}]'" if known else f"pip install {package}"
+    return install(known) if known else f"pip install {package}"

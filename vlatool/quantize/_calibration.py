@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import calibration_recording, doubts
+from vlatool.data import calibration_checks, calibration_recording
 from vlatool.errors import DataError
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._calibrate import Wanted, calibrate
@@ -55,7 +55,7 @@ class Calibrated(Quantization):
             raise self._missing(bundle)
         numbers = recording.spread(self.samples)
         asked = self.samples if self.samples != type(self).model_fields["samples"].default else 0
-        for doubt in doubts(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
+        for doubt in calibration_checks(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
             warnings.warn(doubt, stacklevel=3)
         return numbers, seen.watch(recording.observation(number) for number in numbers)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
@@ -57,12 +57,16 @@ def load(
             something else than the graph says, a stage found the bundle to be wrong, or a limit is reached.
         UsageError: an argument is invalid.
         MissingExtra: the engine is not installed.
+        InstallationError: vlatool and vlatool-runtime are installed side by side.
 
     Example:
         >>> policy = load("out/vln-babyai")                                            # doctest: +SKIP
         >>> policy.infer({"image": frames, "instruction": "go to the red ball"}).labels  # doctest: +SKIP
         ('forward',)
     """
+    from vlatool.bundle.bundle import Bundle
+
+    refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.described(path)
     refuse_findings(bundle, accept)

@@ -146,10 +146,12 @@ def independent(series: Array) -> float:
     That is exact for a first-order autoregression; ranks keep one long stall from hiding what the others do. A series
     that alternates counts as independent.
     """
+    from scipy.stats import rankdata  # a target, which has numpy alone, imports this module as well
+
     count = len(series)
     if count < 3:
         return float(count)
-    ranks = midranks(series)
+    ranks = rankdata(series)
     centred = ranks - ranks.mean()
     spread = float(centred @ centred)
     if spread == 0:
@@ -172,8 +174,8 @@ def effective_sample_size(series: Array, share: float, processes: Sequence[int] 
         return worth
     exceeds = (series > np.quantile(series, share)).astype(np.float64)
     alike = max(0.0, intraclass(exceeds, processes))
-    each = len(series) / len(set(processes))
-    return min(worth, len(series) / (1 + (each - 1) * alike))
+    size = len(series) / len(set(processes))
+    return min(worth, len(series) / (1 + (size - 1) * alike))
 
 
 def intraclass(values: Array, processes: Sequence[int]) -> float:
@@ -183,13 +185,6 @@ def intraclass(values: Array, processes: Sequence[int]) -> float:
     means = np.bincount(place, values) / counts
     within = float(((values - means[place]) ** 2).sum()) / max(1, total - groups)
     between = float((counts * (means - values.mean()) ** 2).sum()) / (groups - 1)
-    each = (total - float((counts**2).sum()) / total) / (groups - 1)
-    spread = between + (each - 1) * within
+    size = (total - float((counts**2).sum()) / total) / (groups - 1)
+    spread = between + (size - 1) * within
     return (between - within) / spread if spread > 0 else 0.0
-
-
-def midranks(series: Array) -> Array:
-    """Return the ranks of a series from 1, equal values sharing their mean."""
-    _, inverse, counts = np.unique(series, return_inverse=True, return_counts=True)
-    last = np.cumsum(counts)
-    return np.asarray((last - (counts - 1) / 2)[inverse], np.float64)

@@ -82,7 +82,7 @@ def reach(processes: int, alpha: float) -> float:
     if processes < fewest(alpha):
         return math.inf
     noise = np.random.default_rng(0).normal(size=(DRAWS, processes))
-    return float(np.quantile([-lower_bound(each, alpha) for each in noise], POWER))
+    return float(np.quantile([-lower_bound(sample, alpha) for sample in noise], POWER))
 
 
 def judged(
@@ -111,30 +111,6 @@ def judged(
     return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread, alpha / sharing)
 
 
-def sequential(
-    measure: Callable[[int], float],
-    margin: float,
-    interim_analyses: Sequence[int] = INTERIM_ANALYSES,
-    alpha: float = ALPHA,
-) -> tuple[Decision, list[float]]:
-    """Measure process after process until an interim analysis decides, or the last one is over.
-
-    Args:
-        measure: Called with the number of the process, from 0; returns its log ratio.
-        margin: The largest slowdown that passes, a share.
-        interim_analyses: After how many processes it is judged, ascending.
-        alpha: Chance of a false verdict over all interim analyses, on either side.
-
-    Returns:
-        The decision, and the log ratio of every process.
-
-    Raises:
-        ValueError: when the interim analyses do not ascend, or the first is too early to decide anything.
-    """
-    decisions, found = jointly(lambda number: (measure(number),), 1, margin, interim_analyses, alpha)
-    return decisions[0], [ratios[0] for ratios in found]
-
-
 def jointly(
     measure: Callable[[int], Sequence[float]],
     statistics: int,
@@ -142,29 +118,31 @@ def jointly(
     interim_analyses: Sequence[int] = INTERIM_ANALYSES,
     alpha: float = ALPHA,
 ) -> tuple[list[Decision], list[Sequence[float]]]:
-    """Judge several statistics of the same processes: it ends when one fails, or when all pass.
+    """Measure process after process until a look decides or the last one is over: one statistic fails, or all pass.
 
     Args:
-        measure: As in ``sequential``, but returns a log ratio for each statistic.
+        measure: Called with the number of the process, from 0; returns a log ratio for each statistic.
         statistics: How many.
-        margin, interim_analyses, alpha: As in ``sequential``.
+        margin: The largest slowdown that passes, a share.
+        interim_analyses: After how many processes they are judged, ascending.
+        alpha: Chance of a false verdict over all interim analyses, on either side.
 
     Returns:
         A decision for each statistic, and the log ratios of every process.
 
     Raises:
-        ValueError: as ``sequential``.
+        ValueError: when the interim analyses do not ascend, or the first is too early to decide anything.
     """
     after = tuple(interim_analyses)
     least = fewest(alpha / statistics / len(after)) if after else 1
     if not after or list(after) != sorted(set(after)) or after[0] < least:
         raise ValueError(f"the interim analyses are {after}; allowed: ascending numbers from {least}")
-    found: list[Sequence[float]] = []
+    processes: list[Sequence[float]] = []
     for count in after:
-        while len(found) < count:
-            found.append(measure(len(found)))
-        decisions = [judged(ratios, margin, alpha / len(after), statistics) for ratios in zip(*found, strict=True)]
+        while len(processes) < count:
+            processes.append(measure(len(processes)))
+        decisions = [judged(ratios, margin, alpha / len(after), statistics) for ratios in zip(*processes, strict=True)]
         verdicts = {decision.verdict for decision in decisions}
         if "fail" in verdicts or "inconclusive" not in verdicts:
             break
-    return decisions, found
+    return decisions, processes

@@ -1,10 +1,14 @@
-"""A Llama-shaped policy whose random weights are written to safetensors shards, never all in memory."""
+"""A Llama-shaped policy whose random weights are written to safetensors shards, never all in memory.
+
+This file is the policy's own ``policy.py``, too.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import math
+import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -113,7 +117,7 @@ def _describe(out: Path, arguments: dict[str, Any]) -> None:
         "name": "llama-like",
         "version": "0.0.0",
         "description": "A decoder shaped like Llama 2 with random weights in safetensors shards.",
-        "source": "vlatool.samples._llama:make",
+        "source": "policy.py:make",
         "arguments": arguments,
         "weights": "*.safetensors",
         "spec": {
@@ -125,6 +129,7 @@ def _describe(out: Path, arguments: dict[str, Any]) -> None:
     }
     text = require("yaml", "build").safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
     (out / "policy.yaml").write_text(text, encoding="utf-8")
+    shutil.copyfile(__file__, out / "policy.py")
 
 
 def _write_shard(file: Path, tensors: dict[str, tuple[int, ...]], seed: int, dtype: str) -> None:
