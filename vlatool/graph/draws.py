@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import GraphError
-from vlatool.graph.shapes import nodes_inside
+from vlatool.graph.nodes import nodes_inside
 
 DRAWING = {
     "RandomNormal": "normal", "RandomNormalLike": "normal", "RandomUniform": "uniform", "RandomUniformLike": "uniform",

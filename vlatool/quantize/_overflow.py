@@ -13,7 +13,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
-from vlatool.graph.types import float_values
+from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
@@ -95,7 +95,7 @@ def _with_peaks(path: Path, scratch: Path, graph: str) -> tuple[Path, list[str]]
     """Write the graph once more with the largest magnitudes of its float32 values as one output, and their names."""
     onnx = require("onnx", "build")
     model = onnx.load(str(path), load_external_data=False)
-    names, make = float_values(model), onnx.helper.make_node
+    names, make = OnnxGraph(model).float_values(), onnx.helper.make_node
     for number, name in enumerate(names):
         own = f"{PEAKS}.{number}"
         model.graph.node.extend(

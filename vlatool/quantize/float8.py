@@ -10,7 +10,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest, require
 from vlatool.graph.files import foreign_errors, load, save
-from vlatool.graph.layers import Layer, Style, find_layers, wanted_values
+from vlatool.graph.layers import Layer, Style, calibrated_values, find_layers
 from vlatool.quantize._base import QUANTIZED_OPS
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._float8_qdq import Float8Writer
@@ -50,7 +50,7 @@ class Float8(Calibrated):
         require("ml_dtypes", "build")
         with foreign_errors("main"):
             layers = self._layers(bundle)
-        wanted = {name: wanted_values(found, Style(), {}) for name, found in layers.items()}
+        wanted = {name: calibrated_values(found, Style(), {}) for name, found in layers.items()}
         samples = SampleSet()
         statistics = self.statistics(bundle, wanted, samples, context)
 

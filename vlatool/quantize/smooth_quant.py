@@ -13,10 +13,11 @@ from pydantic import BeforeValidator, Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, require
+from vlatool.errors import GraphError
 from vlatool.graph.files import foreign_errors, load, save
 from vlatool.graph.layers import find_layers
 from vlatool.graph.nodes import reads
+from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._ranges import Statistics
@@ -162,68 +163,52 @@ class SmoothQuant(Calibrated):
         return {**note, "how": how, "why": "", "alpha": alpha, "estimated_loss": float(f"{gain:.4g}")}
 
 
-class _Writer:
+class _Writer(OnnxGraph):
     """Multiplies constants of a graph in place, one reader's copy at a time."""
-
-    def __init__(self, model: Any) -> None:
-        self._onnx = require("onnx", "build")
-        self._graph = model.graph
-        self._constants = {tensor.name: tensor for tensor in model.graph.initializer}
-        self._nodes = {node.output[0]: node for node in model.graph.node}
-        self._layers = {node.name: node for node in model.graph.node}
 
     def weight(self, name: str, axis: int) -> Array:
         """Return a weight as (inputs, outputs)."""
-        values: Array = self._onnx.numpy_helper.to_array(self._constants[name])
-        return values if axis == 1 else values.T
+        return self.array(name) if axis == 1 else self.array(name).T
 
     def apply(self, group: Group, scales: Array) -> None:
         """Divide the value of a group by the scales and multiply its weights by them."""
+        names = {layer.name for layer in group.layers}
+        layers = {node.name: node for node in self.graph.node if node.name in names}
         for edit in group.edits:
             self._multiply(edit, scales)
         for layer in group.layers:
-            self._multiply(Edit(self._layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
-        if not group.edits:
-            self._insert(group, scales)
+            self._multiply(Edit(layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
+        if not group.edits:  # a Mul of its own before the layers
+            value, smooth = group.value, f"{group.value}.smooth"
+            factors = self.add(f"{smooth}.scale", _reciprocals(scales))
+            for node in layers.values():
+                node.input[0] = smooth
+            first = next(iter(layers.values()))
+            self.insert_before(first, self.node("Mul", [value, factors], [smooth], f"{value}/smooth"))
 
     def _multiply(self, edit: Edit, scales: Array) -> None:
-        node = self._nodes[edit.node]
+        node = self.producers[edit.node]
         name = self._own(node, edit.position)
-        values = self._onnx.numpy_helper.to_array(self._constants[name])
+        values = self.array(name)
         if edit.width and values.shape[-1:] != (edit.width,):
             values = np.broadcast_to(values, (*values.shape[:-1], edit.width))
         values = np.array(values, np.float32)
         axis = edit.axis % values.ndim
         place = (*(slice(None),) * axis, slice(edit.start, edit.start + len(scales)))
-        factors = scales if edit.power > 0 else (1 / scales.astype(np.float64)).astype(np.float32)
+        factors = scales if edit.power > 0 else _reciprocals(scales)
         values[place] *= factors.reshape(-1, *(1,) * (values.ndim - 1 - axis))
-        self._constants[name].CopyFrom(self._onnx.numpy_helper.from_array(values, name))
+        self.constants[name].CopyFrom(self.onnx.numpy_helper.from_array(values, name))
 
     def _own(self, node: Any, position: int) -> str:
         """Return the name of a constant that this node alone reads, in this place alone; copy a shared one."""
         name = str(node.input[position])
-        if sum(list(reads(each)).count(name) for each in self._graph.node) == 1:
-            return name
-        copy = f"{name}.{node.name}.{position}"
-        tensor = self._onnx.TensorProto()
-        tensor.CopyFrom(self._constants[name])
-        tensor.name = copy
-        self._graph.initializer.append(tensor)
-        self._constants[copy] = self._graph.initializer[-1]
-        node.input[position] = copy
-        return copy
+        if sum(list(reads(reader)).count(name) for reader in self.graph.node) > 1:
+            node.input[position] = self.add_tensor(self.constants[name], f"{name}.{node.name}.{position}")
+        return str(node.input[position])
 
-    def _insert(self, group: Group, scales: Array) -> None:
-        """Put a Mul before the layers of a group."""
-        value, smooth = group.value, f"{group.value}.smooth"
-        factors = (1 / scales.astype(np.float64)).astype(np.float32)
-        self._graph.initializer.append(self._onnx.numpy_helper.from_array(factors, f"{smooth}.scale"))
-        names = {layer.name for layer in group.layers}
-        places = [place for place, node in enumerate(self._graph.node) if node.name in names]
-        for place in places:
-            self._graph.node[place].input[0] = smooth
-        made = self._onnx.helper.make_node("Mul", [value, f"{smooth}.scale"], [smooth], name=f"{value}/smooth")
-        self._graph.node.insert(min(places), made)
+
+def _reciprocals(scales: Array) -> Array:
+    return (1 / scales.astype(np.float64)).astype(np.float32)
 
 
 def _peaks(statistics: dict[str, dict[str, Statistics]]) -> dict[str, dict[str, Array]]:

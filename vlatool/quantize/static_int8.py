@@ -14,12 +14,12 @@ from vlatool.graph.files import foreign_errors, load, read, save
 from vlatool.graph.layers import (
     Layer,
     Style,
+    calibrated_values,
     check_weights,
     convolved,
     find_layers,
     hoisted,
     split_gemm,
-    wanted_values,
 )
 from vlatool.graph.qdq import Range, insert_qdq
 from vlatool.quantize._base import QUANTIZED_OPS
@@ -207,7 +207,7 @@ class StaticInt8(Calibrated):
             layers[name] = [layer for layer in layers[name] if layer.name in selected]
             model = read(path)
             check_weights(model, layers[name])
-            wanted[name] = wanted_values(layers[name], self.style, hoisted(model, layers[name], self.style))
+            wanted[name] = calibrated_values(layers[name], self.style, hoisted(model, layers[name], self.style))
         return layers, wanted
 
     def _rewritten(self, model: Any, layers: list[Layer]) -> list[Layer]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from vlatool.errors import GraphError, require
 from vlatool.graph.files import load
-from vlatool.graph.layers import Layer, Style, hoisted, wanted_values
+from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted
 from vlatool.graph.qdq import Range, insert_qdq
 
 FLAG = "int8."
@@ -29,8 +29,8 @@ def add_switches(
     Args:
         path: A float32 ONNX file.
         layers: From ``find_layers`` of that file.
-        ranges: Value name -> (low, high), of every value that ``wanted_values`` names; when None, ranges are taken from
-            the values at run time (uint8, DynamicQuantizeLinear).
+        ranges: Value name -> (low, high), of every value that ``calibrated_values`` names; when None, ranges are taken
+            from the values at run time (uint8, DynamicQuantizeLinear).
         style: How the int8 graph writes its layers.
 
     Raises:
@@ -41,7 +41,7 @@ def add_switches(
     moved = hoisted(written, chosen, style)
     plain = replace(style, hoist=False)
     known: dict[str, Range] = {}
-    for name in wanted_values(chosen, plain, {}):
+    for name in calibrated_values(chosen, plain, {}):
         source = moved.get(name, name)
         if ranges is not None and source not in ranges:
             raise GraphError(
