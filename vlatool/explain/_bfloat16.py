@@ -13,7 +13,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.graph.files import load, part_phases, save
-from vlatool.graph.phase import PERIODIC, cut_phases
+from vlatool.graph.phase import cut_phases, periodic
 from vlatool.runtime.engine import computing, engine_class
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, Session
@@ -63,7 +63,7 @@ def phases(
         if graph.compute != "bfloat16":
             continue
         kept = f"{name}_phases" if f"{name}_phases" in graphs else ""
-        nodes = _periodic(load(bundle.file(graph.file)))
+        nodes = tuple(node.name for node in periodic(load(bundle.file(graph.file))))
         each = Phases(name, kept, nodes)
         if nodes:
             found.append(_measured(bundle, each, observations, context))
@@ -87,18 +87,6 @@ def _without(
     except VlatoolError as error:
         return replace(each, note=f"not measured: {error.message}")
     return replace(each, error=_error(uncut, plain), cut=_error(cut, plain))
-
-
-def _periodic(model: Any) -> tuple[str, ...]:
-    """Return the Sin and Cos whose argument depends on an input of the graph."""
-    dependent = {value.name for value in model.graph.input}
-    found = []
-    for node in model.graph.node:
-        if not dependent.isdisjoint(node.input):
-            dependent.update(node.output)
-            if node.op_type in PERIODIC:
-                found.append(node.name)
-    return tuple(found)
 
 
 def _measured(bundle: Bundle, each: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
