@@ -15,7 +15,6 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import GraphError
 from vlatool.graph.files import foreign_errors, load, save
-from vlatool.graph.layers import find_layers
 from vlatool.graph.nodes import reads
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._calibrate import calibrate
@@ -74,15 +73,16 @@ class SmoothQuant(Calibrated):
         """Calibrate, smooth every selected graph, and compare the golden action with the source's."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
-        with foreign_errors("main"):
-            groups = self._plan(bundle)
-        wanted = {name: [value for group in found for value in group.activations] for name, found in groups.items()}
-        samples = SampleSet()
+        groups, samples = {}, SampleSet()
+        for name, layers in self.layers_of(bundle, OPS).items():
+            with foreign_errors(name):
+                groups[name] = find_groups(load(bundle.file(bundle.manifest.graphs[name].file)), layers)
+        values = {name: [value for group in found for value in group.activations] for name, found in groups.items()}
         halves = self._halves(list(zip(*self.observed(bundle, samples), strict=True)))
         peaks = []
         for half in halves:
             numbers, observations = zip(*half, strict=True)
-            peaks.append(_peaks(calibrate(bundle, wanted, observations, context, channels=True, numbers=numbers)))
+            peaks.append(_peaks(calibrate(bundle, values, observations, context, channels=True, numbers=numbers)))
         notes: list[dict[str, Any]] = []
 
         def smooth(name: str, original: Path, target: Path) -> None:
@@ -111,16 +111,6 @@ class SmoothQuant(Calibrated):
         blocked = sum(group["why"] == "only a Mul of its own could divide it" for group in groups)
         more = f" ({blocked} of them for want of --insert)" if blocked else ""
         return (f"{told}, {count['left']} left as they are{more}",)
-
-    def _plan(self, bundle: Bundle) -> dict[str, list[Group]]:
-        """Return graph -> groups of selected layers."""
-        models = {name: load(bundle.file(bundle.manifest.graphs[name].file)) for name in self.chosen_graphs(bundle)}
-        layers = {name: find_layers(model, OPS) for name, model in models.items()}
-        selected = self.selected([layer.name for found in layers.values() for layer in found], bundle)
-        return {
-            name: find_groups(model, [layer for layer in layers[name] if layer.name in selected])
-            for name, model in models.items()
-        }
 
     def _halves(self, observations: list[Sample]) -> list[list[Sample]]:
         """Return all observations, or for ``auto`` every other one and the rest, whose peaks are compared."""
