@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ def calibrated_records(
         if task.kind == "copy":
             records += records_of(task, stage.form, stage.choose, 0.0)
             continue
-        records.append(Record(task.label, padded(task.size), _Filler(walk, number), task.source.count, False))
+        records.append(Record(task.label, padded(task.size), partial(walk.fill, number), task.source.count, False))
     return records
 
 
@@ -164,19 +164,3 @@ def _note(task: Task, weight: Array, made: Rounded, rows: Array, tolerance: floa
     of_product = np.linalg.norm(rows @ difference.T) / (np.linalg.norm(wanted) or 1.0)
     note = figures(task, lost, norm, tolerance)
     return {**note, "product_error": float(of_product), "sha256": ""}
-
-
-@dataclass(frozen=True)
-class _Filler:
-    """Computes the record of one task; only here, and only after those before it."""
-
-    walk: _Walk
-    number: int
-
-    def __call__(self, tools: Tools, data: Array) -> dict[str, Any]:
-        """Fill the record."""
-        return self.walk.fill(self.number, tools, data)
-
-    def to_json(self) -> str:
-        """Never called: such a record is not portable."""
-        raise NotImplementedError(self.number)
