@@ -21,7 +21,7 @@ from vlatool.quantize._blocks import Format
 from vlatool.quantize._compute import Job, records_of
 from vlatool.quantize._journal import DATA, JOURNAL
 from vlatool.quantize._records import Record
-from vlatool.quantize._rewrite import Task, block_task, copy_task
+from vlatool.quantize._rewrite import Task, copy_task, weight_task
 from vlatool.quantize._stream import work_directory, write_records
 from vlatool.quantize._worker import serve
 from vlatool.stage.base import Tell
@@ -54,7 +54,9 @@ def records(shard: Path) -> list[Record]:
     for tensor in sorted(read_header(shard), key=lambda each: each.name):
         quantized = tensor.name.startswith("layer")
         layer = LayerLike(tensor.name, 128, 64)
-        task: Task = block_task(layer, tensor, FORM, False) if quantized else copy_task(tensor.name, tensor, True)
+        task: Task = (
+            weight_task(layer, tensor, FORM, "ort", False) if quantized else copy_task(tensor.name, tensor, True)
+        )
         found += records_of(task, FORM, "searched", FORM.largest_error)
     return found
 
@@ -207,7 +209,7 @@ def test_an_error_in_a_process_is_the_error_here(shard, tmp_path):
 
 def test_a_loss_beyond_the_bits_is_an_error(shard, tmp_path):
     tensor = next(each for each in read_header(shard) if each.name == "layer.0")
-    task = block_task(LayerLike("layer.0", 128, 64), tensor, FORM, False)
+    task = weight_task(LayerLike("layer.0", 128, 64), tensor, FORM, "ort", False)
     with pytest.raises(GraphError, match=r"Quantizing 'layer\.0' .* loses 0\.0\d+ of its norm; allowed: 0\.01"):
         write(records_of(task, FORM, "rtn", 0.01), tmp_path / "work" / "a")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from vlatool.errors import require
@@ -45,13 +45,18 @@ def varying(model: Any) -> set[str]:
 
 
 def name_nodes(model: Any) -> None:
-    """Give every node without a name, or with one that came before, a name of its own, in place.
+    """Give every node of an ``onnx.ModelProto`` without a name, or with one that came before, a name of its own."""
+    name_each(list(model.graph.node))
+
+
+def name_each(nodes: Sequence[Any]) -> None:
+    """Do so with the nodes of a graph, be they protobuf or ``onnx_ir``.
 
     Layers are chosen and rewritten by the names of their nodes; some exporters leave them empty or repeat them.
     """
-    taken = {node.name for node in model.graph.node}
-    seen = {""}
-    for number, node in enumerate(model.graph.node):
+    taken = {node.name for node in nodes}
+    seen = {"", None}
+    for number, node in enumerate(nodes):
         if node.name in seen:
             node.name = free_name(node.name or node.op_type, number, taken)
         seen.add(node.name)

@@ -21,7 +21,7 @@ from vlatool.quantize._gptq import Rounded, awq, gptq, nearest_codes
 from vlatool.quantize._journal import DATA
 from vlatool.quantize._layerwise import Layerwise, Values
 from vlatool.quantize._records import Record, Tools, padded
-from vlatool.quantize._rewrite import Layer, Task
+from vlatool.quantize._rewrite import Product, Task
 from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan
 from vlatool.runtime.observation import ObservationEncoder
@@ -58,7 +58,7 @@ class _Walk:
         self._observations = observations
         self._offsets = plan.offsets()
         self._wanted = -1
-        self._shared = {id(layer): number for graph in plan.graphs.values() for layer, number in graph.layers}
+        self._shared = {id(layer): number for graph in plan.graphs.values() for layer, number in graph.products}
         owners: dict[int, int] = {}
         for layer, number in self._shared.items():
             owners.setdefault(number, layer)
@@ -93,14 +93,14 @@ class _Walk:
             for values in samples:
                 _begin(step, values, random)
             graph = self._plan.graphs[step.graph]
-            layers = [layer for layer, _ in graph.layers]
+            layers = [layer for layer, _ in graph.products]
             local = [{name: values[value] for name, value in step.feeds.items()} for values in samples]
             yield from Layerwise(graph.skeleton, layers, self._product).run(local, tools)
             for values, given in zip(samples, local, strict=True):
                 values.update({value: given[name] for name, value in step.gives.items()})
                 values.update({target: values[source] for source, target in step.carry.items()})
 
-    def _product(self, layer: Layer, rows: Array, tools: Tools) -> Array:
+    def _product(self, layer: Product, rows: Array, tools: Tools) -> Array:
         number = self._numbers.get(id(layer))
         if number is None:  # a weight that was quantized for another layer: the float one serves
             return rows @ whole_weight(self._plan.tasks[self._shared[id(layer)]], tools).T
