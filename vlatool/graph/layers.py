@@ -151,7 +151,7 @@ def hoisted(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]
             if mover.op_type not in SHAPES or mover.input[0] in graph.constants or value in graph.outputs:
                 break
             readers = graph.readers[value]
-            if not (len(readers) == 1 if value != name else all((each.name, value) in read for each in readers)):
+            if not (len(readers) == 1 if value != name else all((reader.name, value) in read for reader in readers)):
                 break
             roots[name] = value = mover.input[0]
     return roots

@@ -146,8 +146,8 @@ class OnnxGraph:
     def insert_before(self, node: Any, *added: Any) -> None:
         """Put nodes in front of one that is in the graph."""
         place = list(self.graph.node).index(node)
-        for number, each in enumerate(added):
-            self.graph.node.insert(place + number, each)
+        for number, new in enumerate(added):
+            self.graph.node.insert(place + number, new)
 
     def replace_reads(self, old: str, new: str) -> None:
         """Let all nodes that read a value read another one."""

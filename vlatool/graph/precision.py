@@ -13,13 +13,13 @@ def precision_shares(path: Path) -> dict[str, float]:
     """
     from vlatool.graph.workload import graph_workload
 
-    macs = graph_workload(path, told=_told).macs
+    macs = graph_workload(path, count_as=_by_weights).macs
     total = sum(macs.values()) or 1
     shares = {name: round(count / total, 3) for name, count in macs.items() if count}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _told(node: Any, tensors: Any) -> str:
+def _by_weights(node: Any, tensors: Any) -> str:
     from vlatool.graph.macs import precision_of, weights_alone
 
     alone = weights_alone(node, tensors)

@@ -70,7 +70,7 @@ def from_values(data: Any) -> Workload | None:
             counts = [fields[key] for key in COUNTS] + list(fields["macs"].values())
             counts += [number for part in fields["parts"].values() for number in part]
             fours = all(len(part) == 4 for part in fields["parts"].values())
-            if not fours or not all(isinstance(each, int) and each >= 0 for each in counts):
+            if not fours or not all(isinstance(count, int) and count >= 0 for count in counts):
                 return None
             graphs[name] = GraphWorkload(**fields)
         return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
@@ -94,7 +94,7 @@ def refuse_other(file: Path) -> None:
         raise OutputError(f"{file} is none that vlatool wrote.", "move it away yourself")
 
 
-def write_workload(file: Path, found: Workload, of: str = "") -> None:
+def write_workload(file: Path, work: Workload, of: str = "") -> None:
     """Write a workload as ``read_workload`` reads it.
 
     Raises:
@@ -102,14 +102,14 @@ def write_workload(file: Path, found: Workload, of: str = "") -> None:
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(file) as draft:
-        data = {**to_values(found), "digest": of}
+        data = {**to_values(work), "digest": of}
         draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def to_values(found: Workload) -> dict[str, Any]:
+def to_values(work: Workload) -> dict[str, Any]:
     """Return a workload as JSON values."""
     graphs: dict[str, Any] = {}
-    for name, graph in found.graphs.items():
+    for name, graph in work.graphs.items():
         fields = dataclasses.asdict(graph)
         graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
-    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)}
+    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(work.runs)}

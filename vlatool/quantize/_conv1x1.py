@@ -110,9 +110,9 @@ class _Rewriter(Forms):
 
     def _weight(self, name: str, *, output_first: bool) -> str:
         """Return a weight (N, K, 1, 1) made of one (K, N), or (N, K); empty when the value is no weight."""
-        made = f"{name}/{'nk' if output_first else 'kn'}"
+        image = f"{name}/{'nk' if output_first else 'kn'}"
         if name in self.constants:
-            return self._image_of(name, made, output_first) if self.is_weight(name, rank=2) else ""
+            return self._image_of(name, image, output_first) if self.is_weight(name, rank=2) else ""
         node = self.producers.get(name)
         if node is None or node.op_type != "DequantizeLinear" or any(part not in self.constants for part in node.input):
             return ""
@@ -121,11 +121,11 @@ class _Rewriter(Forms):
         by_channel = len(scale.dims) == 1 and axis == (0 if output_first else 1)
         if len(stored.dims) != 2 or scale.data_type != FLOAT or not (by_channel or not scale.dims):
             return ""
-        if made not in self.shapes:
-            inputs = [self._image_of(node.input[0], f"{made}/stored", output_first), *node.input[1:]]
-            self.append("DequantizeLinear", inputs, made, f"{node.name}/image", **({"axis": 0} if by_channel else {}))
-            self.shapes[made] = ()
-        return made
+        if image not in self.shapes:
+            inputs = [self._image_of(node.input[0], f"{image}/stored", output_first), *node.input[1:]]
+            self.append("DequantizeLinear", inputs, image, f"{node.name}/image", **({"axis": 0} if by_channel else {}))
+            self.shapes[image] = ()
+        return image
 
     def _image_of(self, name: str, image: str, output_first: bool) -> str:
         if image in self.constants:
@@ -161,10 +161,10 @@ class _Rewriter(Forms):
         leading = {self.shapes[name][:-1] for name in (*moving, value)}
         if len(leading) != 1 or not self._by_row(node, [name for name in inputs if name not in moving]):
             return False
-        made = self.padded_name(value)
-        copy = self.copy(node, [self.padded(name) if name in moving else name for name in node.input], made)
+        padded = self.padded_name(value)
+        copy = self.copy(node, [self.padded(name) if name in moving else name for name in node.input], padded)
         self._last_axis(copy)
-        self.forms[value] = Names("padded", rows=value if made == value else "", padded=made)
+        self.forms[value] = Names("padded", rows=value if padded == value else "", padded=padded)
         return True
 
     def _mixed_next(self, node: Any) -> bool:

@@ -71,8 +71,8 @@ def look_at_weights(model: Any, kept: set[str]) -> Weights:
 
 def around(model: Any, values: Iterable[str]) -> set[str]:
     """Return the names of the nodes that give or read one of the values."""
-    wanted = set(values)
-    return {node.name for node in model.graph.node if not wanted.isdisjoint((*node.input, *node.output))}
+    names = set(values)
+    return {node.name for node in model.graph.node if not names.isdisjoint((*node.input, *node.output))}
 
 
 def to_float16(model: Any, kept: set[str]) -> Any:

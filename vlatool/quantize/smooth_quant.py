@@ -77,7 +77,7 @@ class SmoothQuant(Calibrated):
         for name, layers in self.layers_of(bundle, OPS).items():
             with foreign_errors(name):
                 groups[name] = find_groups(load(bundle.file(bundle.manifest.graphs[name].file)), layers)
-        values = {name: [value for group in found for value in group.activations] for name, found in groups.items()}
+        values = {name: [value for group in members for value in group.activations] for name, members in groups.items()}
         halves = self._halves(list(zip(*self.observed(bundle, samples), strict=True)))
         peaks = []
         for half in halves:
@@ -92,11 +92,11 @@ class SmoothQuant(Calibrated):
                 notes.append({"graph": name, **note})
             save(model, target)
 
-        made = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
+        smoothed = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
         (out / REPORT).parent.mkdir(exist_ok=True)
         (out / REPORT).write_text(json.dumps({"groups": notes}, indent=1) + "\n", encoding="utf-8")
-        _check_same(bundle, made)
-        return made
+        _check_same(bundle, smoothed)
+        return smoothed
 
     def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
         """Return those of the bundle that is smoothed, whose golden action must stay."""
@@ -107,10 +107,10 @@ class SmoothQuant(Calibrated):
         groups = json.loads((made.path / REPORT).read_text(encoding="utf-8"))["groups"]
         count = {how: sum(group["how"] == how for group in groups) for how in ("folded", "inserted", "left")}
         layers = sum(len(group["layers"]) for group in groups if group["how"] != "left")
-        told = f"smoothed what {layers} layers read: {count['folded']} activations folded, {count['inserted']} inserted"
+        text = f"smoothed what {layers} layers read: {count['folded']} activations folded, {count['inserted']} inserted"
         blocked = sum(group["why"] == "only a Mul of its own could divide it" for group in groups)
         more = f" ({blocked} of them for want of --insert)" if blocked else ""
-        return (f"{told}, {count['left']} left as they are{more}",)
+        return (f"{text}, {count['left']} left as they are{more}",)
 
     def _halves(self, observations: list[Sample]) -> list[list[Sample]]:
         """Return all observations, or for ``auto`` every other one and the rest, whose peaks are compared."""
@@ -203,7 +203,8 @@ def _reciprocals(scales: Array) -> Array:
 
 def _peaks(statistics: dict[str, dict[str, Statistics]]) -> dict[str, dict[str, Array]]:
     return {
-        graph: {name: np.asarray(each.peaks) for name, each in found.items()} for graph, found in statistics.items()
+        graph: {name: np.asarray(seen.peaks) for name, seen in collected.items()}
+        for graph, collected in statistics.items()
     }
 
 
@@ -212,13 +213,13 @@ def _joint(peaks: list[dict[str, dict[str, Array]]], graph: str, group: Group) -
     return [np.maximum.reduce([half[graph][name] for name in group.activations]) for half in peaks]
 
 
-def _check_same(source: Bundle, made: Bundle) -> None:
+def _check_same(source: Bundle, smoothed: Bundle) -> None:
     """Refuse a bundle whose golden action is not the source's.
 
     Raises:
         GraphError: when it differs by more than float32 rounding explains.
     """
-    before, after = load_golden(source), load_golden(made)
+    before, after = load_golden(source), load_golden(smoothed)
     if before is None or after is None or not _equal(before[:2], after[:2]):
         return
     error = relative_error(after[2], before[2])

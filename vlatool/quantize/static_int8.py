@@ -112,8 +112,8 @@ class StaticInt8(Calibrated):
 
     def on(self, profile: Profile) -> Self:
         """Write the layout and the activations that the board's preferred engine takes."""
-        wanted = class_for(profile.engine).int8
-        return self.model_copy(update={name: how for name, how in wanted.items() if name not in self.model_fields_set})
+        options = class_for(profile.engine).int8
+        return self.model_copy(update={name: how for name, how in options.items() if name not in self.model_fields_set})
 
     def used_packages(self) -> tuple[str, ...]:
         """The engine too that the layout is for."""

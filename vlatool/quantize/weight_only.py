@@ -169,8 +169,8 @@ def _told(written: Written, file: Path) -> dict[str, Any]:
     mean = sum(errors) / len(errors) if errors else 0.0
     summary = {"mean": round(mean, 6), "max": round(max(errors, default=0.0), 6), "worst": worst}
     file.parent.mkdir(exist_ok=True)
-    told = {**summary, "resumed": written.resumed, "layers": layers}
-    file.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    report = {**summary, "resumed": written.resumed, "layers": layers}
+    file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     identity = sorted(f"{note['tensor']}:{note.get('first', 0)}:{note['sha256']}" for note in written.notes)
     digest = hashlib.sha256("\n".join(identity).encode()).hexdigest()
     return {"weights_sha256": digest, "weight_error": summary}
