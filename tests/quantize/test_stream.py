@@ -283,11 +283,11 @@ def entry(dtype: str = "F32", shape: tuple[int, ...] = (2,), begin: int = 0, end
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "no safetensors file, or is cut off: 0 bytes"),
-        (b"PK\x03\x04 this is something else", "no safetensors file, or is cut off"),
+        (b"", "not a safetensors file, or is cut off: 0 bytes"),
+        (b"PK\x03\x04 this is something else", "not a safetensors file, or is cut off"),
         ((99).to_bytes(8, "little") + b"{}", "cannot hold a header of 99"),
         ((2).to_bytes(8, "little") + b"{]", "damaged safetensors header"),
-        (header([1]), "it is no mapping"),
+        (header([1]), "it is not a mapping"),
         (header({"x": {"dtype": "F32"}}), "damaged safetensors header at 'x'"),
         (header(entry("F4")) + bytes(8), "holds 'x' as F4; known dtypes"),
         (header(entry(end=4)) + bytes(8), "cannot take 4 bytes"),
@@ -312,7 +312,7 @@ def test_shards_and_their_index(tmp_path, shard):
     with pytest.raises(SourceError, match=r"says that 'x' is in model\.safetensors, which does not hold it"):
         read_shards(tmp_path, "*.safetensors")
     index.write_text("{}")
-    with pytest.raises(SourceError, match="is no index of safetensors shards"):
+    with pytest.raises(SourceError, match="is not an index of safetensors shards"):
         read_shards(tmp_path, "*.safetensors")
     index.unlink()
     before = fingerprint([shard])

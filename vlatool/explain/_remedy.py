@@ -101,7 +101,7 @@ class Contest:
 
 
 def plans(stage: Stage | None, worst: Sequence[LayerError], fallen: Sequence[Fallback], engine: str) -> list[Candidate]:
-    """Return what is worth trying for a stage: the worst layers in float32, other ranges, the layout for the engine."""
+    """Return the candidates for a stage: the worst layers in float32, other ranges, the layout for the engine."""
     tried: list[Candidate] = []
     fixed, before = stage, ""
     if isinstance(stage, StaticInt8) and fallen:

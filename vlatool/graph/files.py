@@ -61,7 +61,7 @@ def load(path: Path) -> Any:
 
 
 def read(path: Path, *, weights: bool = True) -> Any:
-    """Read an ONNX model, with a name of its own for every node; what it gives is no constant but read from one.
+    """Read an ONNX model, with a name of its own for every node; no output is itself a constant.
 
     Raises:
         GraphError: when a file with its weights is missing.

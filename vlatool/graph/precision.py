@@ -9,7 +9,7 @@ from typing import Any
 def precision_shares(path: Path) -> dict[str, float]:
     """Return precision -> share of the multiply-accumulates (rounded to 0.001, the largest first).
 
-    Layers whose weights alone are quantized are told by those, ``int4 weights``, in whatever form they are stored.
+    Layers whose weights alone are quantized count as ``int4 weights`` and the like, in whatever form they are stored.
     """
     from vlatool.graph.workload import graph_workload
 

@@ -38,22 +38,23 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
         file: The file.
         of: ``digest`` that it must have.
     """
+    data = _content(file)
+    return from_values(data) if data.get("digest", "") == of else None
+
+
+def _content(file: Path) -> dict[str, Any]:
+    """Return what a file of JSON holds; nothing when it is missing, damaged or of something else."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if not isinstance(data, dict) or data.get("digest", "") != of:
-        return None
-    return from_values(data)
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
 
 
 def is_workload(file: Path) -> bool:
     """Say whether a file is one of this package's, of an earlier layout too, which nobody reads any more."""
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    if not isinstance(data, dict) or not isinstance(data.get("layout"), int):
+    data = _content(file)
+    if not isinstance(data.get("layout"), int):
         return False
     return from_values(data) is not None if data["layout"] >= LAYOUT else isinstance(data.get("graphs"), dict)
 
@@ -86,12 +87,8 @@ def refuse_other(file: Path) -> None:
     """
     if not os.path.lexists(file):
         return
-    try:
-        data = {} if file.is_symlink() else json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        data = {}
-    if not isinstance(data, dict) or set(data) != {"layout", "digest", "graphs", "runs"}:
-        raise OutputError(f"{file} is none that vlatool wrote.", "move it away yourself")
+    if file.is_symlink() or set(_content(file)) != {"layout", "digest", "graphs", "runs"}:
+        raise OutputError(f"{file} was not written by vlatool.", "move it away yourself")
 
 
 def write_workload(file: Path, work: Workload, of: str = "") -> None:

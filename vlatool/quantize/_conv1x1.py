@@ -109,7 +109,7 @@ class _Rewriter(Forms):
         return self.is_weight(name) and list(self.constants[name].dims) == [channels]
 
     def _weight(self, name: str, *, output_first: bool) -> str:
-        """Return a weight (N, K, 1, 1) made of one (K, N), or (N, K); empty when the value is no weight."""
+        """Return a weight (N, K, 1, 1) made of one (K, N), or (N, K); empty when the value is not a weight."""
         image = f"{name}/{'nk' if output_first else 'kn'}"
         if name in self.constants:
             return self._image_of(name, image, output_first) if self.is_weight(name, rank=2) else ""

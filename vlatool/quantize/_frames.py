@@ -90,7 +90,7 @@ class _Folder(OnnxGraph):
                 return []
 
     def _varying(self, node: Any) -> str:
-        """Return the operand that is no constant; nothing when both are none, or a constant is divided."""
+        """Return the operand that is not a constant; nothing when neither is, or a constant is divided."""
         left, right = node.input
         if right in self.constants:
             return str(left)

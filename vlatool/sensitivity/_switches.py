@@ -45,9 +45,7 @@ def add_switches(
     for name in calibrated_values(chosen, plain, {}):
         source = moved.get(name, name)
         if ranges is not None and source not in ranges:
-            raise GraphError(
-                f"There is no range for the value '{source}' of {path.name}.", "calibrate with the same stage"
-            )
+            raise GraphError(f"The value '{source}' of {path.name} has no range.", "calibrate with the same stage")
         known[name] = (0.0, 1.0) if ranges is None else ranges[source]
     insert_qdq(written, chosen, known, plain)
     pairs = _Pairs(written, dynamic=ranges is None)

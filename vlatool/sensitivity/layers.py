@@ -215,7 +215,7 @@ class Switchboard:
             DataError: when there is no observation.
         """
         if not observations:
-            raise DataError("There is no observation to measure the layers on.", "record some: see docs/data")
+            raise DataError("No observations to measure the layers on.", "record some: see docs/data")
         spec = self.policy.spec.action
         rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
         start = time.monotonic()

@@ -48,7 +48,7 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
         context: Whom to tell.
 
     Raises:
-        SourceError: when the original cannot be imported, fails, or gives what is no action.
+        SourceError: when the original cannot be imported, fails, or gives something that is not an action.
         DataError: when the observations cannot be read.
     """
     file = factory_file(options.against, Path.cwd())

@@ -1,4 +1,4 @@
-"""Both sides on the same observations, in this process: actions, and what can be told of the stages between."""
+"""Both sides on the same observations, in this process: actions, and what is known of the stages between."""
 
 from __future__ import annotations
 

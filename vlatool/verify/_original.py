@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 
 class Original:
-    """Calls a user's functions; what they raise, and what is no answer, becomes one sentence.
+    """Calls a user's functions; what they raise, and an answer of the wrong kind, becomes one sentence.
 
     Args:
         factory: ``original.py:act`` or ``package.module:act``.
@@ -105,11 +105,11 @@ class Original:
             array = np.asarray(value)
         except Exception as error:  # the seam: an object may refuse in any way
             raise SourceError(
-                f"{what} of '{self._name}' gives a {type(value).__name__}, which is no array: {message_of(error)}.",
+                f"{what} of '{self._name}' gives a {type(value).__name__}, which is not an array: {message_of(error)}.",
                 "return a numpy array, or a tensor of float32",
             ) from error
         if array.dtype.kind not in "biuf" or not array.size:
-            raise SourceError(f"{what} of '{self._name}' gives {_told(value, array)}; wanted an array of numbers.")
+            raise SourceError(f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.")
         if not np.isfinite(array).all():
             raise SourceError(f"{what} of '{self._name}' gives NaN or infinity on observation {number}.")
         return array
@@ -135,8 +135,8 @@ class Original:
         right = flat.dtype.kind in "iu" and 1 <= flat.size <= self._spec.chunk
         if not right or not ((flat >= 0) & (flat < len(labels))).all():
             raise SourceError(
-                f"act() of '{self._name}' gives {_told(answer, array)} for '{action.name}'; wanted an index from 0 to "
-                f"{len(labels) - 1}, or one of {', '.join(labels)}.",
+                f"act() of '{self._name}' gives {_described(answer, array)} for '{action.name}'; wanted an index from "
+                f"0 to {len(labels) - 1}, or one of {', '.join(labels)}.",
                 "return argmax of the logits",
             )
         return flat.astype(np.int64)
@@ -159,7 +159,7 @@ def _takes(function: Callable[..., Any], name: str) -> bool:
         return False
 
 
-def _told(value: Any, array: Array) -> str:
+def _described(value: Any, array: Array) -> str:
     if isinstance(value, Mapping):
         return f"a dict of {', '.join(map(str, value))}"[:120]
     return repr(value)[:60] if array.size <= 4 else f"an array of {array.dtype} with the shape {list(array.shape)}"

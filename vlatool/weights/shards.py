@@ -96,7 +96,7 @@ def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
     """Read the headers of all shards: name -> where the tensor is, in the order of files and offsets.
 
     Raises:
-        SourceError: when a shard is missing, cut off or no safetensors file, or a tensor is there twice.
+        SourceError: when a shard is missing, cut off or not a safetensors file, or a tensor is there twice.
     """
     files = shard_files(folder, pattern)
     _check_indexes(files)
@@ -119,7 +119,7 @@ def _check_indexes(files: list[Path]) -> None:
             named = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
             files_of = {str(tensor): str(file) for tensor, file in named.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise SourceError(f"{index} is no index of safetensors shards: {error!r}.", AGAIN) from error
+            raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", AGAIN) from error
         for name in sorted(set(files_of.values())):
             if not (index.parent / name).is_file():
                 raise SourceError(f"{index} names the shard {name}, which is missing.", AGAIN)
@@ -141,7 +141,7 @@ def read_header(file: Path) -> list[StoredTensor]:
     except ValueError as error:
         raise SourceError(f"{file} has a damaged safetensors header: {error}.", AGAIN) from error
     if not isinstance(entries, Mapping):
-        raise SourceError(f"{file} has a damaged safetensors header: it is no mapping.", AGAIN)
+        raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", AGAIN)
     return [_entry(file, str(name), entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
 
 
@@ -153,7 +153,7 @@ def _header_bytes(file: Path) -> tuple[bytes, int, int]:
             length = struct.unpack("<Q", stream.read(8))[0] if size >= 8 else 0
             if not 2 <= length <= min(size - 8, LARGEST_HEADER):
                 raise SourceError(
-                    f"{file} is no safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
+                    f"{file} is not a safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
                     AGAIN,
                 )
             return stream.read(length), 8 + length, size
