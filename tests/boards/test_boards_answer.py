@@ -139,7 +139,7 @@ def test_only_a_policy_with_code_carries_a_count(float_bundle: Bundle, policy_di
     with pytest.raises(UsageError, match="is counted without torch"):
         carry_count(str(float_bundle.path), Context())
     (policy_dir / "workload.json").mkdir()
-    with pytest.raises(OutputError, match=r"workload\.json is none that vlatool wrote"):
+    with pytest.raises(OutputError, match=r"workload\.json was not written by vlatool"):
         carry_count(str(policy_dir), Context())
 
 

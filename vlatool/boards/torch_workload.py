@@ -187,7 +187,7 @@ def _count(torch: Any, seen: _Seen, name: str, args: Any, output: Any) -> None:
         seen.product(scores * query.shape[-1], scores, 0)
         seen.product(scores * value.shape[-1], math.prod(query.shape[:-1]) * value.shape[-1], 0)
     elif name == "cat":
-        seen.tally.concat(found=True)
+        seen.tally.concat(concatenates=True)
 
 
 def _weights(torch: Any, tensor: Any) -> int:
