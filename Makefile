@@ -12,7 +12,9 @@ ARM64 ?=
 LADDER ?=
 FOREIGN ?= --guides
 
-.PHONY: foreign gate peers python310 arm64 ladder help install demo test check robot docs format clean metaworld
+RUNTIME_WHEEL := $(OUT)/wheels/vlatool_runtime-*.whl
+
+.PHONY: wheels foreign gate peers python310 arm64 ladder help install demo test check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -39,18 +41,24 @@ metaworld: $(BIN)/vlatool  ## install what the sample policy vla-metaworld needs
 test: $(VENV)/.dev  ## run the tests with coverage
 	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto
 
-check: $(VENV)/.dev  ## lint, format, types, layers, docs equal code
+check: $(VENV)/.dev  ## lint, format, types, layers, docs that match the code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python docs/generate.py --check
+	$(BIN)/python docs/check.py
 
-robot: $(BIN)/vlatool  ## run an int8 bundle as a robot would: Python 3.10, onnxruntime 1.23, numpy, nothing else
+wheels: $(BIN)/vlatool  ## build both distributions: vlatool, and vlatool-runtime for robots
+	rm -rf $(OUT)/wheels
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps -w $(OUT)/wheels . ./robot
+
+robot: wheels  ## run an int8 bundle as a robot would: Python 3.10, vlatool-runtime, onnxruntime 1.23, nothing else
 	$(BIN)/vlatool quantize sample_models/vln-babyai -o $(OUT)/robot/bundle --force
 	@test -x $(OUT)/robot/venv/bin/python || $(PYTHON310) -m venv $(OUT)/robot/venv
-	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 numpy
-	PYTHONPATH=. $(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
+	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 $(RUNTIME_WHEEL)
+	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(RUNTIME_WHEEL)
+	$(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
 
 python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundle under Python 3.10, without torch
 	$(BIN)/vlatool export sample_models/vln-babyai -o $(OUT)/python310/bundle --force

@@ -72,7 +72,7 @@ def gate_page() -> str:
     off = [
         f"`{name}`" for name, field in config.Gate.model_fields.items() if field.default is None and name != "baseline"
     ]
-    parts = [f"# gate.yaml\n\n{top}\none that is null is not examined. Null when nothing is said: {', '.join(off)}.\n"]
+    parts = [f"# gate.yaml\n\n{top}\na claim that is null is not examined. Null by default: {', '.join(off)}.\n"]
     for claim in (
         config.LatencyClaim,
         config.AccuracyClaim,
@@ -82,10 +82,8 @@ def gate_page() -> str:
     ):
         names = [name for name, field in config.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
         parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")
-    told = config.Gate.model_fields["accept"].description
-    parts.append(
-        f"## accept\n\n`accept: [engine-difference]`: {told}; see `vlatool inspect`. None when nothing is said.\n"
-    )
+    meaning = config.Gate.model_fields["accept"].description
+    parts.append(f"## accept\n\n`accept: [engine-difference]`: {meaning}; see `vlatool inspect`. None by default.\n")
     return "\n".join(parts)
 
 
@@ -149,8 +147,8 @@ def report_page() -> str:
         "Every command that measures writes one (`-o DIRECTORY`, or `--json` on stdout). "
         "[report.schema.json](report.schema.json) is its JSON Schema (draft 2020-12), made from the same classes: "
         "`check-jsonschema --schemafile docs/reference/report.schema.json report.json`.\n\n"
-        "A number that could not be had is null, and the note beside it says why. Within schema 1 a later version may "
-        "add keys at the top level, which readers pass over; rows, measurements and findings have these keys only."
+        "A number that could not be measured is null, and the note beside it says why. Within schema 1 a later version "
+        "may add keys at the top level, which readers ignore; rows, measurements and findings have these keys only."
     )
     return f"{head}\n\n{about}\n{rest}"
 
@@ -176,8 +174,8 @@ def output_schema_page() -> str:
         "commands": COMMANDS,
     }
     defs = definitions(json.loads(schema_page()))
-    told = dict.fromkeys(["failed", *(name for names in COMMANDS.values() for name in names)])
-    any_of = [{"$ref": f"#/$defs/{name}"} for name in told]
+    documents = dict.fromkeys(["failed", *(name for names in COMMANDS.values() for name in names)])
+    any_of = [{"$ref": f"#/$defs/{name}"} for name in documents]
     return json.dumps({**head, "anyOf": any_of, "$defs": defs}, indent=1) + "\n"
 
 
@@ -191,17 +189,17 @@ def json_page() -> str:
 JSON_ABOUT = """
     # --json
 
-    Every command takes `--json`, and then standard output holds one JSON document: when it ends well, when it fails,
-    when an option is wrong, and on Ctrl-C. Whatever else is printed meanwhile, by a policy, its libraries or the
-    processes that they start, goes to standard error.
+    Every command takes `--json`; standard output then holds one JSON document: on success, on failure, on a wrong
+    option, and on Ctrl-C. Anything else that is printed meanwhile, by a policy, its libraries or the processes that
+    they start, goes to standard error.
 
-    A command that ends with another exit code than 0 has the key `error`: `type` (a class of [errors](errors.md),
-    `OSError`, `MemoryError`, `Interrupted`, `Terminated` or `InternalError`), `message`, `fix` (what to do; may be
-    empty) and `exit_code`. It stands alone, or beside what was found out all the same, such as the report of a gate
+    The document of a command that exits with a code other than 0 has the key `error`: `type` (a class of
+    [errors](errors.md), `OSError`, `MemoryError`, `Interrupted`, `Terminated` or `InternalError`), `message`, `fix`
+    (what to do; may be empty) and `exit_code`. It stands alone, or next to a result, such as the report of a gate
     that fails: `vlatool gate CANDIDATE --json | jq -r '.error.fix // "pass"'`.
 
-    A number that could not be had is null. A report's raw samples are left out (a benchmark has megabytes of them);
-    `raw_samples` says how many they are and which `report.json` keeps them, and `--raw` prints them.
+    A number that could not be measured is null. A report's raw samples are left out (a benchmark has megabytes of
+    them); `raw_samples` says how many there are and which `report.json` keeps them, and `--raw` prints them.
 
     [output.schema.json](output.schema.json) is the JSON Schema (draft 2020-12); the document of a command is its
     `$defs/NAME`, and `$defs/failed` where an error stands alone.
@@ -230,9 +228,9 @@ def _object(kind: Any, also_required: Sequence[str] = ()) -> dict[str, Any]:
     hints = typing.get_type_hints(kind)
     properties, required = {}, list(also_required)
     for field in dataclasses.fields(kind):
-        found = {"enum": list(WORDS[field.name])} if field.name in WORDS else _type(hints[field.name])
+        schema = {"enum": list(WORDS[field.name])} if field.name in WORDS else _type(hints[field.name])
         meaning = meanings.get(field.name, "").replace("``", "")
-        properties[field.name] = {**NARROWER.get(field.name, found), **({"description": meaning} if meaning else {})}
+        properties[field.name] = {**NARROWER.get(field.name, schema), **({"description": meaning} if meaning else {})}
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             required.append(field.name)
     return {
@@ -276,7 +274,7 @@ def _described(kind: Any) -> tuple[str, dict[str, str]]:
 
 def errors_page() -> str:
     """Return the tree of errors and the exit codes."""
-    signals = "130: interrupted by Ctrl-C. 143 and 129: ended by SIGTERM or SIGHUP. What was begun is removed."
+    signals = "130: interrupted by Ctrl-C. 143 and 129: ended by SIGTERM or SIGHUP. Unfinished output is removed."
     return f"# Errors and exit codes\n\n```\n{inspect.cleandoc(errors.__doc__ or '')}\n```\n\n{signals}\n"
 
 

@@ -20,6 +20,7 @@ EXIT_CODES = {
     "RecipeError": 3,
     "OutputError": 3,
     "TargetError": 3,
+    "InstallationError": 3,
     "PluginError": 3,
     "MissingExtra": 4,
     "GateFailed": 1,

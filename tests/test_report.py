@@ -119,7 +119,7 @@ def test_a_key_of_a_later_vlatool_is_passed_over():
     ],
 )
 def test_text_that_is_no_report(text):
-    with pytest.raises(DataError, match="no vlatool report"):
+    with pytest.raises(DataError, match="not a vlatool report"):
         Report.from_json(text)
 
 
@@ -133,7 +133,7 @@ def test_a_report_is_found_by_file_or_directory(tmp_path: Path, place: str):
 
 
 def test_no_report(tmp_path: Path):
-    with pytest.raises(DataError, match="There is no report at"):
+    with pytest.raises(DataError, match="No report at"):
         read_report(tmp_path)
 
 

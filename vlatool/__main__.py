@@ -1,5 +1,29 @@
 """``python -m vlatool``."""
 
-from vlatool.cli import main
+import sys
 
+from vlatool.errors import DISTRIBUTION, MissingExtra
+
+
+def without_command_line(module: str) -> MissingExtra:
+    """Say what the command line lacks, where it cannot be imported.
+
+    Args:
+        module: The module that is absent.
+    """
+    if DISTRIBUTION != "vlatool":
+        why = f"{DISTRIBUTION} loads and runs bundles; the command line is in vlatool."
+        fix = "pip install vlatool on another machine; its vlatool benchmark --target measures on this one through ssh"
+        return MissingExtra(why, fix)
+    return MissingExtra(f"The command line needs the package '{module}'.", "pip install vlatool, without --no-deps")
+
+
+try:
+    from vlatool.cli import main
+except ModuleNotFoundError as error:
+    if DISTRIBUTION == "vlatool" and str(error.name).startswith("vlatool."):
+        raise
+    refused = without_command_line(str(error.name))
+    sys.stderr.write(f"{refused}\n")
+    sys.exit(refused.exit_code)
 main()

@@ -1,8 +1,8 @@
 """The tree of user faults: what was wrong, what to do, and the exit code.
 
 VlatoolError                 70  our bug, unless a subclass says otherwise
-├── UsageError                2  the command line or call makes no sense
-├── InputError                3  something that was handed in is bad
+├── UsageError                2  an invalid command line or call
+├── InputError                3  an input is bad
 │   ├── BundleError              a bundle directory: missing, corrupt, half, too new
 │   ├── SpecError                a policy spec: names, shapes, dtypes, statistics
 │   ├── SourceError              a policy source: factory, weights, ONNX file
@@ -12,6 +12,7 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the place to write to: exists, read-only, full
 │   ├── TargetError              the machine that a benchmark should run on: unreachable, or it ends
+│   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
 ├── MissingExtra              4  an optional dependency is absent; names the extra
 ├── GateFailed                1  measured, and outside the limits
@@ -25,7 +26,12 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from types import ModuleType
+
+HERE = Path(__file__).parent
+DISTRIBUTION = "vlatool" if (HERE / "cli").is_dir() else "vlatool-runtime"
+"""What pip calls this installation: all of vlatool, or what a robot needs alone, which has no command line."""
 
 
 class VlatoolError(Exception):
@@ -52,13 +58,13 @@ class VlatoolError(Exception):
 
 
 class UsageError(VlatoolError):
-    """The command line or the call makes no sense."""
+    """The command line or the call is invalid."""
 
     exit_code = 2
 
 
 class InputError(VlatoolError):
-    """Something that was handed in is missing, corrupt or of the wrong kind."""
+    """An input is missing, corrupt or of the wrong kind."""
 
     exit_code = 3
 
@@ -99,6 +105,10 @@ class TargetError(InputError):
     """The machine that a benchmark should run on cannot be reached or used, or what runs there ends."""
 
 
+class InstallationError(InputError):
+    """Two distributions of vlatool are installed in one environment, each with files of the other."""
+
+
 class PluginError(InputError):
     """Another package that adds something to vlatool cannot be imported, or fails."""
 
@@ -122,7 +132,7 @@ class Inconclusive(VlatoolError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a sentence part that lists what is known, with the nearest name first.
+    """Return part of a sentence that lists what is known, with the nearest name first.
 
     Example:
         >>> nearest("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
@@ -134,8 +144,34 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean '{hits[0]}'? {listing}" if hits else listing
 
 
+def install(extra: str, distribution: str = DISTRIBUTION) -> str:
+    """Return the command that installs an extra of vlatool.
+
+    Example:
+        >>> install("ort")
+        "pip install 'vlatool[ort]'"
+    """
+    return f"pip install '{distribution}[{extra}]'"
+
+
+def refuse_two_distributions(packages: Path = HERE.parent) -> None:
+    """Refuse to go on where vlatool and vlatool-runtime are installed side by side: they own the same files.
+
+    Args:
+        packages: The folder that vlatool is installed in.
+
+    Raises:
+        InstallationError: when both are.
+    """
+    if all(any(packages.glob(f"{name}-*.dist-info")) for name in ("vlatool", "vlatool_runtime")):
+        raise InstallationError(
+            f"Both vlatool and vlatool-runtime are installed in {packages}; either has files of the other.",
+            "pip uninstall -y vlatool vlatool-runtime, then pip install vlatool-runtime on a robot, vlatool elsewhere",
+        )
+
+
 def require_present(module: str, extra: str) -> None:
-    """Say which extra provides a module that is absent, without importing it.
+    """Raise for a module that is absent, without importing it; names the extra that provides it.
 
     Raises:
         MissingExtra: when the module is not installed.
@@ -145,13 +181,11 @@ def require_present(module: str, extra: str) -> None:
     except ImportError:
         absent = True
     if absent or sys.modules.get(module, ...) is None:
-        raise MissingExtra(
-            f"This needs the package '{module}', which the extra '{extra}' provides.", f"pip install 'vlatool[{extra}]'"
-        )
+        raise MissingExtra(f"This needs the package '{module}', which the extra '{extra}' provides.", install(extra))
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import ``module``, or say which extra provides it.
+    """Import ``module``; where that fails, name the extra that provides it.
 
     Raises:
         MissingExtra: when the module is not installed.
@@ -163,9 +197,9 @@ def require(module: str, extra: str) -> ModuleType:
         if error.name is not None and error.name.partition(".")[0] != top:
             raise MissingExtra(
                 f"'{module}' is installed, but '{error.name}', which it needs, is not.",
-                f"pip install 'vlatool[{extra}]'",
+                install(extra),
             ) from error
         raise MissingExtra(
             f"This needs the package '{top}', which the extra '{extra}' provides.",
-            f"pip install 'vlatool[{extra}]'",
+            install(extra),
         ) from error

@@ -1,4 +1,4 @@
-"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or what another package brings; loads only what is named.
+"""(kind, name) -> the class in ``vlatool/<kind>/<name>.py``, or what another package adds; loads only what is named.
 
 One thing, one file, found by its file name: there is no list to edit. A file whose name starts with ``_`` is a shared
 part of its folder, not an entry. Another package adds an entry by an entry point of the group ``vlatool.<kind>``
@@ -17,7 +17,10 @@ from types import ModuleType
 
 from vlatool.errors import PluginError, UsageError, VlatoolError, nearest
 
-PACKAGES = {"engines": "vlatool.runtime.engines", "commands": "vlatool.cli"}
+PACKAGES = {
+    "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
+    "sections": "vlatool.render.sections",
+}  # fmt: skip
 """Kind -> the package that holds its files, where that has another name."""
 NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",
@@ -31,6 +34,11 @@ _FOREIGN: dict[type, str] = {}
 def package_of(kind: str) -> str:
     """Return the package that holds the files of ``kind`` (``"engines"`` live in the runtime)."""
     return PACKAGES.get(kind, f"vlatool.{kind}")
+
+
+def noun_of(kind: str) -> str:
+    """Return what an entry of a kind is called in messages."""
+    return NOUNS.get(kind, kind.removesuffix("s"))
 
 
 def names(kind: str) -> list[str]:
@@ -47,71 +55,70 @@ def names(kind: str) -> list[str]:
 def plugins(kind: str) -> dict[str, metadata.EntryPoint]:
     """Return what other packages add to a kind: name -> entry point. A name that vlatool has itself is not taken."""
     own = _own(kind)
-    found = {entry.name.replace("-", "_"): entry for entry in metadata.entry_points(group=f"vlatool.{kind}")}
-    return {name: entry for name, entry in found.items() if name not in own}
+    entries = {entry.name.replace("-", "_"): entry for entry in metadata.entry_points(group=f"vlatool.{kind}")}
+    return {name: entry for name, entry in entries.items() if name not in own}
 
 
 def module(kind: str, name: str) -> ModuleType:
     """Import the file of one entry.
 
     Raises:
-        UsageError: when there is no such entry; names the nearest one.
-        PluginError: when another package brings it, and cannot be imported.
+        UsageError: for an unknown entry; suggests the nearest one.
+        PluginError: when another package adds it, and cannot be imported.
     """
-    wanted = name.replace("-", "_")
-    if wanted in _own(kind):
-        return importlib.import_module(f"{package_of(kind)}.{wanted}")
-    if wanted not in plugins(kind):
-        noun = NOUNS.get(kind, kind.removesuffix("s"))
-        raise UsageError(f"Unknown {noun} '{name}'; {nearest(wanted, names(kind))}.")
-    entry = plugins(kind)[wanted]
+    own_name = name.replace("-", "_")
+    if own_name in _own(kind):
+        return importlib.import_module(f"{package_of(kind)}.{own_name}")
+    if own_name not in plugins(kind):
+        raise UsageError(f"Unknown {noun_of(kind)} '{name}'; {nearest(own_name, names(kind))}.")
+    entry = plugins(kind)[own_name]
     try:
         return importlib.import_module(entry.module)
     except VlatoolError:
         raise
-    except Exception as error:  # the seam: another package's code raises what it likes
-        raise _blamed(entry, f"cannot be imported: {type(error).__name__}: {error}") from error
+    except Exception as error:  # the seam: another package's code may raise anything
+        raise _plugin_error(entry, f"cannot be imported: {type(error).__name__}: {error}") from error
 
 
 def load(kind: str, name: str) -> type:
     """Return the one public class that the file of an entry defines, or that an entry point names.
 
     Raises:
-        UsageError: when there is no such entry.
-        PluginError: when another package brings it, and it is no such class.
+        UsageError: for an unknown entry.
+        PluginError: when another package adds it, and it is not such a class.
         TypeError: when the file defines no public class, or several (a fault of the file).
     """
     source = module(kind, name)
-    wanted = name.replace("-", "_")
-    entry = plugins(kind)[wanted] if source.__name__ != f"{package_of(kind)}.{wanted}" else None
+    own_name = name.replace("-", "_")
+    entry = plugins(kind)[own_name] if source.__name__ != f"{package_of(kind)}.{own_name}" else None
     if entry is None:
         return _only_class(source)
     try:
-        found = getattr(source, entry.attr) if entry.attr else _only_class(source)
-        if not inspect.isclass(found):
-            raise TypeError(f"{entry.value} is no class")
+        entry_class = getattr(source, entry.attr) if entry.attr else _only_class(source)
+        if not inspect.isclass(entry_class):
+            raise TypeError(f"{entry.value} is not a class")
     except (AttributeError, TypeError) as error:
-        raise _blamed(entry, f"does not name a class: {error}") from error
-    _FOREIGN[found] = f"{kind}.{wanted}"
-    return found
+        raise _plugin_error(entry, f"does not name a class: {error}") from error
+    _FOREIGN[entry_class] = f"{kind}.{own_name}"
+    return entry_class
 
 
-def entry_of(found: type) -> str:
+def entry_of(entry_class: type) -> str:
     """Return ``kind.name`` of a class that ``load`` returned, or of one in a file of its kind."""
-    return _FOREIGN.get(found) or ".".join(found.__module__.split(".")[-2:])
+    return _FOREIGN.get(entry_class) or ".".join(entry_class.__module__.split(".")[-2:])
 
 
 def all_plugins() -> dict[str, list[str]]:
     """Return other package (``acme 1.2``) -> what it adds, as ``kind.name``."""
-    found: dict[str, list[str]] = {}
+    added: dict[str, list[str]] = {}
     for group in sorted(metadata.entry_points().groups):
         for entry in plugins(group.partition(".")[2]).values() if group.startswith("vlatool.") else ():
-            found.setdefault(_title(entry), []).append(f"{group.partition('.')[2]}.{entry.name}")
-    return found
+            added.setdefault(_title(entry), []).append(f"{group.partition('.')[2]}.{entry.name}")
+    return added
 
 
 def owner(module_name: str) -> str:
-    """Return which other package brings a module (``acme 1.2``); empty for vlatool's own, and for any that brings none.
+    """Return which other package a module is from (``acme 1.2``); empty for vlatool's own, and for any that adds none.
 
     Args:
         module_name: Of any module of that package.
@@ -126,8 +133,8 @@ def _own(kind: str) -> list[str]:
     spec = importlib.util.find_spec(package_of(kind))
     if spec is None or spec.submodule_search_locations is None:
         return []
-    found = pkgutil.iter_modules(spec.submodule_search_locations)
-    return sorted(each.name for each in found if not each.name.startswith("_"))
+    files = pkgutil.iter_modules(spec.submodule_search_locations)
+    return sorted(file.name for file in files if not file.name.startswith("_"))
 
 
 def _only_class(source: ModuleType) -> type:
@@ -145,8 +152,8 @@ def _title(entry: metadata.EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
 
 
-def _blamed(entry: metadata.EntryPoint, what: str) -> PluginError:
+def _plugin_error(entry: metadata.EntryPoint, what: str) -> PluginError:
     return PluginError(
-        f"The package {_title(entry)}, which brings '{entry.name}' ({entry.group}), {what}.",
-        "tell its authors, or uninstall it",
+        f"The package {_title(entry)}, which adds '{entry.name}' ({entry.group}), {what}.",
+        "report it to its authors, or uninstall it",
     )

@@ -91,15 +91,12 @@ class Row:
 
     def get(self, name: str, origin: str = "measured") -> Measurement | None:
         """Return the measurement of that name and origin, or None."""
-        for measurement in self.measurements:
-            if measurement.name == name and measurement.origin == origin:
-                return measurement
-        return None
+        return next((item for item in self.measurements if (item.name, item.origin) == (name, origin)), None)
 
     def value(self, name: str) -> float:
         """Return a measured value, NaN when it is not there."""
-        found = self.get(name)
-        return found.value if found else math.nan
+        measurement = self.get(name)
+        return measurement.value if measurement else math.nan
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """What a command found out.
+    """What a command measured, predicted and decided.
 
     Args:
         kind: ``benchmark``, ``evaluate``, ``optimize``, ``compare``, ``hwselect`` or ``gate``.
@@ -172,7 +169,7 @@ class Report:
         """Read what ``to_json`` wrote.
 
         Raises:
-            DataError: when the text is no report, or of a newer schema.
+            DataError: when the text is not a report, or of a newer schema.
         """
         try:
             data = json.loads(text)
@@ -188,7 +185,7 @@ class Report:
             values["findings"] = tuple(Finding(**item) for item in data.get("findings", ()))
             return cls(**values)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise DataError(f"This is no vlatool report: {error}.") from error
+            raise DataError(f"This is not a vlatool report: {error}.") from error
 
 
 def read_report(path: Path) -> Report:
@@ -203,7 +200,7 @@ def read_report(path: Path) -> Report:
                 return Report.from_json(candidate.read_text(encoding="utf-8"))
             except (OSError, UnicodeDecodeError) as error:
                 raise DataError(f"The report {candidate} cannot be read: {error}.") from error
-    raise DataError(f"There is no report at {path}.", "name a report.json, or a directory that holds one")
+    raise DataError(f"No report at {path}.", "name a report.json, or a directory that holds one")
 
 
 def _row(data: Mapping[str, Any]) -> Row:

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +13,13 @@ from pydantic import ValidationError
 from vlatool.benchmark.latency import Latency, processors
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, ProfileError, UsageError
+from vlatool.files.messages import from_json, to_json
 from vlatool.graph.workload import workload
-from vlatool.measurement.cold_start import cold_start, main
+from vlatool.measurement.cold_start import ColdStart, cold_start, run
 from vlatool.measurement.interleaved import BLOCKS, Contestant, latency_measurements, speedup, unique_names
+from vlatool.measurement.jobs import ColdStartJob, LatencyJob
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
 from vlatool.stage.base import Context
-
-PROBED = {"import_ms", "engine_ms", "load_ms", "first_ms", "peak_rss_mb", "rss_mb"}
 
 
 def names(row):
@@ -118,7 +119,7 @@ def test_the_further_bundles_belong_to_the_key_and_are_opened_first(float_bundle
     assert stage.inputs() == (int8_bundle.path / "manifest.json",)
     assert stage.key("a") != Latency().key("a")
     assert stage.key("a") == stage.key("a") != stage.key("b")
-    with pytest.raises(BundleError, match="There is no bundle"):
+    with pytest.raises(BundleError, match="No bundle"):
         Latency(against=(tmp_path / "none",)).check(float_bundle, None)
 
 
@@ -170,28 +171,32 @@ def test_a_percentile_needs_enough_samples_for_its_upper_bound(count, wanted):
 # ---- the probe
 
 
+def probe_of(bundle):
+    return ColdStartJob(str(bundle.path), "ort_cpu", 1, time.monotonic_ns())
+
+
 def test_the_probe_runs_in_a_fresh_process(int8_bundle):
     found = cold_start(int8_bundle.path, "ort_cpu", 1)
-    assert set(found) == PROBED | {"start_ms", "total_ms"}
-    assert all(value > 0 for name, value in found.items() if name != "rss_mb")
-    assert list(found["rss_mb"]) == ["interpreter", "imported", "engine", "loaded", "first", "more"]
-    assert 0 < found["rss_mb"]["interpreter"] < found["rss_mb"]["loaded"] <= found["peak_rss_mb"] + 1
-    assert found["total_ms"] > found["start_ms"] + found["import_ms"] + found["load_ms"]
+    assert all(value > 0 for name, value in vars(found).items() if name != "rss_mb")
+    assert list(found.rss_mb) == ["interpreter", "imported", "engine", "loaded", "first", "more"]
+    assert 0 < found.rss_mb["interpreter"] < found.rss_mb["loaded"] <= found.peak_rss_mb + 1
+    assert found.total_ms > found.start_ms + found.import_ms + found.load_ms
 
 
 def test_the_probe_prints_one_line_of_json(int8_bundle):
-    command = [sys.executable, "-m", "vlatool.measurement.cold_start", str(int8_bundle.path), "ort_cpu", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert set(json.loads(done.stdout)) == PROBED | {"begun_ns", "acted_ns"}
+    command = [sys.executable, "-m", "vlatool.measurement.cold_start"]
+    line = json.dumps(to_json(probe_of(int8_bundle)))
+    done = subprocess.run(command, input=line, capture_output=True, text=True, check=True)
+    assert from_json(ColdStart, json.loads(done.stdout)["result"]["value"]).peak_rss_mb > 0
 
 
 def test_the_probe_says_why_a_bundle_does_not_run(tmp_path):
-    with pytest.raises(BundleError, match=r"There is no bundle at .*none"):
+    with pytest.raises(BundleError, match=r"No bundle at .*none"):
         cold_start(tmp_path / "none", "ort_cpu", 1)
 
 
 def test_the_probe_in_this_process(float_bundle):
-    assert set(main([str(float_bundle.path), "ort_cpu", "1"])) == PROBED | {"begun_ns", "acted_ns"}
+    assert run(probe_of(float_bundle)).first_ms > 0
 
 
 def test_a_bundle_without_golden_values_is_probed_on_another_observation(float_bundle, copied):
@@ -199,9 +204,9 @@ def test_a_bundle_without_golden_values_is_probed_on_another_observation(float_b
 
     bare = copied(float_bundle)
     seal(bare.path, replace(bare.manifest, golden=""))
-    found = main([str(bare.path), "ort_cpu", "1"])
-    assert "first" in found["rss_mb"]
-    assert found["first_ms"] > 0
+    found = run(probe_of(bare))
+    assert "first" in found.rss_mb
+    assert found.first_ms > 0
 
 
 def test_the_peak_of_memory_is_the_processs_own(tmp_path):
@@ -256,8 +261,8 @@ def test_an_invalid_measurement_decides_nothing(float_bundle, monkeypatch):
 
     def strays(job, tell):
         found = honest(job, tell)
-        found["policies"][0]["answers"]["strays"] = 7
-        return found
+        policy = found.policies[0]
+        return replace(found, policies=(replace(policy, answers=replace(policy.answers, strays=7)),))
 
     monkeypatch.setattr(agent, "measure", strays)
     report = benchmarked(float_bundle)
@@ -288,13 +293,12 @@ def test_a_board_is_emulated_with_its_processors_and_memory(float_bundle):
 
 def test_a_job_runs_elsewhere_where_the_context_says_so(float_bundle):
     from vlatool.measurement.agent import measure
-    from vlatool.measurement.job import Job
 
     asked = []
 
     def elsewhere(job, bundles, tell):
         asked.append((job, bundles))
-        return {**measure(Job.from_dict(job), tell), "target": {"python": "3.10"}}
+        return {**to_json(measure(from_json(LatencyJob, job), tell)), "target": {"python": "3.10"}}
 
     report = benchmarked(float_bundle, Context(elsewhere=elsewhere))
     assert asked[0][1] == [float_bundle.path]
@@ -327,10 +331,10 @@ def test_processors_are_read_as_lists_of_ranges(text, wanted):
 
 def test_what_the_engine_logs_is_kept(float_bundle):
     from vlatool.measurement.agent import measure
-    from vlatool.measurement.job import Job
 
     def elsewhere(job, bundles, tell):
-        return {**measure(Job.from_dict(job), tell), "log": "".join(f"warning {number}\n" for number in range(50))}
+        log = "".join(f"warning {number}\n" for number in range(50))
+        return {**to_json(measure(from_json(LatencyJob, job), tell)), "log": log}
 
     lines = benchmarked(float_bundle, Context(elsewhere=elsewhere)).rows[0].details["log"]
     assert [line["line"] for line in lines] == [f"warning {number}" for number in range(10, 50)]

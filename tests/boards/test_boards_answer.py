@@ -31,7 +31,7 @@ from vlatool.hardware.profile import load_profile, names
 from vlatool.latency_model.model import shipped
 from vlatool.machine.host import cache_directory
 from vlatool.prune.magnitude import Magnitude
-from vlatool.render._boards import limit_ms
+from vlatool.render.sections.boards import limit_ms
 from vlatool.stage.base import Context
 from vlatool.stage.run import run_transform
 
@@ -139,7 +139,7 @@ def test_only_a_policy_with_code_carries_a_count(float_bundle: Bundle, policy_di
     with pytest.raises(UsageError, match="is counted without torch"):
         carry_count(str(float_bundle.path), Context())
     (policy_dir / "workload.json").mkdir()
-    with pytest.raises(OutputError, match=r"workload\.json is none that vlatool wrote"):
+    with pytest.raises(OutputError, match=r"workload\.json was not written by vlatool"):
         carry_count(str(policy_dir), Context())
 
 

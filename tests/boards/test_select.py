@@ -106,7 +106,7 @@ def test_memory_that_may_not_suffice_says_so(chosen: Callable[..., Choice], load
     middle, low, high = (each / 1e3 for each in found.outcome.memory_mb)
     assert low < middle < 1.5 < high
     assert found.state == "may fit"
-    assert found.reason == f"memory may not suffice: about {middle:.1f} GB ({low:.1f}-{high:.1f}), 1.5 usable"
+    assert found.reason == f"memory may be too small: about {middle:.1f} GB ({low:.1f}-{high:.1f}), 1.5 usable"
     found = chosen(PI, work, memory_gb=(low + middle) / 2, precisions=("float32",))
     assert found.state == "no"
     assert found.reason.startswith(f"needs about {middle:.1f} GB ({low:.1f}-{high:.1f})")
@@ -170,7 +170,7 @@ def test_a_rented_machine_is_not_ruled_out_by_what_its_card_costs(chosen: Callab
 
 
 def test_nothing_to_choose_from_is_refused(certain: LatencyModel, load: Load) -> None:
-    with pytest.raises(ProfileError, match="no board to choose from"):
+    with pytest.raises(ProfileError, match="No boards to choose from"):
         choose([], load(), certain, Wants())
 
 

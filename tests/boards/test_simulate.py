@@ -55,7 +55,7 @@ def test_the_time_line_runs_from_begin_to_end(outcome: Outcome, certain: Latency
     assert first.startswith("prefix")
     assert f" {outcome.phases[0].ms:.3g} ms" in first
     assert "compute" in first
-    assert f"10x{outcome.phases[1].each.ms:.3g}" in second
+    assert f"10x{outcome.phases[1].once.ms:.3g}" in second
     assert "memory" in second
     assert first.index("█") == 17
     assert abs(second.index("█") - first.rindex("█") - 1) <= 1, "one begins where the other ends"
@@ -68,7 +68,7 @@ def test_changes_are_predicted_for_the_same_board(certain: LatencyModel, policy:
         f"{precision} in the place of float32" for precision in ("int8", "w8", "w4")
     ]
     assert found["step: 5 steps in the place of 10"].latency.ms == pytest.approx(
-        outcome.latency.ms - 5 * outcome.phases[1].each.ms
+        outcome.latency.ms - 5 * outcome.phases[1].once.ms
     )
     assert found["int8 in the place of float32"].memory_mb[0] < outcome.memory_mb[0]
     smaller = found["images of 0.7 of the side, where prefix works on image tokens alone"]

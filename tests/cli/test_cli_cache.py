@@ -48,7 +48,7 @@ def test_what_is_no_cache_is_told(vlatool, tmp_path, command) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     code, out, err = vlatool("cache", *command, "--cache", tmp_path)
     assert (code, out) == (3, "")
-    assert f"{tmp_path} is no cache" in err
+    assert f"{tmp_path} is not a cache" in err
 
 
 def test_json_of_size_list_and_prune(vlatool, cache) -> None:
@@ -75,14 +75,14 @@ def test_prune_removes_what_was_asked_for(vlatool, cache, asked, removed) -> Non
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [
-        ([], 2, "Say what to remove"),
-        (["--all", "--max-size", "1GB"], 2, "Say what to remove"),
+        ([], 2, "Nothing is chosen for removal"),
+        (["--all", "--max-size", "1GB"], 2, "Nothing is chosen for removal"),
         (["--older-than", "30"], 2, "--older-than is '30'; it must be a number and a unit, such as 30d"),
         (["--older-than", "-3d"], 2, "it must be a number and a unit"),
         (["--older-than", "3y"], 2, "--older-than is '3y'"),
         (["--max-size", "5 apples"], 2, "--max-size is '5 apples'"),
         (["--max-size", "nan"], 2, "--max-size is 'nan'"),
-        (["--all", "--cache", "/no/such/place"], 3, "There is no directory /no/such/place"),
+        (["--all", "--cache", "/no/such/place"], 3, "No such directory: /no/such/place"),
     ],
 )
 def test_wrong_values_are_told(vlatool, cache, line, code, says) -> None:

@@ -16,7 +16,7 @@ import pytest
 from vlatool import __version__, cli, registry
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import main
-from vlatool.cli._console import command_line, leave, progress
+from vlatool.cli._console import command_line, progress, raise_verdict
 from vlatool.cli._stages import DEFAULTS
 from vlatool.cli.optimize import share
 from vlatool.errors import GateFailed, GraphError, Inconclusive, UsageError
@@ -239,7 +239,7 @@ def test_a_probe_ends_as_load_would(vlatool, float_bundle, copied, also):
     code, out, err = vlatool("inspect", bundle.path, "--probe", *also)
     assert code == 3
     assert "golden error 0.67 (allowed 0.01), in physical units " in out or also
-    assert "another golden action than recorded: relative error 0.667, allowed 0.01." in err
+    assert "a different golden action than recorded: relative error 0.667, allowed 0.01." in err
     with pytest.raises(GraphError) as caught:
         load(bundle.path)
     assert caught.value.message in err
@@ -344,15 +344,15 @@ def test_reports_are_put_side_by_side(vlatool, tmp_path):
 @pytest.mark.parametrize(("verdict", "error", "code"), [("fail", GateFailed, 1), ("inconclusive", Inconclusive, 5)])
 def test_a_bad_verdict_leaves_with_its_status_and_its_first_sentence(verdict, error, code):
     with pytest.raises(error, match="The first sentence") as caught:
-        leave(Report("evaluate", "t", verdict, summary=("The first sentence.", "another")))
+        raise_verdict(Report("evaluate", "t", verdict, summary=("The first sentence.", "another")))
     assert caught.value.exit_code == code
     with pytest.raises(error):
-        leave(Report("evaluate", "t", verdict))
+        raise_verdict(Report("evaluate", "t", verdict))
 
 
 @pytest.mark.parametrize("verdict", ["pass", "info"])
 def test_a_good_verdict_leaves_quietly(verdict):
-    leave(Report("evaluate", "t", verdict))
+    raise_verdict(Report("evaluate", "t", verdict))
 
 
 # ---- machine, boards, samples

@@ -147,8 +147,8 @@ def test_reports_that_cannot_be_compared(compared, other, code, said):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{", "This is no vlatool report"),
-        ("", "This is no vlatool report"),
+        ("{", "This is not a vlatool report"),
+        ("", "This is not a vlatool report"),
         (json.dumps({**json.loads(made().to_json()), "schema": 9}), "upgrade vlatool"),
     ],
 )

@@ -13,7 +13,7 @@ from vlatool.gate import run, timed
 from vlatool.measurement.agreement import run_agreement
 from vlatool.measurement.pairs import Pairs
 
-QUICK = "{latency: {looks: [10]}, memory: null}"
+QUICK = "{latency: {interim_analyses: [10]}, memory: null}"
 
 
 @pytest.fixture
@@ -101,7 +101,9 @@ def test_a_job_of_github_gets_annotations_and_a_summary(
 def test_the_margin_and_the_gate_of_the_directory(vlatool, float_bundle, slowdown, tmp_path, monkeypatch) -> None:
     slowdown(0.3)
     monkeypatch.chdir(tmp_path)
-    Path("gate.yaml").write_text(f"{{baseline: {float_bundle.path}, latency: {{looks: [10]}}, memory: null}}")
+    Path("gate.yaml").write_text(
+        f"{{baseline: {float_bundle.path}, latency: {{interim_analyses: [10]}}, memory: null}}"
+    )
     assert vlatool("gate", float_bundle.path)[0] == 1
     assert vlatool("gate", float_bundle.path, "--margin", 0.5)[0] == 0
 
@@ -165,7 +167,7 @@ def test_init_on_a_full_disk_names_the_file_and_leaves_no_empty_folder(vlatool, 
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [
-        (["{bundle}"], 2, "There is no baseline."),
+        (["{bundle}"], 2, "No baseline to compare with."),
         (["{bundle}", "--baseline", "{tmp}/none"], 3, "fix: make one: vlatool export POLICY -o"),
         (["{bundle}", "--baseline", "{bundle}", "--margin", "inf"], 2, "--margin"),
         (["{bundle}", "--baseline", "{bundle}", "--junit", "{tmp}"], 3, "is a directory"),

@@ -49,7 +49,7 @@ def test_hwselect_ranks_boards_and_says_what_comes_next(vlatool, policy_template
     assert code == 0, err
     assert out.startswith("PASS  raspberry-pi-5 is the cheapest of ")
     assert f"vlatool optimize {policy_template} --profile raspberry-pi-5 --hz 10" in " ".join(out.split())
-    assert "Fits (predicted, not measured)" in out
+    assert "Fits: PREDICTED, not measured" in out
     assert "times as fast as needed" in out
     assert "predicting" in err
 

@@ -119,7 +119,7 @@ def test_the_wrong_call_and_the_wrong_source_have_their_own_codes(vlatool, quant
     assert "--check" in err
     code, _, err = vlatool("rebuild", quantized.path, "--check", "--source", tmp_path / "none.onnx")
     assert code == 3
-    assert "There is no ONNX file" in err
+    assert "No such ONNX file" in err
     code, _, err = vlatool("rebuild", quantized.path, "--check")
     assert code == 3
     assert "pass --source SOURCE" in err

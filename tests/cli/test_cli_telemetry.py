@@ -45,7 +45,7 @@ def test_json_has_every_sample(vlatool, jetson) -> None:
 def test_a_machine_that_tells_nothing_says_so(vlatool, tmp_path) -> None:
     code, out, _ = vlatool("telemetry", "--seconds", 0.01, "--root", tmp_path)
     assert code == 0
-    assert "throttled: nothing on this machine tells" in out
+    assert "throttled: not reported by this machine" in out
     assert " 0 W" not in out
 
 
@@ -55,7 +55,7 @@ def test_a_machine_that_tells_nothing_says_so(vlatool, tmp_path) -> None:
         (["--seconds", 0], 2, "--seconds is 0; allowed: above 0"),
         (["--seconds", "nan"], 2, "--seconds is nan"),
         (["--period", -1], 2, "--period is -1"),
-        (["--root", "/no/such/place"], 3, "There is no directory /no/such/place"),
+        (["--root", "/no/such/place"], 3, "No such directory: /no/such/place"),
         (["--seconds", "long"], 2, "valid number"),
     ],
 )

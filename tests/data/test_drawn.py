@@ -142,5 +142,5 @@ def test_a_vocabulary_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"The vocabulary .* cannot be read"):
         words_of(tmp_path / "none.json")
     (tmp_path / "t.json").write_text("[]")
-    with pytest.raises(DataError, match="is no mapping"):
+    with pytest.raises(DataError, match="is not a mapping"):
         words_of(tmp_path / "t.json")

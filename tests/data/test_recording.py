@@ -186,7 +186,7 @@ def test_named_axes_have_any_length(tmp_path: Path):
 
 
 def test_a_missing_file(tmp_path: Path):
-    with pytest.raises(DataError, match="There is no data file"):
+    with pytest.raises(DataError, match=r"Data file .* not found"):
         read_recording(tmp_path / "absent.npz", SPEC)
 
 

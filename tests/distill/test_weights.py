@@ -60,5 +60,5 @@ def test_what_does_not_fit_is_named(source_bundle: Bundle, tuned: Path, tmp_path
     tuned.write_bytes(b"no safetensors")
     with pytest.raises(SourceError, match="cannot be read as safetensors"):
         run_transform(Weights(file=tuned), source_bundle, tmp_path / "c", Context())
-    with pytest.raises(SourceError, match="There is no file"):
+    with pytest.raises(SourceError, match="No such file"):
         run_transform(Weights(file=tmp_path / "none"), source_bundle, tmp_path / "d", Context())

@@ -14,6 +14,7 @@ from vlatool.doctor.doctor import EXTRAS, Check
 from vlatool.errors import MissingExtra
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT, SATURATING
+from vlatool.runtime.engine import Engine
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
 JETSON = "NVIDIA Jetson Orin Nano Engineering Reference Developer Kit Super"
@@ -50,7 +51,7 @@ def test_int8_products_are_measured_for_every_engine(monkeypatch) -> None:
 
 def test_avx2_without_vnni_names_flags_and_the_engine_that_is_exact() -> None:
     found = doctor.instruction_set(["avx2", "fma"])
-    assert "ONNX Runtime is told to be exact" in found.finding
+    assert "ONNX Runtime is set to be exact" in found.finding
     assert {"--layout", "--reduce-range"} <= {*re.findall(r"--[a-z-]+", found.fix)}
 
 
@@ -66,6 +67,15 @@ def test_an_engine_that_is_not_installed_is_not_asked(monkeypatch) -> None:
 
     monkeypatch.setattr(doctor.registry, "load", lambda kind, name: SimpleNamespace(arithmetic=missing))
     assert list(doctor.arithmetic()) == []
+
+
+def test_an_engine_that_measures_no_products_of_its_own_is_not_known(monkeypatch) -> None:
+    class Bare(Engine):
+        package = "numpy"
+
+    monkeypatch.setattr(doctor.registry, "load", lambda kind, name: Bare)
+    (check,) = [check for check in doctor.arithmetic() if check.name == "int8 ort_cpu"]
+    assert (check.status, "not known" in check.finding) == ("warn", True)
 
 
 def test_every_check_says_something_and_names_are_unique(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.environment import World
-from vlatool.episodes.play import Job, run_jobs
+from vlatool.episodes.play import EpisodesJob, run_jobs
 from vlatool.errors import DataError
 from vlatool.stage.base import Context
 
@@ -34,7 +34,7 @@ def played(folder, bundle, old: str = "", new: str = ""):
     """Play an episode in the good world, of which a part is another; the worlds are in files of their own."""
     assert old in GOOD
     (folder / "world.py").write_text(GOOD.replace(old, new) if old else GOOD)
-    return run_jobs(bundle, [Job("world.py:make", str(folder), "reach", (7,))], "", Context())
+    return run_jobs(bundle, [EpisodesJob("world.py:make", str(folder), "reach", (7,))], "", Context())
 
 
 def test_a_good_world_is_played(tmp_path, float_bundle):

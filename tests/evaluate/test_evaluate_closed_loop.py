@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from vlatool.accuracy.outcome import Outcome
-from vlatool.accuracy.paired import compare_success, success_row
+from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.data import observations_for
 from vlatool.episodes import controls, play
-from vlatool.episodes.play import Job, run_jobs
+from vlatool.episodes.play import EpisodesJob, run_jobs
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.report import Row
@@ -205,9 +204,9 @@ def test_one_environment_is_open_at_a_time(float_bundle, int8_bundle, world):
     ("options", "error", "says"),
     [
         ({"tasks": ("raech",)}, UsageError, "There is no task 'raech'; did you mean 'reach'"),
-        ({"environment": "none.py:make"}, SourceError, "There is no file"),
+        ({"environment": "none.py:make"}, SourceError, "No such file"),
         ({"environment": "environment.py:mak"}, SourceError, "did you mean 'make'"),
-        ({"environment": "environment.py"}, SourceError, "names a file and no function"),
+        ({"environment": "environment.py"}, SourceError, "names a file but no function"),
         ({"environment": "no_such_package.module:make"}, MissingExtra, "no_such_package"),
     ],
 )
@@ -229,7 +228,7 @@ def test_without_environment_or_tasks_the_remedy_is_named(int8_bundle):
 
 
 def test_jobs_come_back_in_their_order(int8_bundle, policy_template):
-    jobs = [Job("environment.py:make", str(policy_template), task, (2, 1)) for task in ("push", "reach")]
+    jobs = [EpisodesJob("environment.py:make", str(policy_template), task, (2, 1)) for task in ("push", "reach")]
     outcomes = run_jobs(int8_bundle, jobs, "ort_cpu", Context(workers=2))
     assert [(each.task, each.seed) for each in outcomes] == [("push", 2), ("push", 1), ("reach", 2), ("reach", 1)]
 

@@ -271,7 +271,7 @@ def test_what_a_stage_found_to_be_wrong_is_said(float_bundle, copied):
 def test_what_load_refuses_is_not_evaluated(float_bundle, copied, monkeypatch):
     bundle = copied(float_bundle)
     monkeypatch.setattr(Policy, "warm_up", partialmethod(Policy.warm_up, tolerance=-1.0))
-    with pytest.raises(GraphError, match="another golden action"):
+    with pytest.raises(GraphError, match="a different golden action"):
         Recorded().run(bundle, Context())
 
 

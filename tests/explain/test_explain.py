@@ -15,7 +15,7 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.cli import app
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, GraphError
-from vlatool.explain import Options, _Found, _times, explain, explanation
+from vlatool.explain import Options, _Findings, _times, explain, explanation
 from vlatool.explain._islands import QuantizedGraph, fallbacks, timed
 from vlatool.explain._operators import GROUPS, profile, shares
 from vlatool.explain._origin import command, observations_of, origin
@@ -24,7 +24,7 @@ from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.render import render
-from vlatool.render.terminal import TerminalRenderer
+from vlatool.render.formats.terminal import TerminalRenderer
 from vlatool.report import Report
 from vlatool.runtime.policy import Policy
 from vlatool.stage.base import Context
@@ -233,7 +233,7 @@ def test_where_openvino_is_confined_float32_is_compared_in_it_too(fragile, made,
         monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", told)
         for bundle, engines in zip(bundles, wanted, strict=True):
             opened.clear()
-            found = _Found(bundle, fragile, origin(bundle), observations_of(bundle, fragile, None, 2))
+            found = _Findings(bundle, fragile, origin(bundle), observations_of(bundle, fragile, None, 2))
             _times(found, Options(runs=2), Context())
             measure(bundle, fragile, [], found.seen.values, Path(), 1, Context())
             assert (set(opened), len(opened)) == (engines, 2)

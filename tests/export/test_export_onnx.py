@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.data import recorded_observations
 from vlatool.errors import GraphError, RecipeError, SourceError, SpecError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.measurement.job import Job
+from vlatool.measurement.jobs import LatencyJob
 from vlatool.measurement.worker import measure, opened
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.quantize.static_int8 import StaticInt8
@@ -165,12 +165,12 @@ def test_eager_torch_and_the_graphs_draw_the_same_noise(source, tmp_path: Path):
     bundle = source(FLOW_PY, FLOW_YAML)
     made = export(bundle, tmp_path / "out")
     observation = {"state": np.array([0.1, -0.5, 2.0], np.float32)}
-    job = Job((str(made.path), str(bundle.path)), iterations=40, warmup=1)
+    job = LatencyJob((str(made.path), str(bundle.path)), iterations=40, warmup=1)
     contestants = [opened(path, job) for path in job.bundles]
     graphs, eager = (each.policy.infer(observation).chunk for each in contestants)
     np.testing.assert_allclose(graphs, eager, rtol=1e-4, atol=1e-6)
     found = measure(contestants, job, lambda what, share: None)
-    assert [each["answers"]["strays"] for each in found["policies"]] == [0, 0]
+    assert [policy.answers.strays for policy in found.policies] == [0, 0]
 
 
 def test_progress_is_told(plain, tmp_path: Path):

@@ -84,15 +84,15 @@ def test_a_bomb_that_lies_about_its_size_unpacks_to_what_it_declared():
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "no zip archive"),
-        (b"PK\5\6", "no zip archive"),
+        (b"", "not a zip archive"),
+        (b"PK\5\6", "not a zip archive"),
         (packed()[:-30], "cannot be read"),
-        (archive_of("a.txt", b"text"), "no array"),
-        (archive_of("a.npy", b"text"), r"no array in the .npy format"),
+        (archive_of("a.txt", b"text"), "not an array"),
+        (archive_of("a.npy", b"text"), r"not an array in the .npy format"),
         (archive_of("a.npy", npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }")), "pickled objects"),
         (archive_of("a.npy", npy("{'descr': '<f4', 'fortran_order': False, 'shape': (9,), }", b"1")), "declares the"),
-        (archive_of("a.npy", npy("{'descr': '<U0', 'fortran_order': False, 'shape': (99999999999,), }")), "none of"),
-        (archive_of("a.npy", npy("{'descr': '<M8', 'fortran_order': False, 'shape': (), }", bytes(8))), "none of"),
+        (archive_of("a.npy", npy("{'descr': '<U0', 'fortran_order': False, 'shape': (99999999999,), }")), "neither n"),
+        (archive_of("a.npy", npy("{'descr': '<M8', 'fortran_order': False, 'shape': (), }", bytes(8))), "neither n"),
         (archive_of("a.npy", npy("__import__('os')")), "not one of plain numbers"),
         (archive_of("a.npy", npy("{'descr': '|b1', 'fortran_order': False, 'shape': (1,), }", b"\7")), "truth values"),
         (archive_of("a.npy", npy("{'descr': '<U1', 'fortran_order': False, 'shape': (1,), }", b"\xff" * 4)), "Unicode"),
@@ -138,7 +138,7 @@ def test_a_missing_file_a_directory_and_a_pipe_are_told(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.npz")
     with pytest.raises(DataError, match=r"none.npz cannot be read: No such file"):
         open_npz(tmp_path / "none.npz")
-    for name, message in (("", "Is a directory"), ("pipe.npz", "no regular file")):
+    for name, message in (("", "Is a directory"), ("pipe.npz", "not a regular file")):
         with pytest.raises(DataError, match=message):
             open_npz(tmp_path / name)
 

@@ -148,7 +148,7 @@ def test_force_replaces_all_of_the_old_content(tmp_path: Path):
 
 def test_force_replaces_no_file(tmp_path: Path):
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(OutputError, match="is no directory"), writing(tmp_path / "out", force=True):
+    with pytest.raises(OutputError, match="is not a directory"), writing(tmp_path / "out", force=True):
         pytest.fail("the block must not run")
     assert (tmp_path / "out").read_text() == "a file"
 

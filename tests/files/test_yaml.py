@@ -95,5 +95,5 @@ def test_aliases_within_the_limit_are_read(tmp_path: Path) -> None:
 
 def test_a_pipe_is_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.yaml")
-    with pytest.raises(RecipeError, match="it is no regular file"):
+    with pytest.raises(RecipeError, match="it is not a regular file"):
         read_mapping(tmp_path / "a.yaml", "It", RecipeError)

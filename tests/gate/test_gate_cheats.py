@@ -16,7 +16,7 @@ from vlatool.gate.claims import growth
 from vlatool.gate.inputs import TIMING, Inputs
 from vlatool.measurement import turns
 from vlatool.measurement.agreement import run_agreement
-from vlatool.measurement.pairs import Job
+from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.turns import run_job
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "soak/attacks"))
@@ -87,7 +87,7 @@ def test_what_is_slow_on_some_observations_is_found_in_one_process(cheated, tmp_
     base = cheated[cheat.policy]
     made = cheat.make(base, tmp_path / "candidate")
     with Inputs(base, None, seed=1).file(20, TIMING) as path:
-        found = run_job(Job(str(base.path), str(made.path), warmup=1, pairs=60, seed=1, observations=str(path)))
+        found = run_job(PairJob(str(base.path), str(made.path), warmup=1, pairs=60, seed=1, observations=str(path)))
     assert found.mean_log_ratio > 0.02
     assert len(found.slow) == turns.CONFIRM
     assert sorted(found.slow)[5] > math.log(1.5)
@@ -96,7 +96,7 @@ def test_what_is_slow_on_some_observations_is_found_in_one_process(cheated, tmp_
 def test_more_memory_on_any_text_shows(cheated, tmp_path: Path) -> None:
     made = gate_cheats.CHEATS["more memory on any text"].make(cheated["tiny"], tmp_path / "candidate")
     with Inputs(cheated["tiny"], None, seed=1).file(8, TIMING) as path:
-        probed = [growth.cold_start(bundle.path, "", 1, observations=path)["peak_rss_mb"]
+        probed = [growth.cold_start(bundle.path, "", 1, observations=path).peak_rss_mb
                   for bundle in (made, cheated["tiny"])]  # fmt: skip
     assert probed[0] > probed[1] + 60
 

@@ -19,7 +19,7 @@ def test_the_defaults_claim_everything_but_a_deadline(tmp_path: Path) -> None:
     assert gate == Gate()
     assert gate.latency == LatencyClaim()
     assert gate.latency.margin == 0.05
-    assert gate.latency.looks == (10, 20, 40)
+    assert gate.latency.interim_analyses == (10, 20, 40)
     assert gate.accuracy
     assert gate.memory
     assert gate.size
@@ -27,11 +27,18 @@ def test_the_defaults_claim_everything_but_a_deadline(tmp_path: Path) -> None:
 
 
 def test_a_gate_is_read_as_it_was_written(tmp_path: Path) -> None:
-    first = read_gate(written(tmp_path, "{latency: {margin: 0.02, looks: [12]}, size: null, deadline: {ms: 20}}"))
+    text = "{latency: {margin: 0.02, interim_analyses: [12]}, size: null, deadline: {ms: 20}}"
+    first = read_gate(written(tmp_path, text))
     assert read_gate(written(tmp_path, first.to_yaml())) == first
     assert first.size is None
     assert first.deadline
     assert (first.deadline.ms, first.deadline.percent) == (20, 99)
+
+
+def test_a_file_of_an_older_version_calls_interim_analyses_looks(tmp_path: Path) -> None:
+    gate = read_gate(written(tmp_path, "{latency: {looks: [12, 24]}}"))
+    assert gate.latency.interim_analyses == (12, 24)
+    assert "looks" not in gate.to_yaml()
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
@@ -48,10 +55,10 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     [
         ("- 1", "must be a mapping; got list"),
         ("{latency: {margin: -1}}", "latency.margin: Input should be greater than or equal to 0"),
-        ("{latency: {looks: [3]}}", "looks must ascend and begin at 8 or later"),
-        ("{latency: {looks: [5, 20, 40]}}", "looks must ascend and begin at 10 or later"),
-        ("{latency: {looks: [20, 10]}}", "looks must ascend"),
-        ("{latency: {looks: []}}", "looks must ascend"),
+        ("{latency: {interim_analyses: [3]}}", "interim_analyses must ascend and begin at 8 or later"),
+        ("{latency: {interim_analyses: [5, 20, 40]}}", "interim_analyses must ascend and begin at 10 or later"),
+        ("{latency: {interim_analyses: [20, 10]}}", "interim_analyses must ascend"),
+        ("{latency: {interim_analyses: []}}", "interim_analyses must ascend"),
         ("{latency: {also_threads: [0]}}", "also_threads.0: Input should be greater than or equal to 1"),
         ("{answers: {follows: 2}}", "answers.follows: Input should be less than or equal to 1"),
         ("{answers: {observations: 3}}", "answers.observations: Input should be greater than or equal to 24"),

@@ -14,22 +14,22 @@ from vlatool.gate import timed
 from vlatool.gate.config import DeadlineClaim, Gate, GrowthClaim, LatencyClaim
 from vlatool.gate.run import run_gate
 from vlatool.measurement.agreement import run_agreement
-from vlatool.measurement.pairs import Job, Pairs
+from vlatool.measurement.pairs import PairJob, Pairs
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.telemetry._reading import THROTTLE, Reader, gauge
 
-QUICK = Gate(memory=None, latency=LatencyClaim(looks=(10,)))
+QUICK = Gate(memory=None, latency=LatencyClaim(interim_analyses=(10,)))
 
 
 @pytest.fixture
 def as_fast(monkeypatch: pytest.MonkeyPatch):
     """A function that sets how much slower the candidate seems to be; no process is started."""
 
-    def make(slowdown: float) -> list[Job]:
-        jobs: list[Job] = []
+    def make(slowdown: float) -> list[PairJob]:
+        jobs: list[PairJob] = []
 
-        def measured(job: Job, timeout: float | None) -> Pairs:
+        def measured(job: PairJob, timeout: float | None) -> Pairs:
             jobs.append(job)
             shift = math.exp(0.001 * (job.seed % 5 - 2))
             return Pairs((2.0,) * 80, (2.0 * (1 + slowdown) * shift,) * 80)
@@ -70,7 +70,7 @@ def test_the_summary_begins_with_what_failed(float_bundle: Bundle, int8_bundle: 
 
 def test_every_process_has_its_own_seed_and_both_bundles(float_bundle: Bundle, int8_bundle: Bundle, as_fast) -> None:
     jobs = as_fast(0.0)
-    claim = LatencyClaim(looks=(10,), pairs=33, threads=2, warmup=3, seconds=4)
+    claim = LatencyClaim(interim_analyses=(10,), pairs=33, threads=2, warmup=3, seconds=4)
     run_gate(int8_bundle, float_bundle, QUICK.model_copy(update={"latency": claim}), Context(), seed=7)
     assert [job.seed for job in jobs] == list(range(7, 17))
     job = jobs[0]
@@ -88,7 +88,7 @@ def test_a_deadline_needs_no_claim_about_the_median(float_bundle: Bundle, as_fas
 
 def test_one_real_gate_from_end_to_end(float_bundle: Bundle) -> None:
     """Ten processes, each with the same bundle twice; no verdict is asked for, for this machine may be busy."""
-    gate = Gate(latency=LatencyClaim(looks=(10,), pairs=30, margin=1.0), memory=GrowthClaim(margin=1.0))
+    gate = Gate(latency=LatencyClaim(interim_analyses=(10,), pairs=30, margin=1.0), memory=GrowthClaim(margin=1.0))
     report = run_gate(float_bundle, float_bundle, gate, Context())
     measured = {each.name: each for each in report.rows[1].measurements}
     assert {each.name for each in report.rows[0].measurements} == {

@@ -342,7 +342,7 @@ def test_a_copy_of_a_file_of_ones_own(tmp_path: Path, valid: dict[str, Any]) -> 
 
 @pytest.mark.parametrize("name", ["Robot", "my board", "", "-x", "a/b", "../x", "a\n"])
 def test_a_copy_needs_a_good_name(name: str, tmp_path: Path) -> None:
-    with pytest.raises(ProfileError, match="is no name of a profile"):
+    with pytest.raises(ProfileError, match="is not a valid profile name"):
         copy_profile("raspberry-pi-5", name, tmp_path / "mine.yaml")
     assert not (tmp_path / "mine.yaml").exists()
 

@@ -10,10 +10,13 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from vlatool.latency_model.fit import fitted
-from vlatool.latency_model.model import shipped
+from vlatool.latency_model.features import rows_of
+from vlatool.latency_model.fit import by_part
+from vlatool.latency_model.folds import Sample
+from vlatool.latency_model.model import Known, LatencyModel, shipped
 from vlatool.latency_model.published import Point, merged, read_points
 from vlatool.latency_model.score import lines, score_points
 
@@ -66,6 +69,17 @@ def line(title: str, point: Point, ms: float, low: float, high: float, why: str)
     told = why or f"{low:.3g}-{high:.3g} {'inside' if low <= published <= high else 'OUTSIDE'}"
     device = question.place.device if question else ""
     return f"{title:38}{device:27}{runtime:17}{dtype:9}{published:>10.4g}{ms:>11.4g}  {told}"
+
+
+def fitted(points: Sequence[Point], like: LatencyModel) -> LatencyModel:
+    """Return the model with the scales of another one, given these points."""
+    parts: dict[str, Known] = {}
+    for part, mine in by_part(points).items():
+        if not mine:
+            continue
+        sample = Sample.of(mine)
+        parts[part] = Known(rows_of(sample.questions, like.shares[part]), sample.logs, like.parts[part].scales)
+    return LatencyModel(parts, like.shares, like.conformal, like.about)
 
 
 if __name__ == "__main__":

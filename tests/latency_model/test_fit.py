@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from landmarks import fitted
 
 from vlatool.errors import DataError, OutputError
 from vlatool.latency_model import fit, model
 from vlatool.latency_model.features import Question, Shares, rows_of
-from vlatool.latency_model.fit import ALL_COUNT, Scores, assess, conformal, fit_files, fitted, loss, thinned, tune
+from vlatool.latency_model.fit import ALL_COUNT, Scores, assess, conformal, fit_files, loss, thinned, tune
 from vlatool.latency_model.folds import Folds, Sample
 from vlatool.latency_model.gaussian_process import Process, Scales
 from vlatool.latency_model.model import LEVEL, LatencyModel, read_model
@@ -265,6 +266,6 @@ def test_few_draws_widen_the_interval() -> None:
 def test_a_fit_replaces_no_file_that_is_no_model(tmp_path: Path, text: str | None) -> None:
     name = "latency.npz" if text is None else "latency.json"
     (tmp_path / name).write_text(text or "mine")
-    with pytest.raises(OutputError, match=f"{name} is no model"):
+    with pytest.raises(OutputError, match=f"{name} is not a model"):
         fit_files(tmp_path / "points.csv", tmp_path, 0, 0)
     assert (tmp_path / name).read_text() == (text or "mine")

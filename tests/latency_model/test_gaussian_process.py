@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vlatool.latency_model import gaussian_process
-from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales, kernel, lower_inverse
+from vlatool.latency_model.gaussian_process import KEYS, Process, Rows, Scales, kernel
 
 SCALES = Scales()
 
@@ -98,12 +98,15 @@ def test_a_noisy_measurement_counts_less() -> None:
     assert 0 < dull[0] < sharp[0] < 1.0
 
 
-@pytest.mark.parametrize("count", [1, 64, 65, 200])
-def test_the_inverse_of_a_triangle(count: int) -> None:
-    random = np.random.default_rng(count)
-    factor = np.tril(random.normal(size=(count, count)) * 0.1) + np.eye(count)
-    np.testing.assert_allclose(lower_inverse(factor), np.linalg.inv(factor), atol=1e-10)
-    assert not np.triu(lower_inverse(factor), 1).any()
+@pytest.mark.parametrize("count", [1, 64, 200])
+def test_mean_and_covariance_are_those_of_the_textbook(count: int) -> None:
+    told, asked = rows(count, 13), rows(5, 14)
+    logs = told.prior + np.random.default_rng(count).normal(size=count)
+    inverse = np.linalg.inv(kernel(told, told, SCALES) + SCALES.noise**2 * np.eye(count))
+    across = kernel(told, asked, SCALES)
+    mean, covariance = Process(told, logs, SCALES).joint(asked)
+    np.testing.assert_allclose(mean, asked.prior + across.T @ inverse @ (logs - told.prior), atol=1e-9)
+    np.testing.assert_allclose(covariance, kernel(asked, asked, SCALES) - across.T @ inverse @ across, atol=1e-9)
 
 
 def test_rows_are_joined_and_taken_in_order() -> None:

@@ -213,7 +213,7 @@ def test_a_directory_without_a_model_is_named(
         data[200:400] = bytes(255 - byte for byte in data[200:400])
         arrays.write_bytes(data)
     monkeypatch.setenv("VLATOOL_LATENCY", str(folder))
-    with pytest.raises(DataError, match="There is no latency model in") as caught:
+    with pytest.raises(DataError, match=r"The latency model in .* cannot be read") as caught:
         shipped()
     assert str(folder) in caught.value.message
     assert "unset VLATOOL_LATENCY" in str(caught.value.fix)

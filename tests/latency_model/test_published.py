@@ -115,7 +115,7 @@ def test_what_has_no_ground_says_why(one: Callable[..., Point], changes: dict[st
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"value": "fast"}, "line 3: 'fast' in the column 'value' is no number"),
+        ({"value": "fast"}, "line 3: 'fast' in the column 'value' is not a number"),
         ({"metric": "joules"}, "line 3: the metric 'joules' is unknown; allowed: latency_ms, fps, tokens_per_s"),
         ({"device_class": "tpu"}, "line 3: the device class 'tpu' is unknown; allowed: cpu, gpu, igpu, npu"),
         ({"n_layers": "many"}, "line 3: 'many' in the column"),

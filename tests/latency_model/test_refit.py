@@ -77,5 +77,5 @@ def test_an_unknown_split_is_refused(points_file: Path, held_out: str | None) ->
 
 def test_one_board_alone_cannot_be_left_out(published: Rows, points_at: Written) -> None:
     path = points_at([row for row in published if row["device"] == "rk3588"])
-    with pytest.raises(DataError, match="has no two devices: nothing is left to fit on"):
+    with pytest.raises(DataError, match="has fewer than two devices: nothing is left to fit on"):
         refit_points(path, "devices", 0, 0.0, silent)

@@ -8,12 +8,12 @@ import pytest
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import BundleError, GraphError
 from vlatool.measurement.agreement import Followed, correlation, measure_agreement, run_agreement
-from vlatool.measurement.pairs import Job
+from vlatool.measurement.pairs import PairJob
 
 
 @pytest.fixture
-def job(float_bundle: Bundle, int8_bundle: Bundle) -> Job:
-    return Job(str(float_bundle.path), str(int8_bundle.path), pairs=90, seed=5)
+def job(float_bundle: Bundle, int8_bundle: Bundle) -> PairJob:
+    return PairJob(str(float_bundle.path), str(int8_bundle.path), pairs=90, seed=5)
 
 
 def random(*shape: int, seed: int = 0) -> np.ndarray:
@@ -43,7 +43,7 @@ def test_elements_that_do_not_vary_do_not_count() -> None:
     assert correlation(-still, still) == 0
 
 
-def test_a_fresh_process_says_how_int8_follows_float32(job: Job) -> None:
+def test_a_fresh_process_says_how_int8_follows_float32(job: PairJob) -> None:
     found = measure_agreement(job)
     assert [(each.kind, each.output) for each in found.followed] == [("drawn", "action")]
     assert isinstance(found.followed[0], Followed)
@@ -53,8 +53,8 @@ def test_a_fresh_process_says_how_int8_follows_float32(job: Job) -> None:
     assert found.engines == ("ort_cpu", "ort_cpu")
 
 
-def test_nothing_is_asked_of_a_gate_without_answers_but_the_golden_action(job: Job, copied) -> None:
-    silent = Job(**{**vars(job), "pairs": 0})
+def test_nothing_is_asked_of_a_gate_without_answers_but_the_golden_action(job: PairJob, copied) -> None:
+    silent = PairJob(**{**vars(job), "pairs": 0})
     assert run_agreement(silent).followed == ()
     made = copied(Bundle.open(job.candidate))
     with np.load(made.path / "golden/golden.npz") as stored:
@@ -63,13 +63,13 @@ def test_nothing_is_asked_of_a_gate_without_answers_but_the_golden_action(job: J
             **{name: -stored[name] if name == "out.action" else stored[name] for name in stored.files},
         )
     seal(made.path, made.manifest)
-    with pytest.raises(GraphError, match=r"copied: This machine computes another golden action than recorded"):
-        run_agreement(Job(**{**vars(silent), "candidate": str(made.path)}))
+    with pytest.raises(GraphError, match=r"copied: This machine computes a different golden action than recorded"):
+        run_agreement(PairJob(**{**vars(silent), "candidate": str(made.path)}))
 
 
-def test_a_file_that_was_changed_is_told(job: Job, copied) -> None:
+def test_a_file_that_was_changed_is_told(job: PairJob, copied) -> None:
     made = copied(Bundle.open(job.candidate))
     with (made.path / "graphs/main.onnx").open("ab") as stream:
         stream.write(b"x")
     with pytest.raises(BundleError, match=r"main\.onnx"):
-        run_agreement(Job(**{**vars(job), "candidate": str(made.path)}))
+        run_agreement(PairJob(**{**vars(job), "candidate": str(made.path)}))

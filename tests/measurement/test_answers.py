@@ -8,7 +8,7 @@ from _policies import Garbage, Memoising
 
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
-from vlatool.measurement.answers import Answers, expected_answers, remembered, varied
+from vlatool.measurement.answers import AnswerCheck, Answers, expected_answers, remembered, varied
 from vlatool.runtime.policy import Policy
 
 
@@ -32,15 +32,15 @@ def run(policy, observations, answers, rounds=3):
 def test_the_same_answers_are_no_strays(policy, observations):
     answers = expected_answers(policy, observations)
     run(policy, observations, answers)
-    assert answers.to_dict() == {"looked": 24, "strays": 0, "worst": 0.0, "first": -1}
+    assert answers.check() == AnswerCheck(looked=24, strays=0, worst=0.0, first=-1)
 
 
 def test_a_policy_that_returns_garbage_later_is_seen_from_its_first_stray(policy, observations):
     answers = expected_answers(policy, observations)
     run(Garbage(policy, after=10), observations, answers)
-    found = answers.to_dict()
-    assert (found["looked"], found["strays"], found["first"]) == (24, 14, 10)
-    assert found["worst"] > 0.1
+    found = answers.check()
+    assert (found.looked, found.strays, found.first) == (24, 14, 10)
+    assert found.worst > 0.1
 
 
 def test_rounding_is_no_stray_and_no_number_is_one():
@@ -49,7 +49,7 @@ def test_rounding_is_no_stray_and_no_number_is_one():
     assert answers.strays == 0
     answers.look(0, {"action": np.array([1, math.nan, 1, 1])})
     answers.look(0, {"action": np.ones(3)})
-    assert answers.to_dict() == {"looked": 3, "strays": 2, "worst": None, "first": 1}
+    assert answers.check() == AnswerCheck(looked=3, strays=2, worst=None, first=1)
 
 
 def test_a_slow_policy_is_asked_few_observations(policy, observations):

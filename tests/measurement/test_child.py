@@ -7,8 +7,20 @@ import pytest
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GateFailed, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.measurement import child
-from vlatool.measurement.child import SAID, answer, ask, ended, message, raise_said, signal_name
-from vlatool.measurement.job import Limits
+from vlatool.measurement.child import (
+    Progress,
+    Raised,
+    Result,
+    answer,
+    ask,
+    ended,
+    error_of,
+    read_line,
+    result_of,
+    signal_name,
+)
+from vlatool.measurement.cold_start import ColdStart
+from vlatool.measurement.jobs import ColdStartJob, Limits
 
 
 def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
@@ -17,23 +29,23 @@ def test_what_a_process_raises_comes_back_as_it_was(monkeypatch: pytest.MonkeyPa
 
     answer(fail)
     line = capsys.readouterr().out
-    assert f'"{SAID}": "MissingExtra"' in line
+    assert '{"raised": {"kind": "MissingExtra"' in line
     done = SimpleNamespace(stdout="noise\n" + line, stderr="", returncode=0)
     monkeypatch.setattr(child.subprocess, "run", lambda *_, **__: done)
     with pytest.raises(MissingExtra, match="onnxruntime is absent") as caught:
-        ask("any", (), "", "x")
+        ask("any", None, Limits, "x")
     assert (caught.value.fix, caught.value.exit_code) == ("pip install it", 4)
 
 
 def test_a_real_process_says_what_is_wrong(float_bundle: Bundle) -> None:
     with pytest.raises(UsageError, match="Unknown engine 'foo'") as caught:
-        ask("vlatool.measurement.cold_start", (str(float_bundle.path), "foo", "1"), "", "x")
+        ask("vlatool.measurement.cold_start", ColdStartJob(str(float_bundle.path), "foo", 1, 0), ColdStart, "x")
     assert caught.value.exit_code == 2
 
 
 def test_a_process_that_dies_is_named() -> None:
     with pytest.raises(GraphError, match=r"x cannot be run in a fresh process: .*no_such_module"):
-        ask("vlatool.no_such_module", (), "", "x")
+        ask("vlatool.no_such_module", None, Limits, "x")
 
 
 @pytest.mark.parametrize(
@@ -55,15 +67,15 @@ def test_a_process_under_a_limit_did_not_fit_only_where_memory_ended_it() -> Non
     limits = Limits(memory_mb=50)
     assert isinstance(ended("x", -9, "", limits), GraphError), "something else killed it"
     assert isinstance(ended("x", 1, "MemoryError", limits), GateFailed)
-    with pytest.raises(GateFailed, match="more than 50 MB"):
-        raise_said({SAID: "GraphError", "message": "std::bad_alloc", "fix": ""}, limits)
-    raise_said({"result": 1}, limits)
+    error = error_of(Raised("GraphError", "std::bad_alloc"), limits)
+    assert isinstance(error, GateFailed)
+    assert "more than 50 MB" in error.message
 
 
 @pytest.mark.parametrize("name", ["annotations", "require", "NoSuchError", "ValueError"])
 def test_what_is_no_error_of_vlatool_is_raised_as_the_other_one(name):
-    with pytest.raises(TargetError, match="it broke"):
-        raise_said({SAID: name, "message": "it broke"}, otherwise=TargetError)
+    error = error_of(Raised(name, "it broke"), otherwise=TargetError)
+    assert (type(error), error.message) == (TargetError, "it broke")
 
 
 def test_signals_have_names_where_there_are_some():
@@ -74,12 +86,23 @@ def test_signals_have_names_where_there_are_some():
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
-        ('{"a": 1}\n', {"a": 1}),
-        ('{"result": {"blocks_ms": [[0.1, 0.', {}),
-        ("an engine says hello", {}),
-        ("[1]", {}),
-        ("", {}),
+        ('{"result": {"value": {"a": 1}}}\n', Result({"a": 1})),
+        ('{"progress": {"what": "opening", "share": null}}', Progress("opening", None)),
+        ('{"progress": {"what": 1, "share": null}}', None),
+        ('{"result": {"value": {"blocks_ms": [[0.1, 0.', None),
+        ('{"a": 1}', None),
+        ('{"result": {"value": 1}, "raised": {}}', None),
+        ("an engine says hello", None),
+        ("[1]", None),
+        ("", None),
     ],
 )
 def test_a_line_that_its_process_did_not_live_to_end_is_no_message(text, wanted) -> None:
-    assert message(text) == wanted
+    assert read_line(text) == wanted
+
+
+def test_a_process_that_answers_something_else_is_named() -> None:
+    with pytest.raises(
+        GraphError, match=r"x: the process does not answer what it was asked: 'answer' lacks 'start_ms'"
+    ):
+        result_of(Result({}), ColdStart, "x")

@@ -1,6 +1,5 @@
 """A process under limits, for real."""
 
-import json
 import os
 import subprocess
 import sys
@@ -11,7 +10,7 @@ import pytest
 from vlatool.errors import UsageError
 from vlatool.machine.processes import python_code, python_command
 from vlatool.measurement import limited
-from vlatool.measurement.job import Job, Limits
+from vlatool.measurement.jobs import Limits
 from vlatool.measurement.limited import chosen, command, grouped, ran_out
 
 USES = "import os, sys; print(sorted(os.sched_getaffinity(0)))"
@@ -67,11 +66,6 @@ def test_what_needs_more_memory_is_stopped(tmp_path, monkeypatch):
     assert "lived" not in done.stdout
     assert done.returncode == -9 if limits.cgroup else "MemoryError" in done.stderr
     assert not limits.cgroup or not os.path.exists(limits.cgroup)
-
-
-def test_a_job_goes_through_json_and_back():
-    job = Job(("a", "b"), rate=5.0, limits=Limits((1, 2), 2, 3.5))
-    assert Job.from_dict(json.loads(json.dumps(job.to_dict()))) == job
 
 
 def test_a_group_says_whether_it_ended_a_process(tmp_path):

@@ -2,16 +2,20 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "telemetry"))
 
+from _runs import QUIET, run_of
 from telemetry_boards import AGX_ORIN, NUC, ORIN_NANO, write
 
+from vlatool.measurement.cold_start import ColdStart
+from vlatool.measurement.measured import PolicyRun
 from vlatool.measurement.rows import measurements, raw, sustained, tables
-from vlatool.telemetry import Recorder, open_all
+from vlatool.telemetry import Absent, Gauge, Recorder, open_all
 
 
 def recorded(root, seconds):
@@ -21,18 +25,17 @@ def recorded(root, seconds):
     recorder.sample(every=True)
     now[0] += seconds
     recorder.sample(every=True)
-    return recorder.recorded.to_dict()
+    return recorder.recorded
 
 
 def found(telemetry=None, calls=100, **more):
-    times = [0.1 * number for number in range(calls)]
-    policy = {"name": "int8", "blocks_ms": [[2.0] * 5] * (calls // 5), "at_s": times, "paced": None} | more
-    return {"begun_s": 1000.0, "ended_s": 1020.0, "wall_s": 20.0, "cpu_s": 30.0, "policies": [policy],
-            "telemetry": telemetry}  # fmt: skip
+    times = tuple(0.1 * number for number in range(calls))
+    policy = PolicyRun("int8", ((2.0,) * 5,) * (calls // 5), times, **more)
+    return run_of(policy, ended_s=1020.0, wall_s=20.0, cpu_s=30.0, telemetry=telemetry)
 
 
 def numbers(what, reference=None, rate=0.0):
-    return {each.name: each for each in measurements(what, what["policies"][0], reference, rate)}
+    return {each.name: each for each in measurements(what, what.policies[0], reference, rate)}
 
 
 def test_a_policy_alone_has_throughput_and_processor_use():
@@ -48,7 +51,7 @@ def test_a_policy_alone_has_throughput_and_processor_use():
 
 def test_beside_others_it_has_a_speed_up_and_no_refusals():
     what = found()
-    slower = {"name": "float32", "blocks_ms": [[6.0] * 5] * 20}
+    slower = PolicyRun("float32", ((6.0,) * 5,) * 20, ())
     told = numbers(what, slower)
     assert told["speedup"].value == 3.0
     assert "latency_p99.9" not in told
@@ -59,12 +62,12 @@ def test_energy_of_a_jetson_is_that_of_its_input_rail(tmp_path):
     telemetry = recorded(write(tmp_path, ORIN_NANO), 20.0)
     told = numbers(found(telemetry))
     watts = told["power_mean"].value
-    assert watts == pytest.approx(telemetry["energy"][0]["mean_w"])
+    assert watts == pytest.approx(telemetry.energy[0].mean_w)
     assert watts > 0
     assert told["energy_per_action"].value == pytest.approx(watts * 20.0 / 100)
     assert "VDD_IN" in told["power_mean"].note
     assert "idle power included" in told["energy_per_action"].note
-    hottest = max(gauge["max"] for gauge in telemetry["gauges"].values() if gauge["unit"] == "degC")
+    hottest = max(gauge.max for gauge in telemetry.gauges.values() if gauge.unit == "degC")
     assert told["temperature_max"].value == hottest
 
 
@@ -91,7 +94,7 @@ def test_a_nuc_counts_energy_over_the_wrap_around(tmp_path):
     (package / "energy_uj").write_text("140000000")
     now[0] = 20.0
     recorder.sample(every=True)
-    told = numbers(found(recorder.recorded.to_dict()))
+    told = numbers(found(recorder.recorded))
     assert told["power_mean"].value == pytest.approx(240 / 20)
     assert told["energy_per_action"].value == pytest.approx(2.4)
 
@@ -99,36 +102,35 @@ def test_a_nuc_counts_energy_over_the_wrap_around(tmp_path):
 def test_every_sample_and_what_the_board_told_is_kept(tmp_path):
     telemetry = recorded(write(tmp_path, ORIN_NANO), 20.0)
     what = found(telemetry)
-    series = raw(what, what["policies"][0], alone=True)
+    series = raw(what, what.policies[0], alone=True)
     assert len(series["latency_ms"]) == len(series["at_s"]) == 100
     gauges = [name for name in series if name.startswith("telemetry.") and not name.endswith(".at_s")]
     assert gauges
     for name in gauges:
         assert len(series[name]) == len(series[f"{name}.at_s"]) == 2
         assert series[f"{name}.at_s"] == [0.0, 20.0]
-    assert set(raw(what, what["policies"][0], alone=False)) == {"latency_ms", "at_s"}
+    assert set(raw(what, what.policies[0], alone=False)) == {"latency_ms", "at_s"}
 
 
 def test_throttled_moments_are_kept():
-    gauge = {"unit": "throttle", "times": [1001.0, 1002.0], "values": [0.0, 1.0], "min": 0, "mean": 0.5, "max": 1}
-    what = found({"gauges": {"pi.throttled": gauge}, "counters": {}, "energy": [], "unmeasured": []})
-    assert raw(what, what["policies"][0], alone=True)["throttled_at_s"] == [2.0]
+    gauge = Gauge("throttle", 0.0, 0.5, 1.0, (1001.0, 1002.0), (0.0, 1.0), "")
+    what = found(replace(QUIET, gauges={"pi.throttled": gauge}))
+    assert raw(what, what.policies[0], alone=True)["throttled_at_s"] == [2.0]
 
 
 def test_what_is_absent_is_told_and_never_zero():
-    telemetry = {"gauges": {}, "counters": {}, "energy": [], "unmeasured": [{"reader": "rapl", "reason": "no RAPL"}]}
-    what = found(telemetry)
-    told = tables(what, what["policies"][0], alone=True)
+    what = found(replace(QUIET, unmeasured=(Absent("rapl", "no RAPL"),)))
+    told = tables(what, what.policies[0], alone=True)
     assert told["unmeasured"] == [{"what": "rapl", "why": "no RAPL"}]
     assert "power_mean" not in numbers(what)
 
 
 def test_memory_and_cold_start_by_part():
     rss = {"interpreter": 10.0, "imported": 30.0, "engine": 50.0, "loaded": 90.0, "first": 88.0, "more": 100.0}
-    start = {"rss_mb": rss, "peak_rss_mb": 101.0, "total_ms": 200.0, "start_ms": 20.0, "import_ms": 100.0,
-             "engine_ms": 30.0, "load_ms": 40.0, "first_ms": 10.0}  # fmt: skip
-    what = found(cold=[start] * 3)
-    told = tables(what, what["policies"][0], alone=True)
+    start = ColdStart(start_ms=20.0, import_ms=100.0, engine_ms=30.0, load_ms=40.0, first_ms=10.0, total_ms=200.0,
+                      peak_rss_mb=101.0, rss_mb=rss)  # fmt: skip
+    what = found(cold=(start,) * 3)
+    told = tables(what, what.policies[0], alone=True)
     assert [line["MB"] for line in told["memory by part"]] == [10, 20, 20, 40, 0, 10]
     assert sum(line["share %"] for line in told["memory by part"]) == 100
     assert [line["ms"] for line in told["cold start by part"]] == [20, 100, 30, 40, 10]

@@ -1,5 +1,7 @@
 """A control loop in a time that tests make: what each tick gets."""
 
+from dataclasses import replace
+
 import pytest
 
 from vlatool.measurement.interleaved import latency_measurements
@@ -72,7 +74,7 @@ def test_progress_is_told_now_and_then():
 
 
 def test_the_numbers_of_a_loop():
-    found = {each.name: each for each in paced_measurements(Loop(*[1.0] * 999, 32.0).run(3000).to_dict(), 3000, 100.0)}
+    found = {each.name: each for each in paced_measurements(Loop(*[1.0] * 999, 32.0).run(3000).pace(), 3000, 100.0)}
     assert set(found) == {"deadline_misses", "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99"}
     misses = found["deadline_misses"]
     assert misses.low < misses.value < misses.high
@@ -82,7 +84,7 @@ def test_the_numbers_of_a_loop():
 
 
 def test_percentiles_of_few_ticks_are_refused_with_what_they_would_take():
-    found = {each.name: each for each in paced_measurements(Loop(1.0).run(300).to_dict(), 300, 100.0)}
+    found = {each.name: each for each in paced_measurements(Loop(1.0).run(300).pace(), 300, 100.0)}
     for name in ("age_p99", "wakeup_p99"):
         assert not found[name].known
         assert "needs 662 independent calls" in found[name].note
@@ -92,8 +94,8 @@ def test_percentiles_of_few_ticks_are_refused_with_what_they_would_take():
 
 
 def test_nothing_is_bounded_where_many_ticks_share_an_inference():
-    seen = Loop(25.0).run(1000).to_dict()
-    assert seen["inferences"] < 600
+    seen = Loop(25.0).run(1000).pace()
+    assert seen.inferences < 600
     assert overloaded(seen, 1000)
     misses = paced_measurements(seen, 1000, 100.0)[0]
     assert (misses.value, misses.low, misses.high) == (1.0, None, None)
@@ -103,14 +105,16 @@ def test_nothing_is_bounded_where_many_ticks_share_an_inference():
 
 
 def test_a_loop_that_never_slept_says_nothing_of_waking_up():
-    seen = Loop(25.0).run(50).to_dict()
-    assert len(seen["wakeup_ms"]) <= 1
-    assert not any(each.name.startswith("wakeup") for each in paced_measurements({**seen, "wakeup_ms": []}, 50, 100.0))
+    seen = Loop(25.0).run(50).pace()
+    assert len(seen.wakeup_ms) <= 1
+    assert not any(
+        each.name.startswith("wakeup") for each in paced_measurements(replace(seen, wakeup_ms=()), 50, 100.0)
+    )
 
 
 def test_ticks_that_share_an_inference_count_for_less():
-    seen = Loop(*[1.0] * 99, 52.0).run(300).to_dict()
-    assert seen["worth"] == pytest.approx(300**2 / (seen["inferences"] - 2 + 2 * 25), rel=0.1)
+    seen = Loop(*[1.0] * 99, 52.0).run(300).pace()
+    assert seen.effective_sample_size == pytest.approx(300**2 / (seen.inferences - 2 + 2 * 25), rel=0.1)
 
 
 def test_there_is_time_for_other_things_while_the_loop_has_slack():

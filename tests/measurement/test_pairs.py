@@ -17,17 +17,17 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.data import Drawer, read_recording, save_drawn
 from vlatool.errors import BundleError, GraphError
 from vlatool.measurement import turns
-from vlatool.measurement.pairs import FEWEST, Job, Pairs, measure_pairs
+from vlatool.measurement.pairs import FEWEST, PairJob, Pairs, measure_pairs
 from vlatool.measurement.turns import CONFIRM, Turns, halved, observation_of, place_of, run_job, sequence, wanted
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "soak/attacks"))
 
 
 @pytest.fixture
-def job(float_bundle: Bundle, int8_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> Job:
+def job(float_bundle: Bundle, int8_bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> PairJob:
     monkeypatch.setattr(turns, "WARMUP_MS", 0.0)
     monkeypatch.setattr(turns.gc, "freeze", lambda: None)
-    return Job(str(float_bundle.path), str(int8_bundle.path), warmup=1, pairs=40)
+    return PairJob(str(float_bundle.path), str(int8_bundle.path), warmup=1, pairs=40)
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def wrapped(monkeypatch: pytest.MonkeyPatch):
     return wrap
 
 
-def test_every_call_of_both_is_kept(job: Job) -> None:
+def test_every_call_of_both_is_kept(job: PairJob) -> None:
     found = run_job(job)
     assert len(found.baseline_ms) == len(found.candidate_ms) == len(found.places) == 40
     assert min(found.baseline_ms + found.candidate_ms) > 0
@@ -60,13 +60,13 @@ def test_every_call_of_both_is_kept(job: Job) -> None:
     assert found.looked > 5
 
 
-def test_a_slow_policy_is_called_less_often_but_often_enough(job: Job) -> None:
-    found = run_job(Job(**{**vars(job), "seconds": 1e-9}))
+def test_a_slow_policy_is_called_less_often_but_often_enough(job: PairJob) -> None:
+    found = run_job(PairJob(**{**vars(job), "seconds": 1e-9}))
     assert len(found.baseline_ms) == len(found.candidate_ms) == FEWEST
     assert sorted(map(found.places.count, set(found.places))) == [3] * 10, "each observation three times"
 
 
-def test_a_fresh_process_measures_the_same(job: Job) -> None:
+def test_a_fresh_process_measures_the_same(job: PairJob) -> None:
     found = measure_pairs(job)
     assert len(found.baseline_ms) == len(found.candidate_ms) == 40
     assert math.isfinite(found.log_ratio + found.mean_log_ratio)
@@ -107,7 +107,7 @@ def test_half_of_a_block_is_exact_another_half_each_time(count: int) -> None:
     assert seen == set(range(2 * count)), "each observation has been both"
 
 
-def test_both_get_the_same_bits_which_are_exact_or_never_seen(job: Job, wrapped) -> None:
+def test_both_get_the_same_bits_which_are_exact_or_never_seen(job: PairJob, wrapped) -> None:
     class Spy(Wrapped):
         def infer(self, observation, **more):
             told.append((id(self), observation["image"].tobytes(), observation["instruction"]))
@@ -131,23 +131,23 @@ def test_both_get_the_same_bits_which_are_exact_or_never_seen(job: Job, wrapped)
     assert 0.2 < firsts.count(id(policies[0])) / len(firsts) < 0.8, "neither is always the first"
 
 
-def test_each_is_loaded_first_in_some_process(job: Job, monkeypatch) -> None:
+def test_each_is_loaded_first_in_some_process(job: PairJob, monkeypatch) -> None:
     told: list[str] = []
     real = turns.load
     monkeypatch.setattr(turns, "load", lambda path, **more: told.append(path) or real(path, **more))
     for seed in range(6):
-        Turns(Job(**{**vars(job), "seed": seed}))
+        Turns(PairJob(**{**vars(job), "seed": seed}))
     assert len(set(told[::2])) == 2
 
 
-def test_other_answers_than_in_a_fresh_session_are_told(job: Job, wrapped) -> None:
+def test_other_answers_than_in_a_fresh_session_are_told(job: PairJob, wrapped) -> None:
     wrapped(lambda policy: Garbage(policy, after=8), only=job.candidate)
     found = run_job(job)
     assert found.strays > found.looked // 2
     assert found.unsteady == 0
 
 
-def test_answers_from_memory_are_of_no_use(job: Job, wrapped) -> None:
+def test_answers_from_memory_are_of_no_use(job: PairJob, wrapped) -> None:
     made = wrapped(Memoising, only=job.candidate)
     found = run_job(job)
     exact = [place for place in found.places if observation_of(place)[1]]
@@ -157,7 +157,7 @@ def test_answers_from_memory_are_of_no_use(job: Job, wrapped) -> None:
     assert made[0].calls >= 40 - len(exact), "what is varied is never answered from memory"
 
 
-def test_what_seems_slow_is_called_again_and_again(job: Job, wrapped) -> None:
+def test_what_seems_slow_is_called_again_and_again(job: PairJob, wrapped) -> None:
     class SlowOnText(Wrapped):
         def infer(self, observation, **more):
             end = turns.time.perf_counter_ns() + (3_000_000 if observation["instruction"] else 0)
@@ -201,7 +201,7 @@ def test_what_is_slow_on_exact_inputs_alone_or_on_varied_ones_is_found(job, wrap
     drawn: set[bytes] = set()
     wrapped(Steady, only=job.baseline)
     wrapped(Slow, only=job.candidate)
-    turns = Turns(Job(**{**vars(job), "pairs": 60, "seed": seed}))
+    turns = Turns(PairJob(**{**vars(job), "pairs": 60, "seed": seed}))
     drawn.update(each.observation["image"].tobytes() for each in turns.pool)
     found = turns.measure()
     assert found.mean_log_ratio == pytest.approx(math.log(2) / 2, rel=0.2), "half of the places, each counted for 2"
@@ -210,7 +210,7 @@ def test_what_is_slow_on_exact_inputs_alone_or_on_varied_ones_is_found(job, wrap
     assert observation_of(max(found.places, key=lambda place: found.medians(found.candidate_ms)[place]))[1] is slow
 
 
-def test_observations_come_from_the_file(job: Job, float_bundle: Bundle, tmp_path, wrapped) -> None:
+def test_observations_come_from_the_file(job: PairJob, float_bundle: Bundle, tmp_path, wrapped) -> None:
     seen = set()
 
     class Spy(Wrapped):
@@ -224,11 +224,11 @@ def test_observations_come_from_the_file(job: Job, float_bundle: Bundle, tmp_pat
     ]
     save_drawn(tmp_path / "drawn.npz", drawn[:10])
     wrapped(Spy)
-    Turns(Job(**{**vars(job), "observations": str(tmp_path / "drawn.npz")}))._time()
+    Turns(PairJob(**{**vars(job), "observations": str(tmp_path / "drawn.npz")}))._time()
     assert seen - {"go to the red"} <= {"go to the ball", "go to the box", "red ball", "blue box"}
 
 
-def test_what_the_baseline_cannot_answer_is_left_out(job: Job, wrapped) -> None:
+def test_what_the_baseline_cannot_answer_is_left_out(job: PairJob, wrapped) -> None:
     class Fails(Wrapped):
         def infer(self, observation, **more):
             if observation["instruction"] == "" and self.calls > 3:
@@ -242,7 +242,7 @@ def test_what_the_baseline_cannot_answer_is_left_out(job: Job, wrapped) -> None:
     assert all(turns.pool[observation_of(place)[0]].observation["instruction"] for place in found.places)
 
 
-def test_what_the_candidate_alone_cannot_answer_is_an_error(job: Job, wrapped) -> None:
+def test_what_the_candidate_alone_cannot_answer_is_an_error(job: PairJob, wrapped) -> None:
     class Fails(Wrapped):
         def infer(self, observation, **more):
             if observation["instruction"] == "" and self.calls > 3:
@@ -257,30 +257,30 @@ def test_what_the_candidate_alone_cannot_answer_is_an_error(job: Job, wrapped) -
 
 
 @pytest.mark.parametrize("side", ["baseline", "candidate"])
-def test_a_bundle_that_load_refuses_is_not_timed(job: Job, copied, side: str) -> None:
+def test_a_bundle_that_load_refuses_is_not_timed(job: PairJob, copied, side: str) -> None:
     made = copied(Bundle.open(getattr(job, side)))
     with np.load(made.path / "golden/golden.npz") as stored:
         arrays = {name: stored[name] for name in stored.files}
     np.savez(made.path / "golden/golden.npz", **{**arrays, "out.action": -arrays["out.action"]})
     sealed = seal(made.path, made.manifest)
-    with pytest.raises(GraphError, match="another golden action than recorded"):
-        run_job(Job(**{**vars(job), side: str(sealed.path)}))
+    with pytest.raises(GraphError, match="a different golden action than recorded"):
+        run_job(PairJob(**{**vars(job), side: str(sealed.path)}))
 
 
 @pytest.mark.parametrize("side", ["baseline", "candidate"])
-def test_a_file_that_was_changed_is_not_timed(job: Job, copied, side: str) -> None:
+def test_a_file_that_was_changed_is_not_timed(job: PairJob, copied, side: str) -> None:
     made = copied(Bundle.open(getattr(job, side)))
     with (made.path / "graphs/main.onnx").open("ab") as stream:
         stream.write(b"x")
     with pytest.raises(BundleError, match=r"main\.onnx"):
-        run_job(Job(**{**vars(job), side: str(made.path)}))
+        run_job(PairJob(**{**vars(job), side: str(made.path)}))
 
 
-def test_a_bundle_that_cannot_run_is_named(job: Job, tmp_path) -> None:
-    with pytest.raises(BundleError, match=r"There is no bundle at .*none"):
-        measure_pairs(Job(**{**vars(job), "candidate": str(tmp_path / "none")}))
+def test_a_bundle_that_cannot_run_is_named(job: PairJob, tmp_path) -> None:
+    with pytest.raises(BundleError, match=r"No bundle at .*none"):
+        measure_pairs(PairJob(**{**vars(job), "candidate": str(tmp_path / "none")}))
 
 
-def test_a_process_that_hangs_is_ended(job: Job) -> None:
+def test_a_process_that_hangs_is_ended(job: PairJob) -> None:
     with pytest.raises(GraphError, match="no result after"):
         measure_pairs(job, timeout=0.01)

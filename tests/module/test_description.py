@@ -31,7 +31,7 @@ def test_a_complete_description(policy_dir: Path):
     assert described.environment["tasks"] == ["reach", "push"]
     assert described.parts["head"] == ["head"]
     assert described.program == single_graph(described.spec)
-    assert described.assets() == {"statistics.json", "vocabulary.json"}
+    assert [file.name for file in described.assets()] == ["statistics.json", "vocabulary.json"]
     assert described.calibration == policy_dir / "calibration.npz"
     assert described.evaluation == policy_dir / "evaluation.npz"
 
@@ -44,7 +44,7 @@ def test_a_short_description_has_defaults(tmp_path: Path):
     described = read_description(write(tmp_path))
     assert (described.version, described.factory, described.arguments) == ("0.0.0", "", {})
     assert described.calibration is None
-    assert described.assets() == set()
+    assert described.assets() == []
 
 
 def test_an_own_program_is_read(tmp_path: Path):
@@ -59,7 +59,7 @@ def test_recorded_data_may_have_another_name(tmp_path: Path):
 
 @pytest.mark.parametrize("named", ["file", "folder"])
 def test_no_description(tmp_path: Path, named):
-    with pytest.raises(SourceError, match=r"There is no .*policy.yaml") as caught:
+    with pytest.raises(SourceError, match=r"No such file: .*policy.yaml") as caught:
         read_description(tmp_path / "policy.yaml" if named == "file" else tmp_path)
     assert "your-own-policy" in caught.value.fix
 

@@ -106,7 +106,7 @@ def test_a_bundle_without_changes_has_none(source_bundle: Bundle):
 ])  # fmt: skip
 def test_a_file_of_edits_that_makes_no_sense_is_refused(changed: Bundle, edit: object):
     (changed.path / EDITS).write_text(json.dumps([edit]))
-    with pytest.raises(SourceError, match="an edit that makes no sense"):
+    with pytest.raises(SourceError, match="an invalid edit"):
         read_edits(changed)
 
 

@@ -32,7 +32,7 @@ def test_what_is_no_factory(factory):
     ("named", "says", "fix"),
     [
         ("model.onnx", "is an ONNX file", "name the file itself as SOURCE"),
-        ("original.py", "names a file and no function", "original.py:NAME"),
+        ("original.py", "names a file but no function", "original.py:NAME"),
     ],
 )
 def test_what_a_person_meant_is_told(named: str, says: str, fix: str):
@@ -85,7 +85,7 @@ def test_a_file_that_changed_is_imported_again(tmp_path: Path):
 
 
 def test_a_missing_file(tmp_path: Path):
-    with pytest.raises(SourceError, match=r"There is no file .*policy.py \(from 'policy.py:make'\)"):
+    with pytest.raises(SourceError, match=r"No such file: .*policy.py \(from 'policy.py:make'\)"):
         import_factory("policy.py:make", tmp_path)
 
 

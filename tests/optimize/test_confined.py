@@ -227,7 +227,7 @@ def test_a_bundle_that_the_board_computes_otherwise_is_refused_when_it_is_evalua
     assert evaluate(bundle.path) == 0
     assert evaluate(bundle.path, "--profile", old_nuc) == 3
     told = capsys.readouterr().err
-    assert "another golden action than recorded" in told
+    assert "a different golden action than recorded" in told
     assert "OpenVINO confined to AVX2" in told
     assert "this processor" not in told, "it has more than AVX2"
 

@@ -7,17 +7,10 @@ from dataclasses import replace
 import pytest
 
 from vlatool.machine.instruction_sets import compared
-from vlatool.optimize.engines_apart import (
-    IN_OPENVINO,
-    REFERENCE,
-    about_int8,
-    choose_apart,
-    in_int8,
-    joined,
-    on_board,
-    placed,
-)
+from vlatool.optimize.choice_apart import choose_apart, on_board
 from vlatool.optimize.judge import Judged
+from vlatool.optimize.summary import about_int8, in_int8
+from vlatool.optimize.timings import IN_OPENVINO, REFERENCE, joined, placed
 from vlatool.report import Measurement, Row
 
 SET = compared("old", ("avx2",), ("avx2", "avx512f", "avx512_vnni"), "AVX2")
@@ -144,7 +137,7 @@ def test_only_what_multiplies_in_int8_tells_how_int8_does(float_bundle):
         return replace(float_bundle, manifest=replace(float_bundle.manifest, graphs={"main": graph}))
 
     bundles = {"weights": computing({"float32": 1.0}), "fast": computing({"int8": 0.9, "float32": 0.1})}
-    assert in_int8(bundles, {"weights": "openvino", "fast": "openvino"}) == {"fast": "openvino"}
+    assert in_int8(bundles) == {"fast": "ort_cpu"}
 
 
 def test_a_board_without_vnni_and_without_a_plan_is_told_too_and_one_with_vnni_nothing():

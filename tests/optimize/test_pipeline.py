@@ -23,7 +23,7 @@ from vlatool.cli import main
 from vlatool.cli._run import exported
 from vlatool.errors import RecipeError, SourceError
 from vlatool.hardware.profile import load_profile
-from vlatool.optimize.pipeline import make_plan
+from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
 from vlatool.report import Report, read_report
 from vlatool.runtime import load
@@ -229,7 +229,7 @@ def test_a_metric_without_observations_is_refused_before_the_search(model, tmp_p
 
 def test_the_summary_says_which_engine_the_robot_needs(run, recipe):
     mine = recipe("candidates: {mine: [quantize.static_int8: {samples: 8, layout: openvino}]}")
-    needs = "It runs on the engine openvino: pip install 'vlatool[openvino]' on the robot."
+    needs = "It runs on the engine openvino: pip install 'vlatool-runtime[openvino]' on the robot."
     assert needs in run(*NEAREST, *mine).report.summary
 
 
@@ -370,7 +370,7 @@ def test_with_calibration_data_alone_the_error_against_float32_on_a_held_out_hal
 def test_a_candidate_that_cannot_be_made_is_a_row_that_says_why(run, recipe):
     made = run("--max-drop", "100%", *recipe(MISSING))
     assert made.code == 0
-    assert (made.row("lost").role, "There is no data file" in made.row("lost").reason) == ("failed", True)
+    assert (made.row("lost").role, "not found" in made.row("lost").reason) == ("failed", True)
     assert "vlatool" in made.stdout or "PASS" in made.stdout
 
 

@@ -11,9 +11,10 @@ import pytest
 from vlatool.bundle.bundle import Bundle
 from vlatool.hardware.profile import load_profile
 from vlatool.optimize import search as search_module
-from vlatool.optimize.judge import Budget
+from vlatool.optimize.budget import Budget
+from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits
-from vlatool.optimize.search import Search, Trial, built, processor_has, variants_for
+from vlatool.optimize.search import Search, Trial, processor_has, variants_for
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engines.openvino import BF16
 from vlatool.sensitivity.layers import LayerError
@@ -73,7 +74,7 @@ def test_a_plan_with_the_graphs_of_another_one_is_not_tried_again(search) -> Non
 
 def test_every_variant_can_be_built_as_stages() -> None:
     for stages in variants_for(None, calibrated=True).values():
-        assert len(built(stages)) == 1
+        assert len(transforms(stages)) == 1
 
 
 def test_every_plan_is_tried_and_the_fastest_inside_join(search) -> None:
@@ -100,7 +101,7 @@ def test_a_bad_plan_is_mended_by_leaving_layers_in_float(search) -> None:
     bad = run._try("bad", BAD)
     assert bad.error > 0.02
     run.budget = Budget("relative_error", 0.6 * bad.error)
-    run._mix(bad, built(BAD)[-1])
+    run._mix(bad, transforms(BAD)[-1])
     mixed = [trial for trial in run.trials if "mixed" in trial.name]
     assert mixed
     assert min(trial.error for trial in mixed) < bad.error
@@ -175,7 +176,7 @@ def test_finalists_are_the_fastest_inside_and_the_most_accurate(search) -> None:
 def test_the_plan_of_a_trial_makes_the_bundle_that_was_tried(search, float_bundle: Bundle, tmp_path: Path) -> None:
     run = search(metric="relative_error", max_metric=0.5)
     trial = run._try("static_int8", ({"quantize.static_int8": {"samples": 8}},))
-    stage = built(trial.stages)[-1]
+    stage = transforms(trial.stages)[-1]
     assert isinstance(stage, StaticInt8)
     made = cached_transform(stage, float_bundle, tmp_path, Context())
     assert run._error(made, Context()) == trial.error

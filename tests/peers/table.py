@@ -4,7 +4,8 @@
     python tests/peers/table.py --workloads vit-s --ours vit-s=out/my-bundle --skip 'torch*'
     python tests/peers/table.py --report            # print again what was measured last
 
-Models are made once and kept below --work; docs/peers.md says what is compared and how. Exits 1 when a check fails.
+Models are made once and kept below --work; docs/measurements/peers.md says what is compared and how.
+Exits 1 when a check fails.
 """
 
 from __future__ import annotations

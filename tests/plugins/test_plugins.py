@@ -18,6 +18,7 @@ ENTRY_POINTS = """\
 [vlatool.quantize]
 rounded = acme_robotics.rounded:Rounded
 broken = acme_robotics.broken
+no-run = acme_robotics.no_run
 static-int8 = acme_robotics.broken
 absent = acme_robotics.no_such_file
 
@@ -34,6 +35,9 @@ acme = acme_robotics.boards
 
 [vlatool.commands]
 acme = acme_robotics.hello
+
+[vlatool.sections]
+acme = acme_robotics.section
 """
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -130,6 +134,18 @@ def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
     assert "'acme_float16'" in found
 
 
+def test_its_section_is_in_every_format_of_a_report(run: Run):
+    code = (
+        "from vlatool.render import render; from vlatool.report import Measurement, Report, Row; "
+        "row = Row('float32', measurements=(Measurement('latency_p50', 50.0, 'ms'),)); "
+        "print(render(Report('benchmark', 't', rows=(row,)), '{}'))"
+    )
+    for format in ("terminal", "markdown", "html"):
+        text = ok(run("-c", code.format(format)))
+        assert "Inferences in an hour" in text
+        assert "72,000" in text
+
+
 def test_its_bug_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     done = run("quantize", "broken", str(onnx_file), "-o", str(tmp_path / "out"))
     assert done.returncode == 3
@@ -138,17 +154,31 @@ def test_its_bug_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_method_without_run_is_told_as_unfinished(run: Run, onnx_file: Path, tmp_path: Path):
+    done = run("quantize", "no-run", str(onnx_file), "-o", str(tmp_path / "out"))
+    assert done.returncode == 3
+    assert "quantize.no_run has no method run()" in done.stderr
+    assert "bug in vlatool" not in done.stderr
+
+
+def test_its_method_takes_the_options_that_select_layers(run: Run, policy_dir: Path, tmp_path: Path):
+    ok(run("export", str(policy_dir), "-o", str(tmp_path / "float32")))
+    done = run("quantize", "rounded", str(tmp_path / "float32"), "--exclude", "*", "-o", str(tmp_path / "out"))
+    assert done.returncode == 3
+    assert "No layer is left to quantize" in done.stderr
+
+
 def test_what_cannot_be_imported_is_told_as_its_own(run: Run, onnx_file: Path, tmp_path: Path):
     done = run("quantize", "absent", str(onnx_file), "-o", str(tmp_path / "out"))
     assert done.returncode == 3
-    assert "acme-robotics 1.2, which brings 'absent' (vlatool.quantize), cannot be imported" in done.stderr
+    assert "acme-robotics 1.2, which adds 'absent' (vlatool.quantize), cannot be imported" in done.stderr
 
 
 def test_an_engine_that_cannot_be_imported_stands_in_nobodys_way(run: Run, onnx_file: Path, tmp_path: Path):
     ok(run("quantize", "dynamic-int8", str(onnx_file), "-o", str(tmp_path / "out")))
     done = run("benchmark", str(tmp_path / "out"), "--engine", "absent", "--iterations", "20")
     assert done.returncode == 3
-    assert "acme-robotics 1.2, which brings 'absent' (vlatool.engines), cannot be imported" in done.stderr
+    assert "acme-robotics 1.2, which adds 'absent' (vlatool.engines), cannot be imported" in done.stderr
 
 
 def test_it_replaces_nothing_of_vlatools_own(run: Run):
@@ -157,5 +187,5 @@ def test_it_replaces_nothing_of_vlatools_own(run: Run):
 
 def test_the_guide_shows_these_files():
     guide = (ROOT / "docs/guides/add-a-method.md").read_text()
-    for name in ("rounded", "engine", "source"):
+    for name in ("rounded", "engine", "source", "section"):
         assert f"```python\n{(HERE / 'acme_robotics' / f'{name}.py').read_text()}```" in guide

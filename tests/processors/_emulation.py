@@ -20,6 +20,10 @@ from itertools import chain
 from pathlib import Path
 
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
+ROBOT = Path(__file__).parents[2] / "robot"
+"""What describes vlatool-runtime."""
+RUNTIME = "runtime"
+"""Folder of the cache that it is installed in."""
 SOURCES = Path("/etc/apt")
 ELSE = "http://deb.debian.org/debian"
 NEEDS = ("apt-get", "dpkg-deb")
@@ -140,6 +144,19 @@ class Emulators:
         words = [*self.emulated("aarch64", "max"), str(self.python()), "-c", code]
         if (got := said(words, {"PYTHONPATH": str(draft)})) != onnxruntime:
             raise EmulationError(f"The emulated Python imports onnxruntime {got}; wanted {onnxruntime}.")
+
+    def runtime(self) -> Path:
+        """Return a folder with vlatool-runtime, built anew and installed: what a robot has of vlatool.
+
+        Raises:
+            Unreachable: when the package registry, which the build backend comes from, does not answer.
+            EmulationError: when something else fails.
+        """
+        target = self.folder / RUNTIME
+        shutil.rmtree(target, ignore_errors=True)
+        words = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+        told([*words, "--target", str(target), str(ROBOT)], "The package registry")
+        return target
 
     def python(self) -> Path:
         """Return the board's Python."""

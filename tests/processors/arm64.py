@@ -19,7 +19,7 @@ from itertools import product
 from pathlib import Path
 
 from _asked import Answer, ask
-from _emulation import EmulationError, Emulators, Unreachable
+from _emulation import RUNTIME, EmulationError, Emulators, Unreachable
 from _planted import plant
 from _rungs import CPUINFO, model
 from _variants import FLOAT, FOR_ARM, SAMPLES, Made, VariantError, make
@@ -76,6 +76,7 @@ def fetch(cache: Emulators, versions: Sequence[str]) -> None:
     cache.folder.mkdir(parents=True, exist_ok=True)
     cache.qemu("aarch64")
     cache.board()
+    cache.runtime()
     for version in versions:
         cache.wheels(version)
 
@@ -97,7 +98,7 @@ def rows_of(source: str, given: argparse.Namespace, cache: Emulators) -> list[Ro
 def asked(core: str, version: str, made: Made, bundles: dict[str, Path], cache: Emulators) -> dict[str, Answer]:
     """Ask every bundle on an emulated board."""
     python = [*cache.emulated("aarch64", core), str(cache.python())]
-    path = {"PYTHONPATH": f"{cache.wheels(version)}:{Path(__file__).parents[2]}"}
+    path = {"PYTHONPATH": f"{cache.wheels(version)}:{cache.folder / RUNTIME}"}
     out = cache.folder / "answers" / made.name / f"{core}-{version}"
 
     def tell(line: str) -> None:

@@ -129,6 +129,6 @@ def test_the_planted_bundle_is_right_where_it_was_made_and_holds_a_conversion_th
 
 def open_golden(policy):
     """Return the golden observations of an open bundle."""
-    from vlatool.runtime.policy import load_goldens
+    from vlatool.runtime.golden import load_goldens
 
     return [golden[0] for golden in load_goldens(policy.bundle)]

@@ -23,7 +23,7 @@ from vlatool.quantize._blocks import Format
 from vlatool.quantize._compute import Job, records_of
 from vlatool.quantize._journal import DATA, JOURNAL
 from vlatool.quantize._records import Record
-from vlatool.quantize._rewrite import Task, block_task, copy_task
+from vlatool.quantize._rewrite import Task, copy_task, weight_task
 from vlatool.quantize._stream import write_records
 from vlatool.quantize._worker import serve
 from vlatool.stage.base import Tell
@@ -56,7 +56,9 @@ def records(shard: Path) -> list[Record]:
     for tensor in sorted(read_header(shard), key=lambda each: each.name):
         quantized = tensor.name.startswith("layer")
         layer = LayerLike(tensor.name, 128, 64)
-        task: Task = block_task(layer, tensor, FORM, False) if quantized else copy_task(tensor.name, tensor, True)
+        task: Task = (
+            weight_task(layer, tensor, FORM, "ort", False) if quantized else copy_task(tensor.name, tensor, True)
+        )
         found += records_of(task, FORM, "searched", FORM.largest_error)
     return found
 
@@ -209,7 +211,7 @@ def test_an_error_in_a_process_is_the_error_here(shard, tmp_path):
 
 def test_a_loss_beyond_the_bits_is_an_error(shard, tmp_path):
     tensor = next(each for each in read_header(shard) if each.name == "layer.0")
-    task = block_task(LayerLike("layer.0", 128, 64), tensor, FORM, False)
+    task = weight_task(LayerLike("layer.0", 128, 64), tensor, FORM, "ort", False)
     with pytest.raises(GraphError, match=r"Quantizing 'layer\.0' .* loses 0\.0\d+ of its norm; allowed: 0\.01"):
         write(records_of(task, FORM, "rtn", 0.01), tmp_path / "work" / "a")
 
@@ -283,11 +285,11 @@ def entry(dtype: str = "F32", shape: tuple[int, ...] = (2,), begin: int = 0, end
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "no safetensors file, or is cut off: 0 bytes"),
-        (b"PK\x03\x04 this is something else", "no safetensors file, or is cut off"),
+        (b"", "not a safetensors file, or is cut off: 0 bytes"),
+        (b"PK\x03\x04 this is something else", "not a safetensors file, or is cut off"),
         ((99).to_bytes(8, "little") + b"{}", "cannot hold a header of 99"),
         ((2).to_bytes(8, "little") + b"{]", "damaged safetensors header"),
-        (header([1]), "it is no mapping"),
+        (header([1]), "it is not a mapping"),
         (header({"x": {"dtype": "F32"}}), "damaged safetensors header at 'x'"),
         (header(entry("F4")) + bytes(8), "holds 'x' as F4; known dtypes"),
         (header(entry(end=4)) + bytes(8), "cannot take 4 bytes"),
@@ -312,7 +314,7 @@ def test_shards_and_their_index(tmp_path, shard):
     with pytest.raises(SourceError, match=r"says that 'x' is in model\.safetensors, which does not hold it"):
         read_shards(tmp_path, "*.safetensors")
     index.write_text("{}")
-    with pytest.raises(SourceError, match="is no index of safetensors shards"):
+    with pytest.raises(SourceError, match="is not an index of safetensors shards"):
         read_shards(tmp_path, "*.safetensors")
     index.unlink()
     before = fingerprint([shard])

@@ -39,6 +39,7 @@ from vlatool.errors import (
     UsageError,
 )
 from vlatool.remote import _bootstrap, _connection, _place, _push, ssh
+from vlatool.remote._heard import Python
 
 pytestmark = pytest.mark.skipif(shutil.which("ssh") is None, reason="there is no ssh")
 SPEC = {
@@ -58,7 +59,7 @@ def say(**line):
 
 job = json.loads(sys.stdin.readline())
 assert sys.stdin.read() == ""
-say(progress=["begun", 0.25])
+say(progress={"what": "begun", "share": 0.25})
 if job["do"] == "answer":
     from vlatool.bundle.bundle import Bundle
     found = [Bundle.open(path) for path in job["bundles"]]
@@ -69,20 +70,21 @@ if job["do"] == "answer":
     print("{neither this")
     print("and one on standard error", file=sys.stderr)
     open(os.path.join(os.environ["TMPDIR"], "left behind"), "w").close()
-    say(progress=["half", None])
-    say(result={"hashes": [each.hash for each in found], "files": files, "names": [each.path.name for each in found],
-                "engine": job.get("engine"), "private": oct(os.stat("..").st_mode & 0o777)})
+    say(progress={"what": "half", "share": None})
+    value = {"hashes": [each.hash for each in found], "files": files, "names": [each.path.name for each in found],
+             "engine": job.get("engine"), "private": oct(os.stat("..").st_mode & 0o777)}
+    say(result={"value": value})
 elif job["do"] == "wait":
     subprocess.Popen(["sleep", "600"])
-    say(progress=["waiting", None])
+    say(progress={"what": "waiting", "share": None})
     time.sleep(600)
 elif job["do"] == "chat":
     for _ in range(25):
         time.sleep(0.1)
-        say(progress=["still at it", None])
-    say(result={"all": "said"})
+        say(progress={"what": "still at it", "share": None})
+    say(result={"value": {"all": "said"}})
 elif job["do"] == "raise":
-    say(**{"vlatool error": job["kind"], "message": job["bundles"][0] + " is refused.", "fix": "export it again"})
+    say(raised={"kind": job["kind"], "message": job["bundles"][0] + " is refused.", "fix": "export it again"})
 elif job["do"] == "die":
     print("the last words", file=sys.stderr, flush=True)
     os.kill(os.getpid(), job["signal"])
@@ -328,8 +330,8 @@ def test_a_python_without_the_engine(there, bundle, engine, package):
 
 
 def test_a_python_that_the_system_manages_needs_an_environment(there):
-    facts = {"command": "python3", "version": [3, 11, 2], "packages": {}, "errors": {"numpy": "none"}, "managed": True}
-    error = ssh._probe.refusal("board", "", [{"python": facts}, {"none": True}], ("numpy",))
+    python = Python("python3", (3, 11, 2), {}, {"numpy": "none"}, "x86_64", "6", None, managed=True)
+    error = ssh._probe.refusal("board", "", [python], [], ("numpy",))
     assert error.fix == (
         "ssh board 'python3 -m venv --system-site-packages vlatool-venv && "
         "vlatool-venv/bin/python -m pip install numpy', then --remote-python '~/vlatool-venv/bin/python'"
@@ -818,22 +820,22 @@ def test_a_target_that_floods_is_cut_off(there, bundle, instead_of_ssh, monkeypa
         ("say('{')", "makes no sense"),
         ("say('[' * 100_000)", "makes no sense"),
         ("""say('{"a": ' * 40 + '1' + '}' * 40)""", "more than 32 levels"),
-        ("""say('{"python": {"version": [3, 11, NaN]}}')""", "NaN is no number"),
+        ("""say('{"python": {"version": [3, 11, NaN]}}')""", "NaN is not a number"),
         ("""say('{"python": {"version": [3, 11, 1e999]}}')""", "a number is too large"),
         ("say('{\"python\": ' + '9' * 5000 + '}')", "makes no sense"),
-        ("say('{}'); say('{\"python\": {}}')", "'command' of a Python is None"),
-        ("say('{}'); python(version='3')", "'version' of a Python is '3'"),
-        ("say('{}'); python(version=[3, 11])", "version of a Python is"),
-        ("say('{}'); python(free='much')", "'free' of a Python is 'much'"),
-        ("say('{}'); python(packages={'numpy': 1})", "a package of a Python is no text"),
+        ("say('{}'); say('{\"python\": {}}')", "'python' lacks 'command'"),
+        ("say('{}'); python(version='3')", "'python.version' is '3', not a list"),
+        ("say('{}'); python(version=[3, 11])", "'python.version' has 2 values, not 3"),
+        ("say('{}'); python(free='much')", "'python.free' is 'much', not"),
+        ("say('{}'); python(packages={'numpy': 1})", "'python.packages.numpy' is 1, not text"),
         ("[python(packages={}) for _ in range(70)]; time.sleep(2)", "more than 64 Pythons"),
-        ("say('{}'); python(); say('{\"ready\": 1}'); time.sleep(2)", "'ready' is 1, no text"),
+        ("say('{}'); python(); say('{\"ready\": 1}'); time.sleep(2)", "'ready' is 1, not text"),
         ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"x\"}'); time.sleep(2)", "makes no sense"),
-        ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"{}\"}'); time.sleep(2)", "'need' is None"),
-        ("until_measuring(); say('{\"ended\": 1}')", "how it ended is no mapping"),
-        ("until_measuring(); say('{\"ended\": {\"code\": \"0\", \"log\": \"\"}}')", "'code' is '0'"),
-        ("until_measuring(); say('{\"ended\": {\"code\": 0, \"log\": 3}}')", "'log' is 3, no text"),
-        ("until_measuring(); say('{\"agent\": 3}'); time.sleep(2)", "'agent' is 3, no text"),
+        ("say('{}'); python(); say('{\"refused\": \"no room\", \"text\": \"{}\"}'); time.sleep(2)", "lacks 'free'"),
+        ("until_measuring(); say('{\"ended\": 1}')", "'ended' is 1, not a mapping"),
+        ("until_measuring(); say('{\"ended\": {\"code\": \"0\", \"log\": \"\"}}')", "'ended.code' is '0'"),
+        ("until_measuring(); say('{\"ended\": {\"code\": 0, \"log\": 3}}')", "'ended.log' is 3, not text"),
+        ("until_measuring(); say('{\"agent\": 3}'); time.sleep(2)", "'agent' is 3, not text"),
         ("""until_measuring(); say(json.dumps({"agent": '{"result": {"p50": 1e999}}'})); time.sleep(2)""",
          "a number is too large"),
     ],
@@ -860,8 +862,8 @@ def test_a_target_that_never_ends_is_cut_off(there, bundle, evil, monkeypatch):
 def test_nothing_of_a_target_reaches_the_terminal_raw(there, bundle, evil):
     evil(r"""
     until_measuring()
-    say(json.dumps({"agent": json.dumps({"progress": ["\x1b]0;owned\x07 half\nway", 0.5]})}))
-    raised = {"vlatool error": "GraphError", "message": "\x1b[2Jgone", "fix": "\u202etxt"}
+    say(json.dumps({"agent": json.dumps({"progress": {"what": "\x1b]0;owned\x07 half\nway", "share": 0.5}})}))
+    raised = {"raised": {"kind": "GraphError", "message": "\x1b[2Jgone", "fix": "\u202etxt"}}
     say(json.dumps({"agent": json.dumps(raised)}))
     say(json.dumps({"ended": {"code": 0, "log": ""}}))
     """)

@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
+from html import unescape
 
 import pytest
 from _render_reports import board, hwselect
 
 from vlatool.render import render
-from vlatool.render._boards import HEADS, by_state, cells, chart, costs, limit_ms, reasons, way
+from vlatool.render.document import build
+from vlatool.render.sections.boards import HEADS, board_table, cells, cost_table, limit_ms, scatter, way
 from vlatool.report import Measurement, Report, Row
 
 STYLES = ("terminal", "markdown", "html")
@@ -16,7 +19,7 @@ STYLES = ("terminal", "markdown", "html")
 
 @pytest.mark.parametrize("style", STYLES)
 def test_every_board_its_reason_and_its_state_are_told(style: str) -> None:
-    text = " ".join(re.sub(r"<[^>]+>|\\", " ", render(hwselect(), style)).replace("&#x27;", "'").split())
+    text = " ".join(unescape(re.sub(r"<[^>]+>|\\", " ", render(hwselect(), style).replace("<wbr>", ""))).split())
     for row in hwselect().rows:
         assert row.name in text
     for words in ("Fits", "May fit: the interval crosses a limit", "Unknown: no ground for a prediction", "Ruled out",
@@ -32,11 +35,11 @@ def test_nothing_is_called_measured(style: str) -> None:
 
 
 def test_states_come_in_order_and_only_those_that_occur() -> None:
-    headings = [heading.split(":")[0] for heading, _ in by_state(hwselect())]
-    assert headings == ["Fits", "May fit", "Unknown", "Ruled out"]
+    states = [section for section in build(hwselect()).sections if section.order == 20]
+    assert [section.title.split(":")[0] for section in states] == ["Fits", "May fit", "Unknown", "Ruled out"]
     one = replace(hwselect(), rows=hwselect().rows[:1])
-    assert [heading for heading, _ in by_state(one)] == ["Fits"]
-    assert sum(len(rows) for _, rows in by_state(hwselect())) == len(hwselect().rows)
+    assert [section.title for section in build(one).sections if section.order == 20] == ["Fits"]
+    assert sum(len(section.blocks[0].lines) for section in states) == len(hwselect().rows)
 
 
 def test_the_cells_of_a_board() -> None:
@@ -50,15 +53,22 @@ def test_a_latency_of_hundreds_has_no_decimals() -> None:
     assert cells(board("pi", "fits", 1234.5, 80.0))[3] == "1234 (617–2469)"
 
 
+def costs(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """Return the titles and the texts of the table of costs."""
+    table = cost_table(rows)
+    assert table is not None
+    return [column.title for column in table.columns], [[cell.text for cell in line.cells] for line in table.lines]
+
+
 def test_columns_of_the_cost_that_say_nothing_are_left_out() -> None:
-    titles, body = costs(hwselect())
+    titles, body = costs(hwselect().rows)
     assert titles == ["board", "W", "mean W", "J", "owned $"]
     assert body[0] == ["raspberry-pi-5", "9.8", "5.5", "0.20", "12,345"]
     assert [line[0] for line in body] == ["raspberry-pi-5", "jetson-orin-nano", "jetson-nano", "raspberry-pi-4"]
     life = Measurement("battery_life", 12.5, "h", "predicted")
     first, *others = hwselect().rows
     report = replace(hwselect(), rows=(replace(first, measurements=(*first.measurements, life)), *others))
-    titles, body = costs(report)
+    titles, body = costs(report.rows)
     assert "battery h" in titles
     assert body[0][titles.index("battery h")] in ("12", "13", "12.5")
     assert body[1][titles.index("battery h")] == "–"
@@ -66,14 +76,15 @@ def test_columns_of_the_cost_that_say_nothing_are_left_out() -> None:
 
 def test_without_costs_there_is_no_table_of_them() -> None:
     bare = replace(hwselect(), rows=(board("pi", "fits", 20.0, 80, cost=False),))
-    assert costs(bare)[1] == []
+    assert cost_table(bare.rows) is None
     for style in STYLES:
         assert "Power and cost" not in render(bare, style)
 
 
 def test_reasons_name_board_and_engine() -> None:
-    assert reasons(hwselect().rows)[0] == "raspberry-pi-5, ort_cpu: raspberry-pi-5 is fits"
-    assert reasons(hwselect().rows)[-1] == "jetson-agx-thor: costs 3,499 dollars, more than 500"
+    first, *_, last = (line.remark for line in board_table(hwselect().rows).lines)
+    assert first == "raspberry-pi-5, ort_cpu: raspberry-pi-5 is fits"
+    assert last == "jetson-agx-thor: costs 3,499 dollars, more than 500"
     assert way(Row("bare")) == {}
 
 
@@ -88,9 +99,12 @@ def test_the_limit_is_the_stricter_of_rate_and_latency(limits: dict[str, float],
 
 @pytest.mark.parametrize("width", [360, 760])
 def test_the_chart_has_a_point_for_each_prediction(width: int) -> None:
-    drawn = chart(hwselect(), width)
-    assert drawn.count("<circle") == 4, "two boards have no latency"
-    assert drawn.count('class="hollow') == 1
+    plot = scatter(hwselect())
+    assert plot is not None
+    drawn = plot.draw(width).svg()
+    assert drawn.count('class="dot') == 3
+    assert drawn.count('class="hollow') == 1, "two boards have no latency"
+    assert drawn.count('class="ring') == 1
     assert "limit 100 ms" in drawn
     assert "raspberry-pi-5: 20 (10–40) ms" in drawn
 

@@ -9,7 +9,7 @@ import re
 import pytest
 
 from vlatool.render import render
-from vlatool.render._labels import Box, Label, Mark, labels
+from vlatool.render.charts.labels import Box, Label, Mark, labels
 from vlatool.report import Measurement, Report, Row
 
 FRAME = (46.0, 16.0, 992.0, 320.0)

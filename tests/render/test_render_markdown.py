@@ -6,7 +6,7 @@ import pytest
 from _render_reports import KINDS, hostile, optimize, sustained
 
 from vlatool.render import render
-from vlatool.render.markdown import inline
+from vlatool.render.formats.markdown import inline
 from vlatool.report import Report, Row
 
 
@@ -44,10 +44,8 @@ def test_headline_measured_and_predicted() -> None:
     text = render(optimize(), "markdown")
     assert text.startswith("### ✅ PASS: static\\_int8 is 3.5 times as fast.")
     assert "98.4 % (97.4–99.0, n = 1000)" in text
-    measured, predicted = (
-        text.index("**Measured on this host: AMD EPYC.**"),
-        text.index("**Predicted for raspberry-pi-5**"),
-    )
+    measured = text.index("**Variants** (measured on this host: AMD EPYC).")
+    predicted = text.index("**Predicted for raspberry-pi-5** (computed by a model, not measured).")
     assert predicted < text.index("35.4 ms (23.6–59.0)") < measured
     assert "(computed by a model, not measured)" in text
     assert "unmeasured: engine refused" in text

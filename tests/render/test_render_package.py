@@ -11,7 +11,9 @@ from _render_reports import KINDS, optimize
 from vlatool import registry
 from vlatool.errors import OutputError, UsageError
 from vlatool.files.writing import writing
-from vlatool.render import FILES, _format, _samples, _scatter, _svg, _tables, render, write_reports
+from vlatool.render import FILES, _format, render, write_reports
+from vlatool.render.charts import samples, svg
+from vlatool.render.sections import details, trade_off
 from vlatool.report import Measurement, Report, Row, read_report
 
 
@@ -108,7 +110,7 @@ def test_labels_and_limits() -> None:
 
 def test_ecdf_keeps_ends_and_few_points() -> None:
     ordered = [float(value) for value in range(1, 5001)]
-    points = _samples.ecdf(ordered)
+    points = samples.ecdf(ordered)
     assert len(points) <= 125
     assert points[0] == (1.0, 1 / 5000)
     assert points[-1] == (5000.0, 1.0)
@@ -116,51 +118,51 @@ def test_ecdf_keeps_ends_and_few_points() -> None:
 
 
 def test_histogram_envelope_and_sparkline() -> None:
-    assert _samples.histogram([0.0, 0.5, 1.0, 2.0], lambda value: value, 2) == [1, 2]
-    band = _samples.Band
-    assert _samples.envelope([0.0, 1.0, 9.0, 10.0], [3.0, 1.0, 2.0, 9.0], 2) == [
+    assert samples.histogram([0.0, 0.5, 1.0, 2.0], lambda value: value, 2) == [1, 2]
+    band = samples.Band
+    assert samples.envelope([0.0, 1.0, 9.0, 10.0], [3.0, 1.0, 2.0, 9.0], 2) == [
         band(2.5, 1.0, 1.0, 3.0, 3.0, 3.0), band(7.5, 2.0, 2.0, 9.0, 9.0, 9.0),
     ]  # fmt: skip
-    assert [found.at for found in _samples.envelope([0.0, 0.1, 8.0], [1.0, 2.0, 3.0], 4)] == [1.0, 7.0]
+    assert [found.at for found in samples.envelope([0.0, 0.1, 8.0], [1.0, 2.0, 3.0], 4)] == [1.0, 7.0]
     hundred = [float(value) for value in range(100)]
-    assert _samples.envelope([5.0] * 100, hundred, 3) == [band(5.0, 0.0, 9.0, 50.0, 89.0, 99.0)]
-    assert _samples.sparkline([1.0] * 5, 8) == "█"
-    assert len(_samples.sparkline([float(value) for value in range(100)], 8)) == 8
+    assert samples.envelope([5.0] * 100, hundred, 3) == [band(5.0, 0.0, 9.0, 50.0, 89.0, 99.0)]
+    assert samples.sparkline([1.0] * 5, 8) == "█"
+    assert len(samples.sparkline([float(value) for value in range(100)], 8)) == 8
 
 
 @pytest.mark.parametrize(("low", "high"), [(7.0, 60.0), (0.001, 5000.0), (3.0, 3.3), (1e-7, 9e-7), (0.0, 1.0)])
 def test_ticks_are_few_and_inside(low: float, high: float) -> None:
-    axis = _svg.axis_for([low, high], 0, 100)
+    axis = svg.axis_for([low, high], 0, 100)
     ticks = axis.ticks(6)
     assert 2 <= len(ticks) <= 8
     assert all(axis.low <= value <= axis.high for value in ticks)
 
 
 def test_wide_logarithmic_axis_falls_back_to_a_few_decades() -> None:
-    assert len(_svg.Axis(1e-6, 1e9, 0, 1, log=True).ticks(5)) >= 2
-    assert len(_svg.Axis(1.1, 1.9, 0, 1, log=True).ticks(5)) >= 2
+    assert len(svg.Axis(1e-6, 1e9, 0, 1, log=True).ticks(5)) >= 2
+    assert len(svg.Axis(1.1, 1.9, 0, 1, log=True).ticks(5)) >= 2
 
 
 def test_pareto_front_leaves_out_the_dominated() -> None:
-    assert [point.name for point in _scatter.front(_scatter.points(optimize()))] == [
-        "pruned_50_static_int8", "static_int8", "dynamic_int8",
-    ]  # fmt: skip
-    assert _scatter.front([]) == []
+    plot = trade_off.scatter(optimize())
+    assert plot is not None
+    assert [point.name for point in plot.front()] == ["pruned_50_static_int8", "static_int8", "dynamic_int8"]
+    assert trade_off.scatter(Report("optimize", "t")) is None
 
 
 def test_details_of_several_variants_become_one_table() -> None:
-    (table,) = _tables.details(optimize())
-    assert table.columns[:2] == ("task", "variant")
-    assert [row[0] for row in table.rows] == ["reach", "", "", "", "", "push", "", "", "", ""]
-    assert table.rows[0][2:] == ("0.9", "0.8", "0.95", "200", "no")
+    (table,) = details.tables(optimize())
+    assert [column.title for column in table.columns[:2]] == ["task", "variant"]
+    assert [line.cells[0].text for line in table.lines] == ["reach", "", "", "", "", "push", "", "", "", ""]
+    assert [cell.text for cell in table.lines[0].cells[2:]] == ["0.9", "0.8", "0.95", "200", "no"]
 
 
 def test_details_columns_keep_their_decimals() -> None:
     records = [{"steps": 54.4, "p": 1e-12}, {"steps": 52.0, "p": 0.5}, {}, {"steps": None}]
-    (table,) = _tables.details(Report("evaluate", "t", rows=(Row("a", details={"d": records, "none": []}),)))
+    (table,) = details.tables(Report("evaluate", "t", rows=(Row("a", details={"d": records, "none": []}),)))
     assert table.title == "d: a"
-    assert [row[0] for row in table.rows] == ["54.4", "52.0", "–"]
-    assert table.rows[0][1] == "1e−12"
+    assert [line.cells[0].text for line in table.lines] == ["54.4", "52.0", "–"]
+    assert table.lines[0].cells[1].text == "1e−12"
 
 
 def test_repeated_numbers_of_another_profile_stay_with_it() -> None:
@@ -170,7 +172,7 @@ def test_repeated_numbers_of_another_profile_stay_with_it() -> None:
     report = Report("optimize", "t", rows=(Row("x", measurements=items),))
     text = render(report, "markdown")
     assert text.index("1.00 ms") < text.index("Predicted for b") < text.index("2.00 ms")
-    assert "Nothing was measured" in text
+    assert "nothing was measured" in text
 
 
 def test_one_bound_alone_is_shown_as_one() -> None:

@@ -8,7 +8,7 @@ from _render_reports import KINDS, compare, hostile, optimize, sustained
 from rich.cells import cell_len
 
 from vlatool.render import render
-from vlatool.render.terminal import TerminalRenderer
+from vlatool.render.formats.terminal import TerminalRenderer
 from vlatool.report import Measurement, Report, Row
 
 ANSI = re.compile(r"\x1b\[[\d;]*m")
@@ -90,27 +90,33 @@ def test_distrust_stands_below_the_result_with_its_remedy() -> None:
 
 def test_percentiles_of_one_variant_are_one_table() -> None:
     text = render(sustained(1), "terminal")
-    assert re.search(r"^latency, ms +value +at most \(99 %\)$", text, re.M)
+    assert re.search(r"^latency, ms +float32 +at most \(99 %\)$", text, re.M)
     assert re.search(r"^p50 +4\d\.\d +≤ 4\d\.\d$", text, re.M)
     assert re.search(r"^p99\.9 +–$", text, re.M)
     assert "300 calls." in text
     assert re.search(r"^deadline misses +1\.2 % +0\.8–1\.7 +n = 2400$", text, re.M)
     assert re.search(r"^highest temperature +78\.5 °C$", text, re.M)
-    assert text.count("latency p50") == 0
+    assert text.count("latency p50") == 1
 
 
 def test_percentiles_of_two_variants_stand_side_by_side() -> None:
     text = render(sustained(2), "terminal")
     assert re.search(r"^p50 +4\d\.\d  ≤ 4\d\.\d +1\d\.\d  ≤ 1\d\.\d$", text, re.M)
-    assert "≤: at most (99 %). 300 calls each." in text
+    assert "Beside each number: at most (99 %)." in text
+    assert "300 calls each." in text
+
+
+def test_why_a_percentile_is_missing_stands_once_and_below_the_percentiles() -> None:
+    text = " ".join(render(sustained(2), "terminal").split())
+    reason = "p99.9: needs 6,636 independent calls, this run is worth 1,204; pass --iterations 33000 300 calls each."
+    assert text.count("6,636") == 1
+    assert text.index("Latency percentiles") < text.index(reason) < text.index("How latency is spread")
 
 
 def test_what_is_unmeasured_is_one_block_and_one_line_for_each_reason() -> None:
     text = render(sustained(2), "terminal")
     block = text.partition("\nUnmeasured\n")[2].partition("\n\n")[0]
     assert [line.strip() for line in block.splitlines()] == [
-        "latency p99.9: needs 6,636 independent calls, this run is worth 1,204; pass",
-        "--iterations 33000",
         "energy per action, mean power: no power meter",
         "GPU memory, GPU clock: no GPU",
     ]

@@ -14,7 +14,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-BLOCKED = {"torch", "onnx", "onnxscript", "onnx_ir", "pydantic", "typer", "rich", "yaml", "psutil", "tokenizers"}
+BLOCKED = {
+    "torch",
+    "onnx",
+    "onnxscript",
+    "onnx_ir",
+    "pydantic",
+    "typer",
+    "rich",
+    "yaml",
+    "psutil",
+    "jinja2",
+    "scipy",
+    "tokenizers",
+}
 
 
 class Absent:
@@ -47,7 +60,7 @@ def main() -> None:
     imported = time.perf_counter()
     policy = vlatool.load(given.bundle, threads=1)
     loaded = time.perf_counter()
-    from vlatool.runtime.policy import load_golden
+    from vlatool.runtime.golden import load_golden
 
     golden = load_golden(policy.bundle)
     if golden is None:

@@ -74,7 +74,7 @@ class Tensor:
 
 def test_a_value_that_gives_no_array_is_told(tmp_path: Path):
     policy = load(written(tmp_path, NEG).path)
-    with pytest.raises(DataError, match="is a Tensor, which gives no numpy array"):
+    with pytest.raises(DataError, match="is a Tensor, which cannot be converted to a numpy array"):
         policy.infer({"x": Tensor()})
 
 

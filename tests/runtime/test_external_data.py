@@ -143,7 +143,7 @@ def wrapped(entry: bytes) -> bytes:
     ("content", "message"),
     [
         (b"\x3a\x7flocation", "a part of it is longer than the whole"),
-        (wrapped(b"\x0a\x08location\x12\x01\xff"), "no UTF-8"),
+        (wrapped(b"\x0a\x08location\x12\x01\xff"), "not UTF-8"),
         (b"location\x0b", "an unknown kind"),
         (b"\x12\x08location\x80", "ends within a number"),
         (b"\x80\x80\x80\x80\x80\x80\x80location", "a number in it is too long"),

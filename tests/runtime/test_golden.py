@@ -19,7 +19,8 @@ from vlatool.runtime import load
 from vlatool.runtime.arithmetic import SATURATING
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
-from vlatool.runtime.policy import load_golden, load_goldens, relative_error
+from vlatool.runtime.golden import load_golden, load_goldens
+from vlatool.runtime.policy import relative_error
 from vlatool.stage.finish import GOLDEN, save_npz, write_golden
 
 SPEC = PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0)
@@ -71,11 +72,11 @@ def test_they_are_replayed_in_the_same_way(bundle, warmup):
 def test_a_policy_whose_state_is_dropped_is_refused(bundle):
     dropped = replace(STEP, gives={"y": "y"})
     seal(bundle.path, replace(bundle.manifest, program=(dropped,)))
-    with pytest.raises(GraphError, match="another golden action"):
+    with pytest.raises(GraphError, match="a different golden action"):
         load(bundle.path)
     noisy = replace(STEP, gives={"y": "y"}, keep={}, noise={"memory": {"shape": [1, 2], "distribution": "zeros"}})
     seal(bundle.path, replace(bundle.manifest, program=(noisy,)))
-    with pytest.raises(GraphError, match="another golden action"):
+    with pytest.raises(GraphError, match="a different golden action"):
         load(bundle.path)
 
 
@@ -136,7 +137,7 @@ def test_other_statistics_of_the_action_show_in_the_golden_chunk(float_bundle, c
     table = json.loads(file.read_text())
     table["action"]["std"] = [-2 * abs(value) if value < 0 else 2 * value for value in table["action"]["std"]]
     file.write_text(json.dumps(table))
-    with pytest.raises(GraphError, match="another golden action"):
+    with pytest.raises(GraphError, match="a different golden action"):
         load(resealed(bundle).path)
 
 
@@ -152,7 +153,7 @@ def test_other_statistics_of_a_small_element_show_beside_a_large_one(float_bundl
     assert right.golden_chunk_error == pytest.approx(0, abs=1e-4)
     table["action"]["std"] = [0.002, 1.0]
     file.write_text(json.dumps(table))
-    with pytest.raises(GraphError, match="another golden action in physical units"):
+    with pytest.raises(GraphError, match="a different golden action in physical units"):
         load(resealed(bundle).path)
 
 
@@ -176,7 +177,9 @@ def test_each_golden_action_has_a_tolerance_of_its_own(bundle, key, where):
     if key == "chunk.y":
         manifest = replace(manifest, golden_tolerance=0.3, golden_chunk_tolerance=0.01)
     scaled(seal(bundle.path, manifest), key, 1 / 1.1)
-    with pytest.raises(GraphError, match=rf"another golden action{where} recorded: relative error 0\.1, allowed 0\.01"):
+    with pytest.raises(
+        GraphError, match=rf"a different golden action{where} recorded: relative error 0\.1, allowed 0\.01"
+    ):
         load(bundle.path)
     policy = load(bundle.path, golden_tolerance=0.2)
     found = (policy.golden_error, policy.golden_chunk_error)
@@ -192,10 +195,10 @@ def test_a_bundle_from_before_has_one_tolerance_for_both(bundle):
 def test_another_engine_than_the_bundle_was_made_for_is_told(bundle):
     pytest.importorskip("openvino")
     scaled(bundle, "out.y", 2.0)
-    with pytest.raises(GraphError, match="another golden action") as caught:
+    with pytest.raises(GraphError, match="a different golden action") as caught:
         load(bundle.path, engine="openvino")
     assert "was made for ort_cpu: load it with engine='ort_cpu'" in caught.value.fix
-    with pytest.raises(GraphError, match="another golden action") as caught:
+    with pytest.raises(GraphError, match="a different golden action") as caught:
         load(bundle.path)
     assert "was made for" not in caught.value.fix
 
@@ -214,7 +217,7 @@ def test_arithmetic_that_is_not_exact_is_told_of_an_int8_policy_alone(int8_bundl
     monkeypatch.setattr(OrtCpuSession, "arithmetic", staticmethod(lambda: SATURATING))
     for bundle, told in ((int8_bundle, True), (float_bundle, False)):
         policy = load(bundle.path)
-        with pytest.raises(GraphError, match="another golden action") as caught:
+        with pytest.raises(GraphError, match="a different golden action") as caught:
             policy.warm_up(1, tolerance=-1.0)
         assert ("int8 products are saturating" in caught.value.message) == told
         assert ("--reduce-range" in caught.value.fix) == told
@@ -232,9 +235,9 @@ def test_where_openvino_saturates_the_remedy_is_what_was_seen_to_be_right(int8_b
 @pytest.mark.parametrize(
     ("engine", "said", "words"),
     [
-        ("openvino", "AVX2", r"^This machine \(OpenVINO confined to AVX2 by ONEDNN_MAX_CPU_ISA\) computes another"),
-        ("openvino", "", "^This machine computes another"),
-        ("ort_cpu", "AVX2", "^This machine computes another"),
+        ("openvino", "AVX2", r"^This machine \(OpenVINO confined to AVX2 by ONEDNN_MAX_CPU_ISA\) computes a different"),
+        ("openvino", "", "^This machine computes a different"),
+        ("ort_cpu", "AVX2", "^This machine computes a different"),
     ],
 )
 def test_what_openvino_is_confined_to_is_no_machine(float_bundle, monkeypatch, engine, said, words):

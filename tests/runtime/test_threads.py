@@ -81,7 +81,7 @@ def test_calls_that_overlap_on_a_policy_with_memory_are_refused(tmp_path: Path):
     thread = threading.Thread(target=lambda: results.append(policy.infer({"x": [1, 2]})))
     thread.start()
     assert session.entered.wait(30)
-    with pytest.raises(UsageError, match="keeps values from step to step") as caught:
+    with pytest.raises(UsageError, match="keeps values between steps") as caught:
         policy.infer({"x": [3, 4]})
     assert "one policy for each thread" in caught.value.fix
     session.leave.set()
@@ -111,7 +111,7 @@ def test_a_call_within_a_call_of_the_same_thread_is_refused_and_does_not_hang(tm
     session.leave.set()
     arguments = ({"x": [1, 2]},) if call == "infer" else ()
     session.inside = lambda: getattr(policy, call)(*arguments)
-    with pytest.raises(UsageError, match="while it infers, in the same thread"):
+    with pytest.raises(UsageError, match="again during an inference, in the same thread"):
         policy.infer({"x": [1, 2]})
     session.inside = lambda: None
     assert policy.infer({"x": [1, 2]}).sequence == 0

@@ -93,12 +93,12 @@ def test_what_makes_a_text_too_long_is_refused(name: str):
 )
 @pytest.mark.parametrize("role", ["normalizer", "pre_tokenizer", "post_processor"])
 def test_a_step_that_is_not_known_is_refused(step: dict[str, Any], role: str):
-    with pytest.raises(SpecError, match="of which is not known how long it makes a text"):
+    with pytest.raises(SpecError, match="whose effect on the length of a text is not known"):
         growth({role: step}, "The tokenizer x")
 
 
 def test_a_step_that_is_no_mapping_is_refused():
-    with pytest.raises(SpecError, match="a step of it is no mapping"):
+    with pytest.raises(SpecError, match="one of its steps is not a mapping"):
         growth({"normalizer": sequence([])}, "The tokenizer x")  # type: ignore[arg-type]
 
 

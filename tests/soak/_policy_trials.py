@@ -25,7 +25,7 @@ from vlatool.stage.run import run_transform
 ENGINES = ("ort_cpu", "openvino")
 FLOAT, HALF, EIGHT_BITS, AT_RUN_TIME, INT8, INT4 = 1e-4, 0.005, 0.05, 0.1, 0.25, 0.7
 """Largest relative L2 drift of the actions from torch, of networks of a few random layers: up to three times what the
-worst of 300 policies lost when no defect was left (docs/measured.md)."""
+worst of 300 policies lost when no defect was left (docs/measurements/robustness.md)."""
 METHODS: dict[str, tuple[str, dict[str, Any], float]] = {
     "static": ("quantize.static_int8", {}, INT8),
     "static-all": ("quantize.static_int8", {"attention": True, "elementwise": True}, 2 * INT8),

@@ -32,9 +32,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.gate.config import Gate, LatencyClaim
-from vlatool.gate.found import worst
+from vlatool.gate.result import worst
 from vlatool.gate.run import run_gate
-from vlatool.measurement.pairs import Job, measure_pairs
+from vlatool.measurement.pairs import PairJob, measure_pairs
 from vlatool.stage.base import Context
 from vlatool.stats.sequential import jointly
 
@@ -140,9 +140,9 @@ def slower(base: Bundle, share: float, folder: Path) -> Bundle:
 
 def cost(base: Bundle, candidate: Bundle, processes: int = 7) -> float:
     """Return by how much a bundle is slower, the median of some processes."""
-    job = Job(str(base.path), str(candidate.path))
+    job = PairJob(str(base.path), str(candidate.path))
     return float(
-        np.expm1(median(measure_pairs(Job(**{**vars(job), "seed": seed})).log_ratio for seed in range(processes)))
+        np.expm1(median(measure_pairs(PairJob(**{**vars(job), "seed": seed})).log_ratio for seed in range(processes)))
     )
 
 

@@ -119,8 +119,10 @@ class StreamWork:
 
 def make_policy(folder: Path, layers: int) -> Path:
     """Write the policy."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from _llama import write_llama
+
     from vlatool.samples._language import DecoderShape
-    from vlatool.samples._llama import write_llama
 
     write_llama(folder, shape=DecoderShape(layers=layers, **POLICY), length=8, shard_bytes=1 << 25)
     return folder

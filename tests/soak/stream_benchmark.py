@@ -76,7 +76,8 @@ def main() -> int:
     parser.add_argument("options", nargs="*", help="options of `vlatool quantize weight-only`, after --")
     given = parser.parse_args()
     if given.make:
-        from vlatool.samples._llama import write_llama
+        sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+        from _llama import write_llama
 
         start = time.perf_counter()
         count = write_llama(given.folder, layers=given.layers)

@@ -26,7 +26,7 @@ from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
 from vlatool.measurement.clock_drift import drift
 from vlatool.measurement.interleaved import Contestant, latency_measurements
-from vlatool.measurement.job import Job
+from vlatool.measurement.jobs import LatencyJob
 from vlatool.measurement.paced import run_paced
 from vlatool.measurement.validity import MOVED, findings
 from vlatool.measurement.worker import measure
@@ -58,8 +58,9 @@ def main() -> int:
 def invalid(policy: Policy, bundle: Bundle) -> bool:
     """Say whether a short run of a policy is found invalid."""
     contestant = Contestant("x", bundle, policy, observations_for(bundle, 16))
-    found = measure([contestant], Job((str(bundle.path),), iterations=200, warmup=2), lambda *_: None)
-    return any(each.effect == "invalid" for each in findings(found))
+    job = LatencyJob((str(bundle.path),), iterations=200, warmup=2)
+    found = findings(measure([contestant], job, lambda *_: None), job)
+    return any(each.effect == "invalid" for each in found)
 
 
 class Quick:
@@ -81,9 +82,8 @@ def stalls_show() -> bool:
     """Say whether stalls of 50 ms in every 1,000th call show in the 99.9th percentile and the maximum."""
     quick = Quick()
     contestant = Contestant("x", quick.bundle, Stalling(quick, 1000), [{"x": 0.0}])
-    job = Job(("x",), iterations=20_000, warmup=0, check=False)
-    found = measure([contestant], job, lambda *_: None)["policies"][0]
-    samples = [value for block in found["blocks_ms"] for value in block]
+    job = LatencyJob(("x",), iterations=20_000, warmup=0, check=False)
+    samples = measure([contestant], job, lambda *_: None).policies[0].samples
     told = {each.name: each for each in latency_measurements(np.random.default_rng(0).permutation(samples))}
     return told["latency_p99.9"].high >= 50 and told["latency_max"].value >= 50
 
@@ -102,7 +102,9 @@ def stalls_show_in_a_loop(seed: int) -> bool:
 
     policy = Stalling(Slow(), 1000, sleep=passes)
     ticks = run_paced(policy, [{"x": 0.0}], 100.0, 8000, clock=lambda: now[0], sleep=passes)
-    told = {each.name: each for each in latency_measurements(ticks.response_ms, most=ticks.to_dict()["worth"])}
+    told = {
+        each.name: each for each in latency_measurements(ticks.response_ms, most=ticks.pace().effective_sample_size)
+    }
     return told["latency_p99.9"].value >= 20 and told["latency_max"].value >= 50 and ticks.misses >= 7 * 5
 
 

@@ -26,7 +26,10 @@ sys.path.insert(0, sys.argv[1])
 import numpy, onnxruntime
 from statistics import median
 from vlatool.runtime import load
-from vlatool.runtime.policy import load_golden
+try:
+    from vlatool.runtime.golden import load_golden
+except ImportError:  # an older commit
+    from vlatool.runtime.policy import load_golden
 import vlatool
 assert vlatool.__file__.startswith(sys.argv[1]), vlatool.__file__
 begun = time.perf_counter()

@@ -93,7 +93,7 @@ def test_external_data_that_is_missing(tmp_path: Path, onnx_file):
 
 
 def test_a_missing_file(tmp_path: Path):
-    with pytest.raises(SourceError, match="There is no ONNX file"):
+    with pytest.raises(SourceError, match="No such ONNX file"):
         OnnxFile(model=tmp_path / "absent.onnx").check(None, None)
 
 
@@ -303,5 +303,7 @@ def test_a_file_that_takes_noise_as_an_input_gets_it_from_its_program(tmp_path: 
 
 
 def test_a_program_of_other_graphs_than_the_file(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="runs the graph 'denoise'; a policy that is one ONNX file has the graph 'm"):
+    with pytest.raises(
+        SourceError, match="runs the graph 'denoise'; a policy that is one ONNX file only has the graph 'm"
+    ):
         build(tmp_path / "out", noisy(tmp_path, "denoise"), policy=tmp_path)

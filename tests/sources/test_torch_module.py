@@ -80,7 +80,7 @@ def test_no_factory(policy_dir: Path):
 
 def test_a_factory_file_that_does_not_exist(policy_dir: Path):
     edit(policy_dir, "policy.py:make", "polisy.py:make")
-    with pytest.raises(SourceError, match=r"There is no file .*polisy.py"):
+    with pytest.raises(SourceError, match=r"No such file: .*polisy.py"):
         TorchModule(policy=policy_dir).check(None, None)
 
 

@@ -14,7 +14,7 @@ from vlatool.errors import GraphError
 from vlatool.runtime import arithmetic, load
 from vlatool.runtime.arithmetic import SATURATING
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
-from vlatool.runtime.policy import load_golden
+from vlatool.runtime.golden import load_golden
 from vlatool.stage.finish import ENGINE_DIFFERENCE, carry_over, finish, reseal, save_npz
 
 
@@ -112,7 +112,7 @@ def test_rounding_of_an_action_that_is_near_zero_in_physical_units_is_no_other_a
     policy = load(made.path, threads=1)
     assert policy.golden_chunk_error == pytest.approx(0.008, abs=1e-4)
     wrong_engine(1.02)
-    with pytest.raises(GraphError, match="another golden action than"):
+    with pytest.raises(GraphError, match="a different golden action than"):
         load(made.path, threads=1)
 
 

@@ -157,5 +157,5 @@ def test_no_samples():
     [(0.99, 1, 31.8205), (0.975, 2, 4.3027), (0.99, 7, 2.998), (0.995, 19, 2.8609), (0.975, 1000, 1.9623), (0.5, 3, 0)],
 )
 def test_students_quantiles_are_those_of_the_tables(share, freedom, value):
-    assert student(share, freedom) == pytest.approx(value, rel=2e-4, abs=1e-4)
-    assert student(1 - share, freedom) == pytest.approx(-student(share, freedom), abs=1e-3)
+    assert student(share, freedom) == pytest.approx(value, rel=2e-5, abs=1e-9)
+    assert student(1 - share, freedom) == pytest.approx(-student(share, freedom), rel=1e-9, abs=1e-9)

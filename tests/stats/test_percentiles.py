@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from vlatool.stats.percentiles import (
+    effective_sample_size,
     exceeding,
     floor,
     independent,
     intraclass,
-    midranks,
     percentile,
     proven_above,
-    worth_of,
 )
 
 
@@ -52,7 +51,7 @@ def test_a_percentile_by_hand() -> None:
     found = percentile(calls, 99)
     assert (found.name, found.value) == ("p99", math.ceil(0.99 * 1307))
     assert found.bound == 1302, "five of 1307 may exceed it"
-    assert found.worth == 1307
+    assert found.effective_sample_size == 1307
 
 
 def lognormal(random: np.random.Generator) -> np.ndarray:
@@ -103,8 +102,15 @@ def test_one_long_stall_does_not_hide_that_calls_follow_each_other() -> None:
     assert independent(stalled) == pytest.approx(independent(series), rel=0.05)
 
 
-def test_ranks_share_their_mean() -> None:
-    assert midranks(np.array([3.0, 1.0, 3.0, 2.0])).tolist() == [3.5, 1, 3.5, 2]
+def test_equal_calls_share_a_rank() -> None:
+    coarse = np.round(autoregressive(np.random.default_rng(5), 2000, 0.7), 1)
+    follow = np.corrcoef(*(ranks := midranks(coarse), np.roll(ranks, -1)))[0, 1]
+    assert independent(coarse) == pytest.approx(2000 * (1 - follow) / (1 + follow), rel=0.01)
+
+
+def midranks(series: np.ndarray) -> np.ndarray:
+    """Each value's rank from 1, as it is defined: how many are below it, and half of its equals."""
+    return (series[:, None] > series).sum(1) + ((series[:, None] == series).sum(1) + 1) / 2
 
 
 def test_a_stall_in_a_thousand_calls_shows() -> None:
@@ -150,10 +156,10 @@ def test_the_bound_holds_where_processes_differ(between: float, percent: float) 
 def test_calls_of_one_process_are_alike_where_processes_differ() -> None:
     random = np.random.default_rng(8)
     alike, places = several(random, 20, 0.0)
-    assert worth_of(alike, 0.9, places) == pytest.approx(3000, rel=0.35)
+    assert effective_sample_size(alike, 0.9, places) == pytest.approx(3000, rel=0.35)
     apart, places = several(random, 20, 0.2)
-    assert worth_of(apart, 0.5, places) < 60
-    assert worth_of(apart, 0.5, None) > worth_of(apart, 0.5, places)
+    assert effective_sample_size(apart, 0.5, places) < 60
+    assert effective_sample_size(apart, 0.5, None) > effective_sample_size(apart, 0.5, places)
     assert intraclass(np.array([1.0, 1.0, 5.0, 5.0]), [0, 0, 1, 1]) == 1.0
     assert intraclass(np.ones(4), [0, 0, 1, 1]) == 0.0
     assert intraclass(np.array([1.0, 5.0, 1.0, 5.0]), [0, 0, 1, 1]) < 0

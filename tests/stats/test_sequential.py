@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
-from vlatool.stats.sequential import LOOKS, Decision, jointly, judged, sequential
+from vlatool.stats.sequential import INTERIM_ANALYSES, Decision, jointly, judged
 
 Source = Callable[[int], float]
 
@@ -14,6 +14,14 @@ Source = Callable[[int], float]
 def noisy(shift: float, seed: int, spread: float = 0.022) -> Source:
     random = np.random.default_rng(seed)
     return lambda number: shift + spread * random.standard_t(4) / math.sqrt(2)
+
+
+def sequential(
+    measure: Source, margin: float, interim_analyses: Sequence[int] = INTERIM_ANALYSES
+) -> tuple[Decision, list[float]]:
+    """One statistic alone: its decision, and the log ratio of every process."""
+    decisions, processes = jointly(lambda number: (measure(number),), 1, margin, interim_analyses)
+    return decisions[0], [ratios[0] for ratios in processes]
 
 
 def verdicts(shift: float, margin: float = 0.05, runs: int = 200) -> dict[str, int]:
@@ -41,9 +49,9 @@ def test_on_the_margin_hardly_anything_is_decided() -> None:
 
 def test_no_more_processes_are_measured_than_needed() -> None:
     decision, ratios = sequential(noisy(0.0, 1), 0.05)
-    assert decision.processes == len(ratios) == LOOKS[0]
+    assert decision.processes == len(ratios) == INTERIM_ANALYSES[0]
     decision, ratios = sequential(noisy(math.log(1.05), 2), 0.05)
-    assert decision.processes == len(ratios) == LOOKS[-1]
+    assert decision.processes == len(ratios) == INTERIM_ANALYSES[-1]
 
 
 def test_a_decision_by_hand() -> None:
@@ -87,10 +95,10 @@ def test_it_says_how_many_processes_would_decide() -> None:
     assert Decision("fail", 1.2, 1.1, 1.3, 0.05, 40, 0.03).wanted == 0
 
 
-@pytest.mark.parametrize("looks", [(), (5,), (20, 10), (10, 10), (8, 20, 40)])
-def test_looks_that_decide_nothing_are_refused(looks: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("interim_analyses", [(), (5,), (20, 10), (10, 10), (8, 20, 40)])
+def test_interim_analyses_that_decide_nothing_are_refused(interim_analyses: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="allowed: ascending numbers from"):
-        sequential(noisy(0, 0), 0.05, looks)
+        sequential(noisy(0, 0), 0.05, interim_analyses)
 
 
 @pytest.mark.parametrize("margin", [-1, -2, math.nan])

@@ -6,7 +6,19 @@ import sys
 
 import numpy as np
 
-BUILD_PACKAGES = ("torch", "onnx", "onnxscript", "onnx_ir", "pydantic", "typer", "rich", "yaml", "psutil")
+BUILD_PACKAGES = (
+    "torch",
+    "onnx",
+    "onnxscript",
+    "onnx_ir",
+    "pydantic",
+    "typer",
+    "rich",
+    "yaml",
+    "psutil",
+    "jinja2",
+    "scipy",
+)
 ROBOT = f"""
 import sys
 
@@ -80,6 +92,11 @@ def test_the_runtime_opens_no_engine_before_it_is_asked_to():
 
 def test_the_command_line_does_not_import_torch_or_an_engine():
     assert loaded_after("import vlatool.cli", "torch", "onnx", "onnxruntime") == []
+
+
+def test_what_measures_on_a_target_imports_numpy_alone():
+    statement = "import vlatool.measurement.agent, vlatool.measurement.worker, vlatool.measurement.pairs"
+    assert loaded_after(statement, "onnxruntime", *BUILD_PACKAGES) == []
 
 
 def test_stages_are_imported_without_torch_onnx_and_engines():

@@ -63,19 +63,21 @@ def test_a_circle_is_seen(copy: Path):
     ("quantize/planted.py", "from vlatool.export.onnx import ExportOnnx", "layers"),
     ("files/planted.py", "from vlatool.bundle.bundle import Bundle", "layers"),
     ("planted/__init__.py", "", "layers"),
+    ("optimize/judge.py", "from vlatool.optimize.choice import choose", "optimize reads"),
     ("bundle/planted.py", "def late():\n    import pydantic", "robot side"),
     ("runtime/planted.py", "from vlatool.stage.base import Stage", "robot side"),
     ("quantize/planted.py", "import onnxruntime", "inference libraries"),
 ])  # fmt: skip
 def test_each_contract_can_fail(copy: Path, place: str, planted: str, broken: str):
     target = copy / PACKAGE / place
+    before = target.read_text() if target.exists() else None
     target.parent.mkdir(exist_ok=True)
-    target.write_text(planted + "\n")
+    target.write_text((before or "") + planted + "\n")
     command = [sys.executable, "-c", "from importlinter.cli import lint_imports_command as run; run()", "--no-cache"]
     try:
         done = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
     finally:
-        target.unlink()
+        target.unlink() if before is None else target.write_text(before)
         if place.startswith("planted"):
             shutil.rmtree(target.parent)
     names = re.findall(r'^name = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)

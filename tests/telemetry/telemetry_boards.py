@@ -171,7 +171,7 @@ def reason(found: Reader | Absent) -> str:
 
 
 def reasons(found: Recorded) -> dict[str, str]:
-    return {one.reader: one.reason for one in found.absent}
+    return {one.reader: one.reason for one in found.unmeasured}
 
 
 class Clock:

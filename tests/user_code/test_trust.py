@@ -165,8 +165,8 @@ def forged(bundle: Bundle, **source: Any) -> Bundle:
         ({"factory": "x"}, "names no factory"),
         ({"arguments": {"layers": 1, "path": "evil.pt"}}, "says arguments: .*evil.pt"),
         ({"weights": "*.bin"}, r"says weights: '\*.bin'"),
-        ({"code": {"../policy.py": "0"}}, "which is no file beside the factory"),
-        ({"code": ["policy.py"]}, "makes no sense"),
+        ({"code": {"../policy.py": "0"}}, "which is not a file beside the factory"),
+        ({"code": ["policy.py"]}, "an invalid record"),
     ],
 )
 def test_the_policys_own_description_says_what_runs(mine, bundle, source, says: str) -> None:
@@ -202,9 +202,9 @@ def test_a_recipe_names_no_policy(vlatool, mine, policy_template, tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "mode", "says"),
     [
-        ("{}", 0o600, "makes no sense"),
+        ("{}", 0o600, "is malformed"),
         ("[", 0o600, "cannot be read"),
-        ('{"schema": 1, "trusted": {"/a": 3}}', 0o600, "makes no sense"),
+        ('{"schema": 1, "trusted": {"/a": 3}}', 0o600, "is malformed"),
         ('{"schema": 1, "trusted": {}}', 0o622, "can be written by others"),
     ],
 )

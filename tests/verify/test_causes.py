@@ -9,12 +9,12 @@ from vlatool.verify._causes import _of_lines, _of_rounding
 
 def told(mine, theirs):
     policy = SimpleNamespace(spec=SimpleNamespace(action=SimpleNamespace(labels=("dx", "gripper"))))
-    return list(_of_lines(policy, [SimpleNamespace(chunk=mine, wanted=theirs)], 1e-3))
+    return list(_of_lines(policy, [SimpleNamespace(chunk=mine, expected=theirs)], 1e-3))
 
 
 def rounded(mine, theirs):
     policy = SimpleNamespace(spec=SimpleNamespace(action=SimpleNamespace(kind="continuous")))
-    return list(_of_rounding(policy, [SimpleNamespace(chunk=mine, wanted=theirs)]))
+    return list(_of_rounding(policy, [SimpleNamespace(chunk=mine, expected=theirs)]))
 
 
 def chunk(count=48):

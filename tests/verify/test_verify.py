@@ -13,7 +13,7 @@ import pytest
 from vlatool.bundle.bundle import Bundle, restate
 from vlatool.cli import main
 from vlatool.errors import SourceError, UsageError
-from vlatool.render.terminal import TerminalRenderer
+from vlatool.render.formats.terminal import TerminalRenderer
 from vlatool.report import Report
 from vlatool.stage.base import Context
 from vlatool.verify import Options, check, verify
@@ -345,9 +345,9 @@ def test_the_command_exits_by_the_verdict_and_prints_json(capsys, policy_dir, ag
     ("line", "code", "says"),
     [
         (["--against", "original.py"], 3, "add the function: original.py:NAME"),
-        (["--against", "nowhere.py:act"], 3, "There is no file"),
+        (["--against", "nowhere.py:act"], 3, "No such file"),
         (["--against", "original.py:none"], 3, "has no function 'none'"),
-        (["--against", "original.py:act", "--data", "none.npz"], 3, "There is no data file"),
+        (["--against", "original.py:act", "--data", "none.npz"], 3, "none.npz not found"),
         (["--against", "original.py:act", "--samples", "0"], 2, "samples"),
         (["--against", "original.py:act", "--tolerance", "2"], 2, "--tolerance is 2"),
         (["--against", "os:getcwd"], 3, "standard library"),

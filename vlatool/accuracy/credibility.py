@@ -67,9 +67,9 @@ def credibility(row: Row, name: str = "the reference") -> Credibility:
             and ``variation``, as the stages of ``vlatool.evaluate`` measure them.
         name: What the sentences call it.
     """
-    found = _recorded(row, name), _played(row, name)
-    recorded, played = found
-    table = tuple(line for each in found for line in each.table)
+    judged = _recorded(row, name), _played(row, name)
+    recorded, played = judged
+    table = tuple(line for part in judged for line in part.table)
     if played.verdict != "unknown":
         warnings = tuple(told for told in recorded.sentences[:1] if not played.fails)
         return Credibility(played.verdict, played.sentences, (*played.warnings, *warnings), table, played.floor)
@@ -101,12 +101,12 @@ def _played(row: Row, name: str) -> Credibility:
             f"observation in {chance.value:.1%} of {chance.samples}."
         )
         return Credibility("credible", table=(line,), floor=floor)
-    told = (
+    reason = (
         f"{name} succeeds in {own.value:.1%} of {own.samples} closed-loop episodes, and actions that do not look at "
         f"the observation in {chance.value:.1%} of {chance.samples}, which cannot tell them apart"
     )
     few = "" if max(own.samples, chance.samples) >= FEW else " More --episodes would narrow that."
-    return _failing(told, LOOK_AT_WORLD + few, (line,))
+    return _failing(reason, LOOK_AT_WORLD + few, (line,))
 
 
 def above(own: Measurement, chance: Measurement) -> float:
@@ -119,8 +119,8 @@ def above(own: Measurement, chance: Measurement) -> float:
 def _recorded(row: Row, name: str) -> Credibility:
     skill, varied = row.get("skill_expert"), row.get("variation")
     if varied is not None and varied.value == 0.0:
-        told = f"{name} gives the same action to all of {varied.samples} recorded observations"
-        return _failing(told, LOOK_AT, (_line("variation", varied, "above 0"),))
+        reason = f"{name} gives the same action to all of {varied.samples} recorded observations"
+        return _failing(reason, LOOK_AT, (_line("variation", varied, "above 0"),))
     if skill is None:
         return Credibility("unknown")
     table: tuple[dict[str, Any], ...] = (
@@ -129,21 +129,21 @@ def _recorded(row: Row, name: str) -> Credibility:
     if not skill.known:
         return _failing(f"{skill.note} ({skill.samples} recorded observations)", LOOK_AT, table)
     if not (skill.value >= SKILL and (skill.low or 0.0) > 0):
-        told = (
+        reason = (
             f"{name} makes {1 - skill.value:.1%} of the error of the best constant action on {skill.samples} recorded "
             f"observations (at most {1 - (skill.low or 0.0):.1%}; a policy that looks makes less than {1 - SKILL:.0%})"
         )
-        return _failing(told, LOOK_AT, table)
+        return _failing(reason, LOOK_AT, table)
     if varied is not None and row.get("error_expert") is not None:
         table = (*table, _line("variation by that of the expert", varied, f"{VARIATION:g}"))
         if varied.value < VARIATION:
-            told = f"the actions of {name} hardly vary: {varied.value:.1%} of the expert's standard deviation"
-            return _failing(f"{told} on {varied.samples} recorded observations", LOOK_AT, table)
+            reason = f"the actions of {name} hardly vary: {varied.value:.1%} of the expert's standard deviation"
+            return _failing(f"{reason} on {varied.samples} recorded observations", LOOK_AT, table)
     floor = f"{name} makes {1 - skill.value:.1%} of the error of the best constant action on {skill.samples} recorded "
     return Credibility("credible", table=table, floor=f"{floor}observations.")
 
 
-def _line(measure: str, found: Measurement, floor: str) -> dict[str, Any]:
-    bounds = "" if found.low is None else f"{found.low:.4g} to {found.high:.4g}"
-    value = found.value if found.known else None
+def _line(measure: str, measured: Measurement, floor: str) -> dict[str, Any]:
+    bounds = "" if measured.low is None else f"{measured.low:.4g} to {measured.high:.4g}"
+    value = measured.value if measured.known else None
     return {"measure": measure, "reference": value and round(value, 4), "by chance": 0, "floor": floor, "found": bounds}

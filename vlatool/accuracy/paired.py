@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from vlatool.accuracy.outcome import Outcome
 from vlatool.errors import DataError
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact, paired_drop, wilson
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one episode ended: after ``steps`` control steps."""
+
+    task: str
+    seed: int
+    success: bool
+    steps: int
 
 
 def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
@@ -38,13 +47,13 @@ def _by_task(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     return table
 
 
-def with_chance(row: Row, controls: Sequence[Row]) -> Row:
+def with_chance(reference: Row, controls: Sequence[Row]) -> Row:
     """Return the row with ``success_chance``: how often the better control succeeds, with its Wilson interval."""
-    rates = [(each.name, found) for each in controls if (found := each.get("success")) is not None]
+    rates = [(row.name, rate) for row in controls if (rate := row.get("success")) is not None]
     name, best = max(rates, key=lambda pair: pair[1].value)
     note = f"{name} actions, the better of {' and '.join(name for name, _ in rates)}"
     chance = replace(best, name="success_chance", note=note)
-    return replace(row, measurements=(*row.measurements, chance))
+    return replace(reference, measurements=(*reference.measurements, chance))
 
 
 def compare_success(baseline: Row, row: Row) -> Row:

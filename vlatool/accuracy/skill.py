@@ -68,7 +68,7 @@ def _interval(gain: Array, episodes: Array | None, answers: bool) -> tuple[float
         bounds.append(paired_drop(won, lost, len(gain), CONFIDENCE)[1:])
     units = gain
     if episodes is not None and len(np.unique(episodes)) >= CLUSTERS:
-        units = np.asarray([gain[episodes == each].mean() for each in np.unique(episodes)])
+        units = np.asarray([gain[episodes == episode].mean() for episode in np.unique(episodes)])
     if len(units) < 2:
         return -1.0, 1.0
     half = student((1 + CONFIDENCE) / 2, len(units) - 1) * float(units.std(ddof=1)) / math.sqrt(len(units))

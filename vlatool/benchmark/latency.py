@@ -13,13 +13,15 @@ from pydantic import Field, PrivateAttr
 
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
+from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
 from vlatool.graph.workload import WORK, whole_work, workload
 from vlatool.machine.host import fingerprint
 from vlatool.measurement import agent
 from vlatool.measurement.interleaved import MOST
-from vlatool.measurement.job import Job, Limits
-from vlatool.measurement.rows import measurements, raw, samples_of, sustained, tables
+from vlatool.measurement.jobs import LatencyJob, Limits
+from vlatool.measurement.measured import Measured
+from vlatool.measurement.rows import measurements, raw, sustained, tables
 from vlatool.measurement.validity import findings, validity
 from vlatool.report import Finding, Measurement, Report, Row
 from vlatool.stage.base import Context, Measure
@@ -130,24 +132,21 @@ class Latency(Measure):
             if self.memory_mb and not bundle.manifest.graphs:
                 raise UsageError(f"The memory of eager torch is not limited: {bundle.path} has no graph.", "export it")
         job = self._job(bundles)
-        elsewhere = context.elsewhere
-        found = (
-            agent.measure(job, context.tell)
-            if elsewhere is None
-            else elsewhere(job.to_dict(), [bundle.path for bundle in bundles], context.tell)
-        )
+        if context.elsewhere is None:
+            return self._report(bundles, job, agent.measure(job, context.tell), HERE)
+        answer = context.elsewhere(to_json(job), [bundle.path for bundle in bundles], context.tell)
         try:
-            return self._report(bundles, found, remote=elsewhere is not None)
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-            if elsewhere is None:
-                raise
+            measured = from_json(Measured, answer, "answer")
+            where = str(measured.host.get("board") or measured.host.get("cpu") or "the target")
+            return self._report(bundles, job, measured, where)
+        except (LookupError, TypeError, ValueError, ArithmeticError) as error:
             raise TargetError(
                 f"What the target measured makes no sense ({type(error).__name__}: {one_line(str(error), 120)}).",
                 "look at that machine: whether it is the one that you mean, and what runs there",
             ) from error
 
-    def _job(self, bundles: Sequence[Bundle]) -> Job:
-        return Job(
+    def _job(self, bundles: Sequence[Bundle]) -> LatencyJob:
+        return LatencyJob(
             bundles=tuple(str(bundle.path.resolve()) for bundle in bundles),
             engine=self.engine,
             threads=self.threads,
@@ -161,34 +160,32 @@ class Latency(Measure):
             limits=Limits(processors(self.pin), self.cores, self.memory_mb),
         )
 
-    def _report(self, bundles: Sequence[Bundle], found: Mapping[str, Any], remote: bool) -> Report:
-        policies, host = found["policies"], found["host"]
-        alone = len(policies) == 1
-        where = _place(host) if remote else HERE
+    def _report(self, bundles: Sequence[Bundle], job: LatencyJob, run: Measured, where: str) -> Report:
+        reference, *others = run.policies
         if self.memory_mb or self.cores:
             where += f", limited{f' as {self._board}' if self._board else ''}"
         rows = []
-        for bundle, policy in zip(bundles, policies, strict=True):
-            measured = measurements(found, policy, None if alone else policies[0], self.rate)
-            measured += sustained(samples_of(policy)) if self.sustained else []
+        for bundle, policy in zip(bundles, run.policies, strict=True):
+            numbers = measurements(run, policy, reference if others else None, self.rate)
+            numbers += sustained(policy.samples) if self.sustained else []
             if bundle.manifest.graphs:
-                measured.append(Measurement("size", bundle.graph_bytes / 1e6, "MB", note="graphs on disk"))
-            told = tables(found, policy, alone) | _work(bundle, policy["engine"])
-            if policy is policies[0] and (lines := found.get("log", "").strip().splitlines()):
-                told["log"] = [{"line": line} for line in lines[-LOG_LINES:]]
-            role = "baseline" if policy is policies[0] and not alone else "subject"
-            placed = tuple(replace(each, where=where) for each in measured)
-            rows.append(Row(policy["name"], role, measurements=placed, raw=raw(found, policy, alone), details=told))
-        seen = (*findings(found, bool(self.sustained)), *self._limited(host, where))
+                numbers.append(Measurement("size", bundle.graph_bytes / 1e6, "MB", note="graphs on disk"))
+            details = tables(run, policy, not others) | _work(bundle, policy.engine)
+            if policy is reference and (lines := run.log.strip().splitlines()):
+                details["log"] = [{"line": line} for line in lines[-LOG_LINES:]]
+            role = "baseline" if policy is reference and others else "subject"
+            placed = tuple(replace(number, where=where) for number in numbers)
+            rows.append(Row(policy.name, role, "", placed, raw(run, policy, not others), details))
+        seen = (*findings(run, job, bool(self.sustained)), *self._limited(run.host, where))
         valid = validity(seen)
         return Report(
             "benchmark",
             f"Latency of {bundles[0].manifest.name}",
             verdict="inconclusive" if valid == "invalid" else "info",
-            summary=(self._sentence(rows, host, valid, seen),),
+            summary=(self._sentence(rows, run.host, valid, seen),),
             rows=tuple(rows),
             limits={"hz": self.rate} if self.rate else {},
-            environment={**host, "run": self._told(), **({"target": found["target"]} if "target" in found else {})},
+            environment={**run.host, "run": self._told(), **({"target": run.target} if run.target else {})},
             validity=valid,
             findings=seen,
         )
@@ -198,21 +195,21 @@ class Latency(Measure):
             return f"The measurement is invalid: {seen[0].reason}."
         where = f"{host.get('cpu') or 'this host'}, {self.threads} thread{'s' if self.threads > 1 else ''}"
         row, others = rows[0], rows[1:]
-        told = f"{row.name}: {_ms(row)} median latency on {where}"
+        text = f"{row.name}: {_ms(row)} median latency on {where}"
         for other in others:
-            told += f"; {other.name}: {_ms(other)} ({other.value('speedup'):.3g}x as fast)"
+            text += f"; {other.name}: {_ms(other)} ({other.value('speedup'):.3g}x as fast)"
         if self.rate:
             misses = row.value("deadline_misses")
             late = f"{misses:.2%} of the ticks are late" if misses else "no tick is late"
-            told = f"{row.name} at {self.rate:g} Hz: {late}, {_ms(row)} median from the tick to "
-            told += f"its action, on {where}"
-        return told + "."
+            text = f"{row.name} at {self.rate:g} Hz: {late}, {_ms(row)} median from the tick to "
+            text += f"its action, on {where}"
+        return text + "."
 
     def _told(self) -> dict[str, Any]:
         """Return how it was measured, for the environment of the report: what makes two reports differ."""
-        told = {"threads": self.threads, "rate_hz": self.rate, "pin": self.pin, "cores": self.cores,
+        options = {"threads": self.threads, "rate_hz": self.rate, "pin": self.pin, "cores": self.cores,
                 "memory_limit_mb": self.memory_mb, "emulates": self._board}  # fmt: skip
-        return {name: value for name, value in told.items() if value}
+        return {name: value for name, value in options.items() if value}
 
     def _limited(self, host: Mapping[str, Any], where: str) -> list[Finding]:
         if not (self.cores or self.memory_mb):
@@ -221,12 +218,13 @@ class Latency(Measure):
         what = [f"{min(self.cores, usable)} processors"] * bool(self.cores)
         what += [f"{self.memory_mb:,.0f} MB of memory"] * bool(self.memory_mb)
         board = f" as {self._board}" if self._board else ""
-        told = [Finding("note", f"emulation{board}: {' and '.join(what)}; the speed is that of {where.split(',')[0]}")]
+        speed = f"the speed is that of {where.split(',')[0]}"
+        notes = [Finding("note", f"emulation{board}: {' and '.join(what)}; {speed}")]
         if self.cores > usable:
             effect = "suspect" if self.threads > usable else "note"
             lacks = f"{self._board or 'the limit'} has {self.cores} processors, and this machine {usable}"
-            told.append(Finding(effect, lacks, "measure on a machine with as many"))
-        return told
+            notes.append(Finding(effect, lacks, "measure on a machine with as many"))
+        return notes
 
 
 def processors(text: str) -> tuple[int, ...]:
@@ -240,20 +238,16 @@ def processors(text: str) -> tuple[int, ...]:
     if not re.fullmatch(r"\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*", text):
         raise UsageError(f"--pin is {text!r}; allowed: processors such as 0-3 or 2,4.")
     ends = [[int(end) for end in part.split("-")] for part in text.split(",")]
-    found = sorted({number for end in ends for number in range(end[0], end[-1] + 1)})
-    if not found:
+    numbers = sorted({number for end in ends for number in range(end[0], end[-1] + 1)})
+    if not numbers:
         raise UsageError(f"--pin is {text!r}, which names no processor; allowed: such as 0-3 or 2,4.")
-    return tuple(found)
+    return tuple(numbers)
 
 
 def _ms(row: Row) -> str:
     """Return the median latency with three digits, or with all before the point."""
     value = row.value("latency_p50")
     return f"{value:.3g} ms" if value < 1000 else f"{value:,.0f} ms"
-
-
-def _place(host: Mapping[str, Any]) -> str:
-    return str(host.get("board") or host.get("cpu") or "the target")
 
 
 def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:

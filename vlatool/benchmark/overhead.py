@@ -106,7 +106,9 @@ def _own_values(step: ProgramStep) -> dict[str, Any]:
     values: dict[str, Any] = {name: draw(wanted, random) for name, wanted in step.noise.items()}
     values |= {name: np.zeros(kept["shape"], kept.get("dtype", "float32")) for name, kept in step.keep.items()}
     for name, numbers in step.schedule.items():
-        values[name] = np.array(numbers[:1], np.int64 if all(isinstance(each, int) for each in numbers) else np.float32)
+        values[name] = np.array(
+            numbers[:1], np.int64 if all(isinstance(number, int) for number in numbers) else np.float32
+        )
     return values
 
 

@@ -92,9 +92,9 @@ def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wa
     """Return the cheapest rented machine that answers in time, network included."""
     if not rented:
         return None
-    found = [choice for choice in choose(rented, load, model, in_the_cloud(wants)) if choice.state == "fits"]
-    prices = {choice.profile.name: choice.profile.price_usd_per_hour for choice in found}
-    return min(found, key=lambda choice: prices[choice.profile.name].value, default=None)  # type: ignore[union-attr]
+    fitting = [choice for choice in choose(rented, load, model, in_the_cloud(wants)) if choice.state == "fits"]
+    prices = {choice.profile.name: choice.profile.price_usd_per_hour for choice in fitting}
+    return min(fitting, key=lambda choice: prices[choice.profile.name].value, default=None)  # type: ignore[union-attr]
 
 
 def opened(source: str, context: Context) -> Bundle:
@@ -110,19 +110,19 @@ def counted(bundle: Bundle, context: Context) -> Workload:
     It is kept in the cache by the bundle's hash; a policy may carry its count, too (``carry_count``).
     """
     file = cache_directory() / "workloads" / f"{bundle.hash.removeprefix('sha256:')[:32]}.json"
-    if (found := read_workload(file)) is not None:
-        return found
+    if (load := read_workload(file)) is not None:
+        return load
     if bundle.manifest.graphs:
-        found = workload(bundle)
+        load = workload(bundle)
     elif _may_carry(bundle) and (carried := read_workload(_beside(bundle), digest(bundle))) is not None:
         return carried
     elif "factory" in bundle.manifest.source:
-        found = _counted_source(bundle, context)
+        load = _counted_source(bundle, context)
     else:
-        found = _counted_export(bundle, context)
+        load = _counted_export(bundle, context)
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
-        write_workload(file, found)
-    return found
+        write_workload(file, load)
+    return load
 
 
 def _counted_source(bundle: Bundle, context: Context) -> Workload:
@@ -164,9 +164,9 @@ def carry_count(source: str, context: Context) -> Path:
         )
     file = origin_of(bundle).folder / CARRIED
     refuse_other(file)
-    found = counted(bundle, context)
+    load = counted(bundle, context)
     try:
-        write_workload(file, found, digest(bundle))
+        write_workload(file, load, digest(bundle))
         note_file(file)
     except OSError as error:
         raise OutputError(f"{file} cannot be written: {error.strerror}.", "make the folder writable") from error
@@ -235,12 +235,12 @@ def _fix_of(load: Workload) -> str:
 
 
 def _part_lines(phases: list[dict[str, Any]]) -> list[str]:
-    told = []
+    lines = []
     for phase in phases:
         shares = sorted(phase["parts"].items(), key=lambda item: -item[1])
         if shares:
-            told.append(f"  {phase['name']}: {', '.join(f'{name} {share:.0%}' for name, share in shares)}")
-    return ["parts of a graph, by the work that they have", *told] if told else []
+            lines.append(f"  {phase['name']}: {', '.join(f'{name} {share:.0%}' for name, share in shares)}")
+    return ["parts of a graph, by the work that they have", *lines] if lines else []
 
 
 def _change(change: Change) -> dict[str, Any]:
@@ -251,22 +251,22 @@ def _change(change: Change) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def simulation_lines(found: dict[str, Any]) -> list[str]:
+def simulation_lines(simulation: dict[str, Any]) -> list[str]:
     """Return the text of a simulation."""
-    ms, low, high = found["latency_ms"]
-    where = ", ".join(found[name] for name in ("profile", "mode", "engine", "precision"))
-    costs = f"{found['memory_mb'][0]:.0f} MB, {found['watts'][0]:.0f} W, {found['joules']:.3g} J"
-    count, hz = found["execute"], found["control_hz"]
+    ms, low, high = simulation["latency_ms"]
+    where = ", ".join(simulation[name] for name in ("profile", "mode", "engine", "precision"))
+    costs = f"{simulation['memory_mb'][0]:.0f} MB, {simulation['watts'][0]:.0f} W, {simulation['joules']:.3g} J"
+    count, hz = simulation["execute"], simulation["control_hz"]
     actions = f"each of the {count} actions that are executed of it" if count > 1 else "each action"
     share = ms / count * hz / 1e3
     busy = f"busy {share:.1%} of the time" if share < 1 else f"{share:.3g} times the time that there is"
     lines = [
         f"PREDICTED for {where}; nothing was run there",
         f"{ms:.4g} ms an inference (80 %: {low:.4g}-{high:.4g}), {costs}",
-        f"{actions}: {ms / count:.3g} ms, {found['joules'] / count:.3g} J; at the policy's {hz:g} Hz {busy}",
-        "", *found["timeline"], *_part_lines(found["phases"]), "", "what a change would give",
+        f"{actions}: {ms / count:.3g} ms, {simulation['joules'] / count:.3g} J; at the policy's {hz:g} Hz {busy}",
+        "", *simulation["timeline"], *_part_lines(simulation["phases"]), "", "what a change would give",
     ]  # fmt: skip
-    for change in found["changes"]:
+    for change in simulation["changes"]:
         if change["latency_ms"] is None:
             lines.append(f"  {change['name']}: unknown ({change['why']})")
             continue

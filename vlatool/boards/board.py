@@ -42,8 +42,15 @@ class Candidate:
 
     @property
     def figures(self) -> EngineFigures:
-        """What the profile says of the engine."""
-        return engine_figures(self.profile, self.engine)
+        """What the profile says of the engine.
+
+        Raises:
+            ProfileError: when it has no such engine.
+        """
+        engines = self.profile.engines
+        if self.engine not in engines:
+            raise ProfileError(f"{self.profile.name} has no engine '{self.engine}'; {nearest(self.engine, engines)}.")
+        return engines[self.engine]
 
 
 @dataclass(frozen=True)
@@ -53,19 +60,19 @@ class Phase:
     Args:
         name: Of the graph.
         runs: In one inference.
-        each: One run, predicted.
+        once: One run, predicted.
         question: What was asked.
     """
 
     name: str
     runs: int
-    each: Predicted
+    once: Predicted
     question: Question
 
     @property
     def ms(self) -> float:
         """All runs."""
-        return self.runs * self.each.ms
+        return self.runs * self.once.ms
 
 
 @dataclass(frozen=True)
@@ -96,35 +103,24 @@ class Outcome:
         return idle + (self.watts[0] - idle) * busy
 
 
-def engine_figures(profile: Profile, engine: str) -> EngineFigures:
-    """Return what a profile says of an engine.
-
-    Raises:
-        ProfileError: when it has no such engine.
-    """
-    if engine not in profile.engines:
-        raise ProfileError(f"{profile.name} has no engine '{engine}'; {nearest(engine, profile.engines)}.")
-    return profile.engines[engine]
-
-
 def candidates(profile: Profile, load: Workload, modes: Iterable[str] | None = None) -> list[Candidate]:
     """Return every way of running a policy on a board, the preferred engine and its fastest precision first.
 
     A bundle that is quantized already is taken as it is, by the engines that compute in its precision.
     """
-    if stored := quantized_as(load):
-        integer = any(graph.integer_ops for graph in load.graphs.values())
-        return [
-            Candidate(profile, mode, engine)
-            for mode in (profile.modes if modes is None else modes)
-            for engine, figures in profile.engines.items()
-            if stored in figures.dtypes and (figures.integer_ops or not integer)
-        ]
+    stored = quantized_as(load)
+    integer = any(graph.integer_ops for graph in load.graphs.values())
+
+    def precisions(figures: EngineFigures) -> tuple[str, ...]:
+        if not stored:
+            return figures.dtypes
+        return ("",) if stored in figures.dtypes and (figures.integer_ops or not integer) else ()
+
     return [
         Candidate(profile, mode, engine, precision)
         for mode in (profile.modes if modes is None else modes)
         for engine, figures in profile.engines.items()
-        for precision in figures.dtypes
+        for precision in precisions(figures)
     ]
 
 
@@ -153,16 +149,16 @@ def outcomes(asked: Sequence[Candidate], load: Workload, model: LatencyModel) ->
             graph = load.graphs[name]
             precision = candidate.precision or stored_precision(graph)
             questions.append(Question(work_of(graph), place, candidate.figures.runtime, precision))
-    told = [_floored(*pair) for pair in zip(questions, model.predict(questions), strict=True)]
-    answers = iter(zip(questions, told, strict=True))
-    found = []
+    predictions = [_floored(*pair) for pair in zip(questions, model.predict(questions), strict=True)]
+    answers = iter(zip(questions, predictions, strict=True))
+    results = []
     for candidate, span in zip(asked, spans, strict=True):
         phases = tuple(
             Phase(name, runs, answer, question) for (name, runs), (question, answer) in zip(span, answers, strict=False)
         )
         latency = _whole(candidate, load, phases)
-        found.append(Outcome(candidate, phases, latency, memory_mb(candidate, load), watts(candidate)))
-    return found
+        results.append(Outcome(candidate, phases, latency, memory_mb(candidate, load), watts(candidate)))
+    return results
 
 
 def work_of(graph: GraphWorkload) -> Work:
@@ -196,11 +192,11 @@ def _whole(candidate: Candidate, load: Workload, phases: Sequence[Phase]) -> Pre
         return Predicted(math.nan, why="the graphs have no matrix product or convolution to count")
     if not candidate.figures.runtime:
         return Predicted(math.nan, why=f"no latency was published for {candidate.engine}")
-    unknown = next((phase.each for phase in phases if not phase.each.known), None)
+    unknown = next((phase.once for phase in phases if not phase.once.known), None)
     if unknown is not None:
         return unknown
-    ms, low, high = (sum(phase.runs * getattr(phase.each, name) for phase in phases) for name in ("ms", "low", "high"))
-    regimes = {phase.each.regime for phase in phases}
+    ms, low, high = (sum(phase.runs * getattr(phase.once, name) for phase in phases) for name in ("ms", "low", "high"))
+    regimes = {phase.once.regime for phase in phases}
     return Predicted(ms, low, high, "unseen" if "unseen" in regimes else min(regimes))
 
 
@@ -220,10 +216,10 @@ def weight_bytes(load: Workload, precision: str) -> float:
     """Return the bytes of all weights at a precision; tables that are looked up stay at 16 bits at least."""
     if not precision:
         return float(load.weight_bytes)
-    each, other = PRECISIONS[precision][0], max(2.0, PRECISIONS[precision][0])
+    width, table_width = PRECISIONS[precision][0], max(2.0, PRECISIONS[precision][0])
     products = sum(graph.weights for graph in load.graphs.values())
     elements = sum(_elements(graph) for graph in load.graphs.values())
-    return products * each + max(0.0, elements - products) * other
+    return products * width + max(0.0, elements - products) * table_width
 
 
 def _elements(graph: GraphWorkload) -> float:

@@ -67,16 +67,16 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
         DataError: when there is no such report, or it holds no latency with its work.
         ProfileError: when the profile has no such mode.
     """
-    found = []
+    measured = []
     missing = 0
     name = mode or profile.default_mode
     profile.mode(name)
-    told = read_report(report)
-    run = told.environment.get("run")
+    benchmark = read_report(report)
+    run = benchmark.environment.get("run")
     if isinstance(run, dict) and (run.get("rate_hz") or run.get("emulates")):
         how = "was paced (--rate)" if run.get("rate_hz") else f"emulates {run['emulates']} on another machine"
         raise DataError(f"{report} cannot calibrate {profile.name}: it {how}.", "measure back to back, on the board")
-    for row in told.rows:
+    for row in benchmark.rows:
         latency = row.get("latency_p50")
         if latency is None or not latency.known:
             continue
@@ -87,23 +87,23 @@ def measured_in(report: Path, profile: Profile, mode: str | None, load: Workload
             continue
         engine = str(described.get("engine") or profile.engine)
         work = {key: described.get(key) for key in (*NUMBERS, "traits")}
-        made = Measured(profile.name, name, engine, str(described.get("precision")), work, latency.value)
-        if engine in profile.engines and is_sound(made):
-            found.append(made)
-    if not found:
+        item = Measured(profile.name, name, engine, str(described.get("precision")), work, latency.value)
+        if engine in profile.engines and is_sound(item):
+            measured.append(item)
+    if not measured:
         why = "its rows do not say what they compute" if missing else "it holds no latency of an engine of this board"
         raise DataError(
             f"{report} cannot calibrate {profile.name}: {why}.",
             "name the bundle that was measured with --bundle, or measure it again: vlatool benchmark BUNDLE -o DIR",
         )
-    return found
+    return measured
 
 
 def elsewhere(report: Path, profile: Profile) -> str:
     """Return what a report was made on when that is not the profile's board; empty when it is, or is not said."""
     made_on = read_report(report).environment
-    said = [str(made_on[key]) for key in ("board", "cpu") if made_on.get(key)]
-    return "" if matches(profile.model_strings, made_on) else ", ".join(said)
+    names = [str(made_on[key]) for key in ("board", "cpu") if made_on.get(key)]
+    return "" if matches(profile.model_strings, made_on) else ", ".join(names)
 
 
 def store(measured: list[Measured]) -> Path:
@@ -130,27 +130,27 @@ def measured_questions(file: Path | None = None) -> list[tuple[Question, float]]
     Raises:
         DataError: when the file is missing or malformed, or its board's profile has changed.
     """
-    found = []
-    for each in [file] if file else sorted(calibrations().glob("*.json")):
+    questions = []
+    for path in [file] if file else sorted(calibrations().glob("*.json")):
         try:
-            found += [(item.question(), item.ms) for item in _read(each) if file or item.profile in names()]
+            questions += [(item.question(), item.ms) for item in _read(path) if file or item.profile in names()]
         except ProfileError as error:
-            raise DataError(f"The calibration {each} does not fit any more: {error.message}", AGAIN) from error
-    return found
+            raise DataError(f"The calibration {path} does not fit any more: {error.message}", AGAIN) from error
+    return questions
 
 
 def _read(file: Path) -> list[Measured]:
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-        found = [Measured(**row) for row in data["measured"]]
+        measured = [Measured(**row) for row in data["measured"]]
     except OSError as error:
         raise DataError(f"The calibration {file} cannot be read: {error.strerror}.", AGAIN) from error
     except (ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
         raise DataError(f"The calibration {file} is malformed: {type(error).__name__}: {error}.", AGAIN) from error
-    for item in found:
+    for item in measured:
         if not is_sound(item):
             raise DataError(f"The calibration {file} is malformed: {item}.", AGAIN)
-    return found
+    return measured
 
 
 def is_sound(item: Measured) -> bool:

@@ -26,4 +26,4 @@ def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Meas
     engine = engine or own
     model = shipped().conditioned(measured_questions())
     outcome = outcomes([Candidate(profile, profile.default_mode, engine)], workload(bundle), model)[0]
-    return [found for found in numbers(outcome) if found.name in SHOWN]
+    return [measurement for measurement in numbers(outcome) if measurement.name in SHOWN]

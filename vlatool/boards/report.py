@@ -55,13 +55,13 @@ def chunk_sentence(first: Choice | None, wants: Wants) -> list[str]:
     if wants.execute < 2 or first is None or first.outcome is None:
         return []
     ms, joules, count = first.outcome.latency.ms, first.outcome.joules, wants.execute
-    told = (
+    sentence = (
         f"One inference gives a chunk, of which {count} actions are executed: with one inference for each chunk, a "
         f"control tick costs {_number(ms / count)} ms and {_number(joules / count)} J there."
     )
     if wants.per_chunk or not wants.hz:
-        return [told]
-    return [f"{told} This answer is for an inference at every tick; for one in each chunk: --per-chunk."]
+        return [sentence]
+    return [f"{sentence} This answer is for an inference at every tick; for one in each chunk: --per-chunk."]
 
 
 def limits(wants: Wants) -> dict[str, Any]:
@@ -78,16 +78,16 @@ def _summary(name: str, choices: Sequence[Choice], first: Choice | None, wants: 
     count = sum(choice.state == "fits" for choice in choices)
     if first is None or first.outcome is None:
         near = [choice for choice in choices if choice.state == "may fit"]
-        told = f"No board is certain to run {name} as asked"
+        verdict = f"No board is certain to run {name} within these limits"
         if near:
-            return [f"{told}; {len(near)} may: {', '.join(choice.profile.name for choice in near[:4])}."]
-        return [f"{told}. The reasons stand beside the boards."]
-    found, way = first.outcome, first.outcome.candidate
+            return [f"{verdict}; {len(near)} may: {', '.join(choice.profile.name for choice in near[:4])}."]
+        return [f"{verdict}. The reasons stand beside the boards."]
+    outcome, way = first.outcome, first.outcome.candidate
     fit = f"{count} boards that fit" if count > 1 else "1 board that fits"
     text = (
         f"{first.profile.name} is the cheapest of {fit}: {way.precision or 'as it is'} "
-        f"with {way.engine} at {way.mode}, about {_number(found.latency.ms)} ms "
-        f"({_number(found.latency.low)}-{_number(found.latency.high)}), {found.watts[0]:.0f} W, "
+        f"with {way.engine} at {way.mode}, about {_number(outcome.latency.ms)} ms "
+        f"({_number(outcome.latency.low)}-{_number(outcome.latency.high)}), {outcome.watts[0]:.0f} W, "
         f"{first.profile.price_usd.value:,.0f} dollars."
     )
     hz = f" --hz {wants.inference_hz:g}" if wants.inference_hz else ""
@@ -101,11 +101,11 @@ def _summary(name: str, choices: Sequence[Choice], first: Choice | None, wants: 
 
 
 def _warnings(first: Choice | None) -> tuple[str, ...]:
-    told = ["everything here is predicted; measure before you buy many: vlatool benchmark on one board, then "
+    warnings = ["everything here is predicted; measure before you buy many: vlatool benchmark on one board, then "
             "vlatool profiles calibrate --from its report"]  # fmt: skip
     if first is not None:
-        told += list(first.profile.caveats[:2])
-    return tuple(told)
+        warnings += list(first.profile.caveats[:2])
+    return tuple(warnings)
 
 
 def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) -> Row:
@@ -136,7 +136,7 @@ def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
     note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
     low, high = (latency.low, latency.high) if latency.known else (None, None)
     memory, power = outcome.memory_mb, outcome.watts
-    found = [
+    measurements = [
         Measurement("latency_p50", latency.ms, "ms", "predicted", where, 0, low, high, LEVEL, note),
         Measurement("memory", memory[0], "MB", "predicted", where, 0, memory[1], memory[2], LEVEL, JUDGED),
         Measurement("usable_memory", 1e3 * outcome.candidate.profile.usable_memory_gb.value, "MB", "predicted", where),
@@ -144,10 +144,11 @@ def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
     ]
     if latency.known:
         ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
-        found.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
-        each = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
-        found += [Measurement(name, value / execute, unit, "predicted", where) for name, value, unit in each]
-    return found
+        measurements.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
+        per_action = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
+        for name, value, unit in per_action:
+            measurements.append(Measurement(name, value / execute, unit, "predicted", where))
+    return measurements
 
 
 EVIDENCE = {

@@ -89,22 +89,22 @@ def choose(boards: Iterable[Profile], load: Workload, model: LatencyModel, wants
     Raises:
         ProfileError: when no board is left to look at.
     """
-    found: list[Choice] = []
+    choices: list[Choice] = []
     asked: dict[str, list[Candidate]] = {}
     profiles = {board.name: board for board in boards}
     if not profiles:
-        raise ProfileError("There is no board to choose from.", "leave --boards out, or look at: vlatool profiles list")
+        raise ProfileError("No boards to choose from.", "leave --boards out, or look at: vlatool profiles list")
     for name, board in profiles.items():
         reason, ways = _before(board, load, wants)
         if reason:
-            found.append(Choice(board, "no", None, reason))
+            choices.append(Choice(board, "no", None, reason))
         else:
             asked[name] = ways
     flat = [way for ways in asked.values() for way in ways]
     answers = iter(outcomes(flat, load, model))
     for name, ways in asked.items():
-        found.append(_best(profiles[name], [next(answers) for _ in ways], wants))
-    return sorted(found, key=_rank)
+        choices.append(_best(profiles[name], [next(answers) for _ in ways], wants))
+    return sorted(choices, key=_rank)
 
 
 def _rank(choice: Choice) -> tuple[int, bool, float, float]:
@@ -158,9 +158,9 @@ def state_of(outcome: Outcome, wants: Wants) -> str:
     return "may fit" if outcome.latency.high > wants.limit_ms or outcome.memory_mb[2] > usable else "fits"
 
 
-def _best(board: Profile, found: Sequence[Outcome], wants: Wants) -> Choice:
+def _best(board: Profile, results: Sequence[Outcome], wants: Wants) -> Choice:
     """Return the way of running the policy on a board that changes it least among those that fit, or the nearest."""
-    states = {id(outcome): state_of(outcome, wants) for outcome in found}
+    states = {id(outcome): state_of(outcome, wants) for outcome in results}
 
     def rank(outcome: Outcome) -> tuple[int, float, float]:
         state = STATES.index(states[id(outcome)])
@@ -170,22 +170,22 @@ def _best(board: Profile, found: Sequence[Outcome], wants: Wants) -> Choice:
         known = outcome.latency.known and outcome.memory_mb[0] <= usable_mb(board, wants)
         return state, outcome.latency.high if known else math.inf, limit
 
-    ordered = sorted(found, key=rank)
+    ordered = sorted(results, key=rank)
     best, *others = ordered
     return Choice(board, states[id(best)], best, _reason(best, states[id(best)], ordered, wants), tuple(others))
 
 
-def _reason(best: Outcome, state: str, found: Sequence[Outcome], wants: Wants) -> str:
+def _reason(best: Outcome, state: str, results: Sequence[Outcome], wants: Wants) -> str:
     usable = usable_mb(best.candidate.profile, wants)
     limit = wants.limit_ms
     low, middle, high = (value / 1e3 for value in (best.memory_mb[1], best.memory_mb[0], best.memory_mb[2]))
     if best.memory_mb[1] > usable:
-        least = min(found, key=lambda outcome: outcome.memory_mb[1])
+        least = min(results, key=lambda outcome: outcome.memory_mb[1])
         return f"needs {least.memory_mb[1] / 1e3:.1f} GB at {_word(least)}, {usable / 1e3:.1f} usable"
     if not best.latency.known:
         return f"{best.latency.why} ({_word(best)}, {best.candidate.engine})"
     if state == "fits":
-        return _headroom(best, found, wants)
+        return _headroom(best, results, wants)
     if best.memory_mb[0] > usable:
         return f"needs about {middle:.1f} GB ({low:.1f}-{high:.1f}), {usable / 1e3:.1f} usable"
     if best.latency.ms > limit:
@@ -194,21 +194,21 @@ def _reason(best: Outcome, state: str, found: Sequence[Outcome], wants: Wants) -
         return (
             f"90th percentile {_ms(best.latency.high)} > {_ms(limit)} at {_word(best)}, median {_ms(best.latency.ms)}"
         )
-    return f"memory may not suffice: about {middle:.1f} GB ({low:.1f}-{high:.1f}), {usable / 1e3:.1f} usable"
+    return f"memory may be too small: about {middle:.1f} GB ({low:.1f}-{high:.1f}), {usable / 1e3:.1f} usable"
 
 
-def _headroom(best: Outcome, found: Sequence[Outcome], wants: Wants) -> str:
+def _headroom(best: Outcome, results: Sequence[Outcome], wants: Wants) -> str:
     """Say what the chosen precision leaves over, and why a more faithful one is not taken."""
     place = FIDELITY.index(best.candidate.precision)
-    better = [each for each in found if FIDELITY.index(each.candidate.precision) < place and each.latency.known]
-    told = ""
+    better = [other for other in results if FIDELITY.index(other.candidate.precision) < place and other.latency.known]
+    faithful = ""
     if better:
-        nearest = min(better, key=lambda each: each.latency.high)
+        nearest = min(better, key=lambda other: other.latency.high)
         if nearest.latency.high > wants.limit_ms:
-            told = f"; {_word(nearest)} takes up to {_ms(nearest.latency.high)}"
+            faithful = f"; {_word(nearest)} takes up to {_ms(nearest.latency.high)}"
     if math.isinf(wants.limit_ms):
-        return f"fits at {_word(best)}{told}"
-    return f"{wants.limit_ms / best.latency.high:.1f} times as fast as needed at {_word(best)}{told}"
+        return f"fits at {_word(best)}{faithful}"
+    return f"{wants.limit_ms / best.latency.high:.1f} times as fast as needed at {_word(best)}{faithful}"
 
 
 def _word(outcome: Outcome) -> str:

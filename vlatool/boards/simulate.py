@@ -49,12 +49,12 @@ class Change:
 
 def bounds(outcome: Outcome, shares: Mapping[str, Shares]) -> list[Bound]:
     """Return each phase with what holds it back."""
-    found = []
+    phases = []
     for phase in outcome.phases:
         parts = roofline_parts(phase.question, shares[part_of(phase.question)])
         whole = sum(parts.values())
-        found.append(Bound(phase, {name: value / whole for name, value in parts.items()}))
-    return found
+        phases.append(Bound(phase, {name: value / whole for name, value in parts.items()}))
+    return phases
 
 
 def parts_of(phase: Phase, graph: GraphWorkload, shares: Mapping[str, Shares]) -> dict[str, float]:
@@ -62,13 +62,13 @@ def parts_of(phase: Phase, graph: GraphWorkload, shares: Mapping[str, Shares]) -
 
     What belongs to no part is ``other``; nothing when the policy names no parts.
     """
-    found = {}
+    milliseconds = {}
     for part, (macs, weights, activations, layers) in graph.parts.items():
         work = replace(phase.question.work, macs=macs, weights=weights, activations=activations, layers=layers)
         rates = shares[part_of(phase.question)]
-        found[part or "other"] = sum(roofline_parts(replace(phase.question, work=work), rates).values())
-    whole = sum(found.values()) or 1.0
-    return {part: ms / whole for part, ms in found.items()}
+        milliseconds[part or "other"] = sum(roofline_parts(replace(phase.question, work=work), rates).values())
+    whole = sum(milliseconds.values()) or 1.0
+    return {part: ms / whole for part, ms in milliseconds.items()}
 
 
 def changes(candidate: Candidate, load: Workload, model: LatencyModel) -> list[Change]:
@@ -90,7 +90,7 @@ def changes(candidate: Candidate, load: Workload, model: LatencyModel) -> list[C
     asked.append((f"images of 0.7 of the side, where {name} works on image tokens alone", candidate, at(load, images)))
     pruned = dict.fromkeys(load.graphs, (PRUNED, PRUNED, math.sqrt(PRUNED)))
     asked.append(("30 % of each layer pruned, whole channels", candidate, at(load, pruned)))
-    return [Change(told, outcomes([way], changed, model)[0]) for told, way, changed in asked]
+    return [Change(title, outcomes([way], changed, model)[0]) for title, way, changed in asked]
 
 
 def widest(load: Workload) -> str:
@@ -98,15 +98,15 @@ def widest(load: Workload) -> str:
     return max(load.graphs, key=lambda name: load.graphs[name].activations / max(1, load.graphs[name].weights))
 
 
-def timeline(found: list[Bound], width: int = 40) -> Iterator[str]:
+def timeline(phases: list[Bound], width: int = 40) -> Iterator[str]:
     """Return a line for each phase: name, bar from begin to end, milliseconds, what holds it back."""
-    whole = sum(bound.phase.ms for bound in found) or 1.0
+    whole = sum(bound.phase.ms for bound in phases) or 1.0
     begin = 0.0
-    for bound in found:
+    for bound in phases:
         phase = bound.phase
         start, end = round(begin / whole * width), round((begin + phase.ms) / whole * width)
         bar = " " * start + "█" * max(1, end - start)
-        times = f" {phase.runs}x{phase.each.ms:.3g}" if phase.runs > 1 else ""
+        times = f" {phase.runs}x{phase.once.ms:.3g}" if phase.runs > 1 else ""
         held = f"{bound.shares[bound.by]:.0%} {bound.by}"
         yield f"{phase.name[:16]:16} {bar:{width + 1}} {phase.ms:8.3g} ms{times}  {held}"
         begin += phase.ms

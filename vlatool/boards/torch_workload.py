@@ -35,10 +35,10 @@ def counted_apart(bundle: Bundle, tell: Callable[[str, float | None], None]) -> 
     """
     about = str(bundle.manifest.source.get("factory", "")).rpartition(":")[0]
     job = {"bundle": str(bundle.path.absolute())}
-    found = children.call("vlatool.boards.torch_workload:count", job, tell, about, ("torch", __name__))
-    counted = from_values(found)
+    values = children.call("vlatool.boards.torch_workload:count", job, tell, about, ("torch", __name__))
+    counted = from_values(values)
     if counted is None:
-        raise SourceError(f"{about} was counted in a way that makes no sense.")
+        raise SourceError(f"{about} gave a count that is not one.")
     return counted
 
 
@@ -79,11 +79,11 @@ def torch_workload(bundle: Bundle) -> Workload:
             f"The policy cannot be run without its weights: {type(error).__name__}: {reason}.",
             "export it first, and name the bundle: vlatool export SOURCE -o BUNDLE",
         ) from error
-    for name, found in seen.items():
-        tally = found.tally
+    for name, run in seen.items():
+        tally = run.tally
         graphs[name] = GraphWorkload(
-            {"float32": found.macs}, tally.layers, tally.weights, tally.activations, tally.traits(),
-            found.stored, 4 * tally.activations, found.peak, parts=tally.parts(), read_again=tally.read_again,
+            {"float32": run.macs}, tally.layers, tally.weights, tally.activations, tally.traits(),
+            run.stored, 4 * tally.activations, run.peak, parts=tally.parts(), read_again=tally.read_again,
         )  # fmt: skip
     return Workload(graphs, dict(runs))
 
@@ -129,7 +129,7 @@ def _stored(module: Any) -> int:
 
 
 def _where(module: Any, parts: Mapping[str, Sequence[str]]) -> dict[int, str]:
-    return {id(each): part_named(name, parts) for name, each in module.named_modules()} if parts else {}
+    return {id(part): part_named(name, parts) for name, part in module.named_modules()} if parts else {}
 
 
 @contextlib.contextmanager
@@ -161,32 +161,33 @@ def _counting(seen: _Seen) -> contextlib.AbstractContextManager[Any]:
 
     class Watching(TorchDispatchMode):  # type: ignore[no-untyped-call]
         def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            given = func(*args, **(kwargs or {}))
-            _count(torch, seen, func.overloadpacket.__name__, args, given)
+            output = func(*args, **(kwargs or {}))
+            _count(torch, seen, func.overloadpacket.__name__, args, output)
             views = func.is_view or str(func).startswith("aten.detach")
-            for tensor in given if isinstance(given, tuple | list) else (given,):
+            for tensor in output if isinstance(output, tuple | list) else (output,):
                 if isinstance(tensor, torch.Tensor) and not views:
                     seen.keep(tensor)
-            return given
+            return output
 
     return Watching()  # type: ignore[no-untyped-call]
 
 
-def _count(torch: Any, seen: _Seen, name: str, args: Any, given: Any) -> None:
+def _count(torch: Any, seen: _Seen, name: str, args: Any, output: Any) -> None:
     if name in PRODUCTS:
         first, second = args[PRODUCTS[name] : PRODUCTS[name] + 2]
-        seen.product(given.numel() * first.shape[-1], given.numel(), _weights(torch, second), weight=_weight_of(second))
+        written, weight = output.numel(), _weight_of(second)
+        seen.product(written * first.shape[-1], written, _weights(torch, second), weight=weight)
     elif name == "convolution":
         weight, groups, transposed = args[1], args[8], args[6]
-        base = args[0].numel() if transposed else given.numel()
-        seen.product(base * math.prod(weight.shape[1:]), given.numel(), weight.numel(), groups, _weight_of(weight))
+        base = args[0].numel() if transposed else output.numel()
+        seen.product(base * math.prod(weight.shape[1:]), output.numel(), weight.numel(), groups, _weight_of(weight))
     elif name.startswith(ATTENTION):
         query, key, value = args[:3]
         scores = math.prod(query.shape[:-1]) * key.shape[-2]
         seen.product(scores * query.shape[-1], scores, 0)
         seen.product(scores * value.shape[-1], math.prod(query.shape[:-1]) * value.shape[-1], 0)
     elif name == "cat":
-        seen.tally.concat(found=True)
+        seen.tally.concat(concatenates=True)
 
 
 def _weights(torch: Any, tensor: Any) -> int:

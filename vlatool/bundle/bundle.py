@@ -44,14 +44,14 @@ class Bundle:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], *, verify: bool = True) -> Bundle:
-        """Read the manifest, hold it against its digest, and check every file before anything else is parsed.
+        """Read the manifest, check it against its digest, and check every file before anything else is parsed.
 
         Args:
             path: The directory.
             verify: Check that the files are those of the manifest, with their sizes and SHA-256, and no others.
 
         Raises:
-            BundleError: when the directory is missing, is no bundle, or a file is missing, changed, a link or unknown.
+            BundleError: when the directory is missing or no bundle, or a file is missing, changed, unknown or a link.
             SpecError: for an impossible spec or program.
         """
         bundle = cls.described(path)
@@ -61,10 +61,10 @@ class Bundle:
 
     @classmethod
     def described(cls, path: str | os.PathLike[str]) -> Bundle:
-        """Read the manifest, hold it against its digest; the files are checked when they are read (``read``).
+        """Read the manifest, check it against its digest; the files are checked when they are read (``read``).
 
         Raises:
-            BundleError: when the directory is missing or is no bundle, or the manifest is changed or makes no sense.
+            BundleError: when the directory is missing or is not a bundle, or the manifest is changed or invalid.
             SpecError: for an impossible spec or program.
         """
         root = Path(path)
@@ -170,12 +170,12 @@ class Bundle:
 
     @property
     def graph_bytes(self) -> int:
-        """Bytes of all graphs, with the weights that lie beside them, whatever their files are called."""
+        """Bytes of all graphs, with the weights beside them, whatever their files are called."""
         graphs = tuple(graph.file for graph in self.manifest.graphs.values())
         folders = tuple(f"{folder}/" for graph in graphs if (folder := graph.rpartition("/")[0]))
         beside = () if len(folders) == len(graphs) else tuple(name for name in self.manifest.files if "/" not in name)
-        wanted = (*graphs, *folders, *beside)
-        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(wanted))
+        prefixes = (*graphs, *folders, *beside)
+        return sum(record.bytes for path, record in self.manifest.files.items() if path.startswith(prefixes))
 
 
 def seal(directory: Path, manifest: Manifest) -> Bundle:
@@ -184,9 +184,9 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
         if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
-            found = path.stat()
-            linked = found.st_nlink > 1  # shared among stages of the cache, and read-only
-            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), found.st_size)
+            status = path.stat()
+            linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
+            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), status.st_size)
     sealed = replace(manifest, files=files)
     write_manifest(directory, sealed)
     return Bundle(directory, sealed)
@@ -217,26 +217,21 @@ def digest_of(content: bytes) -> bytes:
 
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file as hex."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else _digest(stream)
-
-
-def _digest(stream: Any) -> str:
-    """``hashlib.file_digest`` for Python 3.10."""
     digest = hashlib.sha256()
-    while block := stream.read(1 << 20):
-        digest.update(block)
+    with path.open("rb", buffering=0) as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
     return digest.hexdigest()
 
 
 def _read_manifest(root: Path) -> Any:
     if not root.exists():
-        raise BundleError(f"There is no bundle at {root}.")
+        raise BundleError(f"No bundle at {root}.")
     path = root / MANIFEST
     if not path.is_file():
-        found = ", ".join(sorted(entry.name for entry in root.iterdir())[:6]) if root.is_dir() else "a file"
+        entries = ", ".join(sorted(entry.name for entry in root.iterdir())[:6]) if root.is_dir() else "a file"
         raise BundleError(
-            f"{root} is not a bundle: it has no {MANIFEST} (found: {found or 'nothing'}).",
+            f"{root} is not a bundle: it has no {MANIFEST} (found: {entries or 'nothing'}).",
             "make one with: vlatool export SOURCE -o BUNDLE",
         )
     content = _read_small(root, MANIFEST, limit("manifest_bytes"))
@@ -248,7 +243,7 @@ def _read_manifest(root: Path) -> Any:
 def _check_digest(root: Path, content: bytes) -> None:
     if not (root / DIGEST).exists():
         raise BundleError(
-            f"{root} has no {DIGEST}: a vlatool before there was one made it, or the file was taken away.",
+            f"{root} has no {DIGEST}: an older vlatool made it, or the file was removed.",
             f"export the policy again; or, if you trust this copy: cd {root} && sha256sum {MANIFEST} > {DIGEST}",
         )
     if _read_small(root, DIGEST, 4096) != digest_of(content):

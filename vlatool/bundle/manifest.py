@@ -121,12 +121,12 @@ class Manifest:
                 raise BundleError(f"The manifest names the graph {graph.file}, but records no hash for it.")
         if self.graphs and not self.program:
             raise BundleError(f"The manifest has graphs, but no program that runs them to '{self.spec.action.name}'.")
-        for name, found in self.accuracy.items():
-            if not isinstance(found, Mapping) or "value" not in found:
+        for name, measured in self.accuracy.items():
+            if not isinstance(measured, Mapping) or "value" not in measured:
                 raise BundleError(
-                    f"The manifest's accuracy '{name}' must have a number as 'value'; got {shown(found)}."
+                    f"The manifest's accuracy '{name}' must have a number as 'value'; got {shown(measured)}."
                 )
-            finite(found["value"], f"The manifest's accuracy '{name}'", BundleError)
+            finite(measured["value"], f"The manifest's accuracy '{name}'", BundleError)
         if self.program:
             check_program(self.program, self.graphs or {step.graph: None for step in self.program}, self.spec)
 
@@ -138,8 +138,6 @@ class Manifest:
             BundleError: for a newer schema, a missing key or a wrong type.
             SpecError: for an impossible spec or program.
         """
-        if not isinstance(data, Mapping):
-            raise BundleError(f"The manifest must be a mapping; got {type(data).__name__}.")
         values = mapping(data, "The manifest", BundleError)
         check_schema(values.get("schema"))
         known(values, [item.name for item in fields(cls)], "The manifest", BundleError)
@@ -153,8 +151,8 @@ class Manifest:
         values["spec"] = PolicySpec.from_dict(values["spec"])
         values["graphs"] = {name: _graph(name, graph) for name, graph in values.get("graphs", {}).items()}
         values["program"] = program_from(values.get("program", []))
-        values["build"] = _build_record(values.get("build", ()))
-        values["findings"] = _findings(values.get("findings", ()))
+        values["build"] = _entries(values.get("build", ()), "build", ("stage",))
+        values["findings"] = _entries(values.get("findings", ()), "findings", ("name", "message"))
         values["files"] = {path: _record(path, record) for path, record in values.get("files", {}).items()}
         for part, globs in values.get("parts", {}).items():
             for glob in listed(globs, f"The part '{part}' of the manifest", BundleError):
@@ -206,7 +204,7 @@ def check_schema(schema: Any) -> None:
 
 
 def _check_type(name: str, value: Any, item: Any) -> None:
-    """Hold a value against the type that its field has by default: text, a mapping or a list."""
+    """Check a value against the type that its field has by default: text, a mapping or a list."""
     where = f"The manifest's '{name}'"
     if name in ("spec", "schema"):
         return
@@ -246,26 +244,21 @@ def _inside(path: Any) -> None:
         raise BundleError(f"The manifest names the file {shown(path)}, which is not inside the bundle: {reason}.")
 
 
-def _findings(data: Any) -> tuple[dict[str, Any], ...]:
-    def named(each: Any) -> bool:
-        return isinstance(each, Mapping) and all(isinstance(each.get(key), str) for key in ("name", "message"))
-
-    if not isinstance(data, list | tuple) or not all(map(named, data)):
-        raise BundleError("The manifest has malformed 'findings'; they must be mappings with 'name' and 'message'.")
-    return tuple(dict(each) for each in data)
-
-
-def _build_record(data: Any) -> tuple[dict[str, Any], ...]:
-    named = all(isinstance(item, Mapping) and isinstance(item.get("stage"), str) for item in data)
-    if not isinstance(data, list | tuple) or not named:
-        raise BundleError("The manifest has a malformed 'build'; it must be a list of mappings that name a stage.")
-    return tuple(dict(item) for item in data)
+def _entries(data: Any, where: str, keys: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
+    """Return a list of mappings that have text under each of the keys."""
+    whole_list = isinstance(data, list | tuple) and all(
+        isinstance(entry, Mapping) and all(isinstance(entry.get(key), str) for key in keys) for entry in data
+    )
+    if not whole_list:
+        named = " and ".join(f"'{key}'" for key in keys)
+        raise BundleError(f"The manifest has a malformed '{where}'; it must be a list of mappings with {named}.")
+    return tuple(dict(entry) for entry in data)
 
 
 def _nonempty(value: Any) -> dict[str, Any]:
-    found = {}
+    plain = {}
     for item in fields(value):
         content = getattr(value, item.name)
         if content not in ({}, [], "", 0) and not (item.name == "repeat" and content == 1):
-            found[item.name] = content
-    return found
+            plain[item.name] = content
+    return plain

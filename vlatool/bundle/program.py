@@ -22,8 +22,6 @@ def check_step(step: ProgramStep) -> None:
     """
     text(step.graph, "The graph of a step", SpecError, empty=False)
     for word in ("feeds", "gives", "carry", "schedule", "noise", "keep"):
-        if not isinstance(getattr(step, word), Mapping):
-            raise SpecError(f"'{word}' of '{step.graph}' must be a mapping; got {shown(getattr(step, word))}.")
         mapping(getattr(step, word), f"'{word}' of '{step.graph}'", SpecError)
     for word in ("feeds", "gives", "carry"):
         for value in getattr(step, word).values():
@@ -37,7 +35,7 @@ def check_step(step: ProgramStep) -> None:
 
 def drawn_and_kept(step: ProgramStep) -> int:
     """Return the elements of the noise and of the kept values of an entry that was checked."""
-    return sum(axes(each["shape"], "a shape", SpecError) for each in (*step.noise.values(), *step.keep.values()))
+    return sum(axes(value["shape"], "a shape", SpecError) for value in (*step.noise.values(), *step.keep.values()))
 
 
 def _check_repeat(step: ProgramStep) -> None:
@@ -57,8 +55,7 @@ def _check_repeat(step: ProgramStep) -> None:
 
 
 def _check_noise(value: str, noise: Any) -> None:
-    if not isinstance(noise, Mapping):
-        raise SpecError(f"The noise '{value}' must be a mapping; got {shown(noise)}.")
+    noise = mapping(noise, f"The noise '{value}'", SpecError)
     known(noise, ("shape", "distribution"), f"The noise '{value}'", SpecError)
     if noise.get("distribution", "normal") not in DISTRIBUTIONS or not noise.get("shape"):
         raise SpecError(f"The noise '{value}' needs a shape and a distribution of {', '.join(DISTRIBUTIONS)}.")
@@ -104,7 +101,7 @@ class ProgramStep:
         check_step(self)
 
     def sources(self) -> set[str]:
-        """Values that this entry brings into being before its graph runs."""
+        """Values that this entry creates before its graph runs."""
         return {*self.schedule, *self.noise, *self.keep}
 
 
@@ -155,9 +152,9 @@ def check_program(program: Iterable[ProgramStep], graphs: Iterable[str], spec: P
                 raise SpecError(
                     f"Step {number} ({step.graph}) needs the value '{name}' before it exists; {nearest(name, values)}."
                 )
-        for given in step.carry:
-            if given not in step.gives.values():
-                raise SpecError(f"Step {number} carries '{given}', which '{step.graph}' does not give.")
+        for source in step.carry:
+            if source not in step.gives.values():
+                raise SpecError(f"Step {number} carries '{source}', which '{step.graph}' does not give.")
         values |= set(step.gives.values())
     for tensor in spec.outputs:
         if tensor.name not in values:

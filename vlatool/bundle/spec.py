@@ -65,7 +65,7 @@ class TensorSpec:
             if reason := outside(file):
                 raise SpecError(
                     f"'{self.name}' names the file {shown(file)}: {reason}.",
-                    "statistics and tokenizers lie in the policy's folder; name them relative to it",
+                    "statistics and tokenizers belong in the policy's folder; name them relative to it",
                 )
 
     def _check_words(self) -> None:
@@ -83,8 +83,8 @@ class TensorSpec:
         for field, values in allowed.items():
             got = getattr(self, field)
             if got not in values:
-                told = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
-                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {told}.")
+                allowed_values = nearest(got, [v for v in values if v]) if isinstance(got, str) else "it must be text"
+                raise SpecError(f"'{self.name}' has {field} {shown(got)}; {allowed_values}.")
 
     def _check_shape(self) -> None:
         for axis in self.shape:
@@ -135,7 +135,7 @@ class TensorSpec:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TensorSpec:
-        """Build from a mapping as it stands in ``manifest.json`` or ``policy.yaml``.
+        """Build from a mapping as in ``manifest.json`` or ``policy.yaml``.
 
         Raises:
             SpecError: for an unknown key or an impossible value.
@@ -240,17 +240,16 @@ class PolicySpec:
 
 
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:
-    if not isinstance(data, Mapping):
-        raise SpecError(f"The {where} must be a mapping; got {type(data).__name__}.")
-    known(data, [field.name for field in fields(cls)], f"The {where}", SpecError)
-    return mapping(data, f"The {where}", SpecError)
+    values = mapping(data, f"The {where}", SpecError)
+    known(values, [field.name for field in fields(cls)], f"The {where}", SpecError)
+    return values
 
 
 def _plain(value: Any) -> dict[str, Any]:
     """Return the non-default fields of a dataclass, tuples as lists (required fields always)."""
-    found = {}
+    plain = {}
     for field in fields(value):
         item = getattr(value, field.name)
         if item != field.default:
-            found[field.name] = list(item) if isinstance(item, tuple) else item
-    return found
+            plain[field.name] = list(item) if isinstance(item, tuple) else item
+    return plain

@@ -16,6 +16,7 @@ from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, lost, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
+from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
 from vlatool.machine.version import VERSION
 from vlatool.user_code import trust
@@ -37,8 +38,8 @@ def _trust(folders: list[Path]) -> list[Path]:
     return folders
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(asked: bool) -> None:
+    if asked:
         typer.echo(f"vlatool {VERSION}")
         raise typer.Exit
 
@@ -60,7 +61,7 @@ def _root(
     """Make a trained robot policy run, fast and safely, on the board that the robot carries."""
 
 
-def _standard_files() -> None:
+def _open_standard_files() -> None:
     """Open what the shell has closed (``2>&-``): files that are opened later would take the numbers, and the prints."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -71,8 +72,8 @@ def _standard_files() -> None:
             setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False))
 
 
-def _flushed() -> None:
-    """Give what nobody takes to nobody: a full disk or a closed pipe does not change the exit code at the very end."""
+def _flush_streams() -> None:
+    """Discard what cannot be written: a full disk or a closed pipe does not change the exit code at the very end."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -82,13 +83,13 @@ def _flushed() -> None:
 
 
 def _say(text: str, fix: str = "") -> None:
-    """Say something on stderr, where somebody reads it."""
+    """Print on stderr, if it is still open."""
     with contextlib.suppress(OSError, ValueError):
         typer.echo(f"{printable(text)}\n  fix: {printable(fix)}" if fix else printable(text), err=True)
 
 
 def _with_trust_first(arguments: list[str]) -> list[str]:
-    """Let ``--trust DIR`` stand anywhere: it is an option of every command."""
+    """Move ``--trust DIR`` to the front: it is an option of every command."""
     first: list[str] = []
     rest: list[str] = []
     words = iter(arguments)
@@ -96,7 +97,7 @@ def _with_trust_first(arguments: list[str]) -> list[str]:
         if word == "--":
             rest += [word, *words]
         elif word == "--trust":
-            first += [word, *[each for each in [next(words, None)] if each is not None]]
+            first += [word, *[folder for folder in [next(words, None)] if folder is not None]]
         elif word.startswith("--trust="):
             first.append(word)
         else:
@@ -105,7 +106,7 @@ def _with_trust_first(arguments: list[str]) -> list[str]:
 
 
 def _end_on_signals() -> None:
-    """Let SIGTERM and SIGHUP end the program as Ctrl-C does: what it started is ended, what it began is removed."""
+    """Make SIGTERM and SIGHUP end the program as Ctrl-C does: child processes are ended, drafts are removed."""
 
     def end(number: int, _frame: object) -> None:
         sys.exit(128 + number)
@@ -126,7 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
     Args:
         arguments: Its words; when None, those that the process was started with, and the process ends with this call.
     """
-    _standard_files()
+    _open_standard_files()
     _end_on_signals()
     words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
     for_good = arguments is None
@@ -135,7 +136,7 @@ def main(arguments: list[str] | None = None) -> None:
     if unprinted := lost():
         _say(str(unprinted), unprinted.fix)
         code = code or unprinted.exit_code
-    _flushed()
+    _flush_streams()
     sys.exit(code)
 
 
@@ -143,6 +144,7 @@ def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
     """Run a command line; return what the process ends with."""
     try:
         with plain_warnings(), trust.nothing_named():
+            refuse_two_distributions()
             code = app(words, standalone_mode=False) or 0
         if code == INTERRUPTED:  # typer catches Ctrl-C itself
             raise KeyboardInterrupt
@@ -155,20 +157,20 @@ def _run(words: list[str], document: Output | None, *, for_good: bool) -> Any:
             raise
         if for_good and isinstance(error, KeyboardInterrupt | typer.Abort):  # once more would interrupt the last words
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-        found = failure(error, words)
-        if document and found.exit_code:
-            document.failed(found)
-        _tell(error, found)
-        code = found.exit_code
+        fault = failure(error, words)
+        if document and fault.exit_code:
+            document.failed(fault)
+        _tell(error, fault)
+        code = fault.exit_code
     return code
 
 
-def _tell(error: BaseException, found: Failure) -> None:
-    """Say on stderr what went wrong; let what may be a bug end in a traceback where one is asked for."""
+def _tell(error: BaseException, fault: Failure) -> None:
+    """Print on stderr what went wrong; raise what may be a bug again where a traceback is asked for."""
     if isinstance(error, CLICK_EXCEPTION):
         with contextlib.suppress(OSError, ValueError):
             error.show()
-    elif found.type in ("InternalError", "PluginError") and os.environ.get("VLATOOL_DEBUG"):
+    elif fault.type in ("InternalError", "PluginError") and os.environ.get("VLATOOL_DEBUG"):
         raise error
-    elif found.exit_code:
-        _say(str(found), found.fix)
+    elif fault.exit_code:
+        _say(str(fault), fault.fix)

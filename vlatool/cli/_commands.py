@@ -9,14 +9,14 @@ import typer
 from typer.core import TyperGroup
 
 from vlatool import registry
-from vlatool.cli._stages import StageGroup, built, failing
+from vlatool.cli._stages import DEFAULTS, StageGroup, built, failing
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import stage_kinds
 
 FIRST = "optimize"
-"""What most people want stands first in the help."""
+"""What most people want comes first in the help."""
 HIDDEN = ("sources",)
-"""Kinds of stages that are no command: a source is an argument of every command."""
+"""Kinds of stages that are not commands: a source is an argument of every command."""
 
 
 class Commands(TyperGroup):
@@ -25,11 +25,11 @@ class Commands(TyperGroup):
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the commands: the one for everything, then the others by name."""
         kinds = [kind for kind in stage_kinds() if kind not in HIDDEN and registry.names(kind)]
-        found = {name.replace("_", "-") for name in (*registry.names("commands"), *kinds)}
-        return sorted(found, key=lambda name: (name != FIRST, name))
+        commands = {name.replace("_", "-") for name in (*registry.names("commands"), *kinds)}
+        return sorted(commands, key=lambda name: (name != FIRST, name))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command that is named; where there is none, say which is nearest."""
+        """Find the named command; for an unknown one, suggest the nearest."""
         if args and args[0] not in (known := self.list_commands(ctx)) and not ctx.resilient_parsing:
             raise UsageError(f"Unknown command '{args[0]}'; {nearest(args[0], known)}.", "vlatool --help")
         return super().resolve_command(ctx, args)
@@ -41,26 +41,26 @@ class Commands(TyperGroup):
         if cmd_name in stage_kinds():
             package = importlib.import_module(registry.package_of(cmd_name))
             text = (package.__doc__ or "").strip().splitlines()[0]
-            group = typer.main.get_group(typer.Typer(cls=StageGroup, help=text, rich_markup_mode=None))
-            group.name = cmd_name
+            group: Any = typer.main.get_group(typer.Typer(cls=StageGroup, help=text, rich_markup_mode=None))
+            group.name, group.default = cmd_name, DEFAULTS[cmd_name]
             return group
         try:
             source = registry.module("commands", cmd_name)
         except PluginError as error:
             return failing(cmd_name, error)
-        found = getattr(source, "app", None) or getattr(source, cmd_name.replace("-", "_"), None)
-        if not isinstance(found, typer.Typer) and not callable(found):
+        command = getattr(source, "app", None) or getattr(source, cmd_name.replace("-", "_"), None)
+        if not isinstance(command, typer.Typer) and not callable(command):
             missing = f"neither a function of that name nor a Typer 'app' is in {source.__name__}"
             words = f"The package {registry.owner(source.__name__)} adds the command '{cmd_name}', but {missing}."
-            return failing(cmd_name, PluginError(words, "tell its authors"))
-        return _built(found, cmd_name)
+            return failing(cmd_name, PluginError(words, "report it to its authors"))
+        return _built(command, cmd_name)
 
 
-def _built(found: Any, name: str) -> Any:
+def _built(source: Any, name: str) -> Any:
     """Return the click command of a Typer application or of a function."""
-    if not isinstance(found, typer.Typer):
-        return built(found, name)
-    found._add_completion = False
-    command = typer.main.get_command(found)
+    if not isinstance(source, typer.Typer):
+        return built(source, name)
+    source._add_completion = False
+    command = typer.main.get_command(source)
     command.name = name
     return command

@@ -1,11 +1,11 @@
-"""What a shell may complete: names of profiles, engines, samples, and what lies in folders. Reads names alone."""
+"""Shell completion: names of profiles, engines and samples, and paths. Reads names alone."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from typer.core import TyperGroup
@@ -18,7 +18,7 @@ MOST = 200
 """Of a folder."""
 _CLICK: Any = TyperGroup.__mro__[1].__module__.rpartition(".")[0]
 CompletionItem: Any = importlib.import_module(f"{_CLICK}.shell_completion").CompletionItem
-"""Of the click that typer brings, or of the one that it imports, by its version."""
+"""From the click inside typer, or the one that it imports, depending on its version."""
 
 
 def profiles(incomplete: str) -> list[str]:
@@ -26,33 +26,29 @@ def profiles(incomplete: str) -> list[str]:
     from vlatool.hardware.profile import SUFFIXES, names
 
     files = _paths(incomplete, lambda path: path.endswith(tuple(SUFFIXES))) if os.sep in incomplete else []
-    return [*(name for name in names() if name.startswith(incomplete)), *files]
+    return [*_starting(names(), incomplete), *files]
 
 
 def platforms(incomplete: str) -> list[str]:
     """Return names of robot platforms."""
     from vlatool.hardware.platforms import platform_names
 
-    return [name for name in platform_names() if name.startswith(incomplete)]
+    return _starting(platform_names(), incomplete)
 
 
 def engines(incomplete: str) -> list[str]:
     """Return names of engines."""
-    return _names("engines", incomplete)
+    return _starting(registry.names("engines"), incomplete)
 
 
 def samples(incomplete: str) -> list[str]:
     """Return the shapes of policies that can be made."""
-    return [
-        name.replace("_", "-") for name in registry.names("samples") if name.replace("_", "-").startswith(incomplete)
-    ]
+    return _starting((name.replace("_", "-") for name in registry.names("samples")), incomplete)
 
 
 def precisions(incomplete: str) -> list[str]:
-    """Return the precisions that profiles speak of."""
-    return [
-        name for name in ("float32", "float16", "bfloat16", "float8", "int8", "int4") if name.startswith(incomplete)
-    ]
+    """Return the precisions that profiles have figures for."""
+    return _starting(("float32", "float16", "bfloat16", "float8", "int8", "int4"), incomplete)
 
 
 def bundles(incomplete: str) -> list[str]:
@@ -81,13 +77,13 @@ OF_FIELDS: dict[str, Callable[[str], list[str]]] = {
 """Field of a stage -> what completes it."""
 
 
-def items(found: list[str]) -> list[Any]:
+def items(values: list[str]) -> list[Any]:
     """Return what click takes from a group."""
-    return [CompletionItem(each) for each in found]
+    return [CompletionItem(value) for value in values]
 
 
-def _names(kind: str, incomplete: str) -> list[str]:
-    return [name for name in registry.names(kind) if name.startswith(incomplete)]
+def _starting(names: Iterable[str], incomplete: str) -> list[str]:
+    return [name for name in names if name.startswith(incomplete)]
 
 
 def _is_bundle(path: str) -> bool:
@@ -98,19 +94,19 @@ def _holds(path: str, name: str) -> bool:
     return os.path.isfile(os.path.join(path, name))
 
 
-def _paths(incomplete: str, wanted: Callable[[str], bool]) -> list[str]:
-    """Return the paths that begin so and are wanted; folders that are not end in a slash."""
-    found = []
+def _paths(incomplete: str, accepts: Callable[[str], bool]) -> list[str]:
+    """Return the matching paths that are accepted; folders that are not end in a slash."""
+    paths = []
     for path in _beginning(incomplete):
-        if wanted(path):
-            found.append(path)
+        if accepts(path):
+            paths.append(path)
         elif os.path.isdir(path):
-            found.append(path + os.sep)
-    return found
+            paths.append(path + os.sep)
+    return paths
 
 
 def _beginning(incomplete: str) -> Iterator[str]:
-    """Return what lies in the folder of an incomplete path, and begins so; hidden files only when asked for."""
+    """Return the paths that begin like an incomplete one; hidden files only where it begins with a dot."""
     folder, start = os.path.split(incomplete)
     with contextlib.suppress(OSError):
         for name in sorted(os.listdir(folder or os.curdir))[: MOST * 10]:

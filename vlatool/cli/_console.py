@@ -32,21 +32,21 @@ PLACES = ("-o", "--output", "--cache", "--junit")
 
 def command_line() -> str:
     """Return the command as a person would type it elsewhere: outputs and caches without folders of this machine."""
-    words, told = sys.argv[1:], ["vlatool"]
+    words, shown = sys.argv[1:], ["vlatool"]
     for before, word in zip(["", *words], words, strict=False):
         name, sign, value = word.partition("=")
         if before in PLACES:
-            told.append(_neutral(word))
+            shown.append(_without_folders(word))
         elif sign and name in PLACES:
-            told.append(f"{name}={_neutral(value)}")
+            shown.append(f"{name}={_without_folders(value)}")
         elif word.startswith("-o") and not word.startswith("--"):
-            told.append(f"-o{_neutral(word[2:])}" if word[2:] else word)
+            shown.append(f"-o{_without_folders(word[2:])}" if word[2:] else word)
         else:
-            told.append(word)
-    return shlex.join(told)
+            shown.append(word)
+    return shlex.join(shown)
 
 
-def _neutral(path: str) -> str:
+def _without_folders(path: str) -> str:
     """Return the last part of an absolute path, or of one that leaves the current directory."""
     return Path(path).name or path if os.path.isabs(path) or path.startswith(("..", "~")) else path
 
@@ -77,8 +77,8 @@ def progress(workers: int = 1) -> Iterator[Context]:
         task = bar.add_task("starting", total=None)
 
         def tell(what: str, share: float | None) -> None:
-            told, whole = escape(one_line(what)), None if share is None else 1.0
-            bar.update(task, description=told, total=whole, completed=share or 0.0)
+            text, whole = escape(one_line(what)), None if share is None else 1.0
+            bar.update(task, description=text, total=whole, completed=share or 0.0)
 
         yield Context(tell, workers, command_line())
 
@@ -90,7 +90,7 @@ def _plain_lines() -> Tell:
         kind = re.sub(r"[\d.,%]+", "", what)
         if kind != last[0]:
             last[0] = kind
-            with contextlib.suppress(OSError):  # nobody reads it any more: no reason to stop
+            with contextlib.suppress(OSError):  # its reader is gone: no reason to stop
                 typer.echo(f"... {one_line(what)}", err=True)
 
     return tell
@@ -98,7 +98,7 @@ def _plain_lines() -> Tell:
 
 @contextlib.contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Show what vlatool warns of on stderr, as one sentence and once, however often a stage says it."""
+    """Show vlatool's warnings on stderr, each as one sentence and once, however often a stage repeats it."""
     shown: set[str] = set()
     elsewhere = warnings.showwarning
 
@@ -120,7 +120,7 @@ def plain_warnings() -> Iterator[None]:
 def refuse_existing(
     out: Path | None, force: bool, *inputs: str | os.PathLike[str] | None, kind: str | None = REPORT
 ) -> None:
-    """Say before the work, not after it, that the output cannot be written.
+    """Refuse an output that cannot be written before the work, not after it.
 
     Args:
         out: The output, None when there is none.
@@ -146,7 +146,7 @@ def file_or_none(named: str | None) -> str | None:
 
 def _refuse_unwritable(out: Path) -> None:
     """Refuse a place in which no directory can be made."""
-    above = next(each for each in out.absolute().parents if each.exists())
+    above = next(folder for folder in out.absolute().parents if folder.exists())
     if not above.is_dir():
         raise OutputError(f"Cannot write {out}: a part of the path is a file ({above}).", "choose another output")
     if not os.access(above, os.W_OK | os.X_OK):
@@ -154,7 +154,7 @@ def _refuse_unwritable(out: Path) -> None:
 
 
 def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False, raw: bool = False) -> None:
-    """Print a report on stdout, write it to a directory where wanted, and leave with the verdict's exit code.
+    """Print a report on stdout, write it to a directory where wanted, and exit with the verdict's code.
 
     Args:
         report: What was found out.
@@ -180,14 +180,14 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
             write_reports(report, draft)
     if out is not None and not as_json:
         put(f"report: {out / 'report.html'}\n")
-    leave(report)
+    raise_verdict(report)
 
 
 def terminal_text(report: Report, *, brief: bool = False) -> str:
     """Return the report for this terminal: its width, its colours."""
     import shutil
 
-    from vlatool.render.terminal import TerminalRenderer
+    from vlatool.render.formats.terminal import TerminalRenderer
 
     color = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     width = min(shutil.get_terminal_size((80, 24)).columns, 120)
@@ -195,20 +195,20 @@ def terminal_text(report: Report, *, brief: bool = False) -> str:
 
 
 def _printable(value: Any) -> Any:
-    """Return a report whose texts may stand on a terminal."""
+    """Return a report whose texts are safe to print on a terminal."""
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, (tuple, list)):
-        return type(value)(_printable(each) for each in value)
+        return type(value)(_printable(item) for item in value)
     if isinstance(value, dict):
-        return {_printable(name): _printable(each) for name, each in value.items()}
+        return {_printable(name): _printable(item) for name, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
-        given = {each.name: getattr(value, each.name) for each in fields(value) if each.init}
-        return replace(value, **_printable(given))
+        contents = {field.name: getattr(value, field.name) for field in fields(value) if field.init}
+        return replace(value, **_printable(contents))
     return value
 
 
-def leave(report: Report) -> None:
+def raise_verdict(report: Report) -> None:
     """Raise for a verdict that is not good.
 
     Raises:

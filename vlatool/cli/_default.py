@@ -1,4 +1,4 @@
-"""A group of commands whose first word may be something else: then its default command is meant."""
+"""A group of commands with a default: where the first word names no command, the default one runs."""
 
 from __future__ import annotations
 
@@ -9,16 +9,24 @@ from typer.core import TyperGroup
 from vlatool.cli import _complete
 
 
+class DefaultGroup(TyperGroup):
+    """A group that inserts its default command where the first word names none."""
+
+    default = ""
+
+    def names_command(self, ctx: Any, args: list[str]) -> bool:
+        """Return whether the first word is a command, asks for help or is absent."""
+        return not args or args[0].replace("_", "-") in ("--help", *self.list_commands(ctx))
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the default command."""
+        return super().parse_args(ctx, args if self.names_command(ctx, args) else [self.default, *args])
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Return commands, and what the default command takes in their place."""
+        return [*super().shell_complete(ctx, incomplete), *_complete.items(_complete.sources(incomplete))]
+
+
 def group_with(default: str) -> type[TyperGroup]:
-    """Return a class of groups that insert a command where the first word names none."""
-
-    class Group(TyperGroup):
-        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-            if args and args[0] not in ("--help", *self.list_commands(ctx)):
-                args = [default, *args]
-            return super().parse_args(ctx, args)
-
-        def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-            return [*super().shell_complete(ctx, incomplete), *_complete.items(_complete.sources(incomplete))]
-
-    return Group
+    """Return a class of groups with a default command."""
+    return type("Group", (DefaultGroup,), {"default": default})

@@ -23,7 +23,7 @@ from vlatool.cli._failure import INPUT, Failure
 from vlatool.report import Report, without_nan
 
 FLAG = "--json"
-TOLD_AT_ONCE = ("--help", "--version")
+ANSWERED_AT_ONCE = ("--help", "--version")
 """Options whose text is the result of the command line that has them."""
 
 
@@ -90,19 +90,19 @@ def report_document(report: Report, *, raw: bool, file: Path | None) -> dict[str
         raw: Whether raw samples are wanted.
         file: The report that keeps them, None when none is written.
     """
-    told: dict[str, Any] = asdict(report)
+    plain: dict[str, Any] = asdict(report)
     left_out = sum(len(series) for row in report.rows for series in row.raw.values())
     if raw or not left_out:
-        return told
-    for row in told["rows"]:
+        return plain
+    for row in plain["rows"]:
         row["raw"] = {}
     where = str(file.absolute()) if file else None
     ask = "--raw prints them" + ("" if file else "; -o DIRECTORY keeps them in report.json")
-    return {**told, "raw_samples": {"omitted": left_out, "file": where, "fix": ask}}
+    return {**plain, "raw_samples": {"omitted": left_out, "file": where, "fix": ask}}
 
 
 def wants_json(words: Sequence[str]) -> bool:
-    """Say whether a command line asks for JSON, even one that is refused before its options are read."""
+    """Return whether a command line asks for JSON, even one that is refused before its options are read."""
     return FLAG in words[: words.index("--") if "--" in words else len(words)]
 
 
@@ -117,7 +117,7 @@ def output(words: Sequence[str], *, for_good: bool) -> Iterator[Output | None]:
     if not wants_json(words):
         yield None
         return
-    at_once = any(word in TOLD_AT_ONCE for word in words)
+    at_once = any(word in ANSWERED_AT_ONCE for word in words)
     printed = io.StringIO() if at_once else None
     stdout, kept = sys.stdout, _set_aside()
     sys.stdout = printed or sys.stderr
@@ -143,7 +143,7 @@ def _set_aside() -> int:
 
 
 def _flush(stream: Any) -> None:
-    """Let what Python and C keep in buffers go where descriptor 1 leads now."""
+    """Flush the buffers of Python and C to where descriptor 1 leads now."""
     with contextlib.suppress(OSError, ValueError):
         stream.flush()
     with contextlib.suppress(OSError, AttributeError):
@@ -151,7 +151,7 @@ def _flush(stream: Any) -> None:
 
 
 def put(text: str) -> None:
-    """Print on standard output. A reader that has gone (``| head``) is no error; of a full disk ``lost`` tells."""
+    """Print on standard output. A reader that is gone (``| head``) is no error; a full disk is noted for ``lost``."""
     try:
         typer.echo(text, nl=False)
         sys.stdout.flush()

@@ -14,12 +14,11 @@ from vlatool.errors import VlatoolError
 from vlatool.files.printable import message_of
 
 OK = 0
-USAGE = 2
 INPUT = 3
 OUR_BUG = 70
 INTERRUPTED = 130
 CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
-"""The base of usage errors: of the click that typer brings, or of the one that it imports, by its version."""
+"""The base of usage errors: from the click inside typer, or the one that it imports, depending on its version."""
 KEEPING = frozenset(("optimize", "export", "quantize"))
 """Commands whose finished stages stay in the cache when they are interrupted."""
 TYPES = ("OSError", "MemoryError", "Interrupted", "Terminated", "InternalError")
@@ -57,7 +56,7 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
         kept = "; finished stages are kept" if KEEPING.intersection(words) else ""
         return Failure("Interrupted", f"interrupted{kept}", "", INTERRUPTED)
     if isinstance(error, BrokenPipeError):
-        return Failure("OSError", "nobody reads the output any more.", "", OK)
+        return Failure("OSError", "the reader of the output is gone.", "", OK)
     if isinstance(error, OSError):
         where = error.filename or ("standard output" if _printing(error) else "a file")
         return Failure("OSError", f"{where}: {error.strerror or error}.", "", INPUT)
@@ -68,13 +67,13 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
         return Failure("Terminated", f"ended by signal {code - 128}." if code > 128 else "ended.", "", code)
     if blamed := _plugin(error):
         words = f"The package {blamed}, which adds to vlatool, fails: {type(error).__name__}: {message_of(error)}."
-        return Failure("PluginError", words, "tell its authors, with the traceback of VLATOOL_DEBUG=1", INPUT)
+        return Failure("PluginError", words, "report it to its authors, with the traceback of VLATOOL_DEBUG=1", INPUT)
     fix = "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback"
     return Failure("InternalError", f"{type(error).__name__}: {message_of(error)}", fix, OUR_BUG)
 
 
 def _printing(error: BaseException) -> bool:
-    """Say whether an error is one of printing: it was raised in ``typer.echo``."""
+    """Return whether an error is one of printing: it was raised in ``typer.echo``."""
     return [frame.f_code.co_name for frame, _ in traceback.walk_tb(error.__traceback__)][-1:] == ["echo"]
 
 
@@ -86,7 +85,7 @@ def _plugin(error: BaseException) -> str:
 
 
 def _usage(error: Any) -> Failure:
-    """Return what click says of a command line that it refuses."""
+    """Return click's reason for refusing a command line."""
     context = getattr(error, "ctx", None)
     fix = f"{context.command_path} --help" if context else ""
     return Failure("UsageError", error.format_message(), fix, int(error.exit_code))

@@ -6,14 +6,14 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlatool.optimize.pipeline import Plan
+    from vlatool.optimize.plan import Plan
     from vlatool.stage.base import Stage
 
 
 def plan_document(plan: Plan) -> dict[str, Any]:
     """Return what ``plan.lines()`` says, as values that JSON can say."""
     effort, loop = plan.recipe.effort, plan.closed_loop
-    told = {
+    plain = {
         "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
         "export": _stages(plan.export),
         "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
@@ -25,7 +25,7 @@ def plan_document(plan: Plan) -> dict[str, Any]:
         "computes": plan.board_set.plan() or None,
         "cache": str(plan.cache),
     }
-    return {"plan": told}
+    return {"plan": plain}
 
 
 def _stages(stages: Iterable[Stage]) -> list[dict[str, Any]]:

@@ -7,15 +7,16 @@ import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
+from vlatool.cli._board_summary import board_summary
 from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
 from vlatool.cli._document import document
-from vlatool.cli._made import for_board, graph_bytes
+from vlatool.cli._options import AsJson, Force, Raw
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.machine.host import MAX_CPU_ISA
@@ -29,58 +30,44 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 
-def _flag(name: str, annotation: Any, default: Any, *flags: str, **settings: Any) -> inspect.Parameter:
-    option = typer.Option(default, *flags, **settings)
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
+def _flag(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-SOURCE_FLAG = inspect.Parameter(
-    "source",
-    inspect.Parameter.KEYWORD_ONLY,
-    default=typer.Argument(
-        ...,
-        show_default=False,
-        help="a bundle, a policy directory, path.py:make or an .onnx file",
-        autocompletion=_complete.sources,
-    ),
-    annotation=str,
+def _board_flag(about: str) -> inspect.Parameter:
+    option = typer.Option("--profile", help=about, autocompletion=_complete.profiles)
+    return _flag("profile", Annotated[str | None, option], None)
+
+
+SOURCE = typer.Argument(
+    show_default=False,
+    help="a bundle, a policy directory, path.py:make or an .onnx file",
+    autocompletion=_complete.sources,
 )
-_FORCE = _flag("force", bool, False, "--force", help="replace an output that exists")
-_JSON = _flag("as_json", bool, False, "--json", help="print JSON on stdout")
+SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
+NEW_BUNDLE = typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)
+REPORTS = typer.Option("-o", "--output", help="directory for report.html, report.md and report.json")
+WORKERS = typer.Option("--workers", min=1, help="processes for closed-loop episodes; all cores if unset")
+TARGET = typer.Option("--target", help="run there, through ssh: user@host, or a Host of your ssh config")
+REMOTE_PYTHON = typer.Option("--remote-python", help="Python of the target, such as ~/venv/bin/python")
+COMMON_FLAGS = (_flag("force", Force, False), _flag("as_json", AsJson, False))
 TRANSFORM_FLAGS = (
-    _flag("out", Path, ..., "-o", "--output", help="directory of the new bundle", show_default=False),
-    _flag(
-        "profile",
-        str | None,
-        None,
-        "--profile",
-        help="make it as this board takes it, and say what to expect there (see: vlatool profiles list)",
-        autocompletion=_complete.profiles,
-    ),
-    _FORCE,
-    _JSON,
+    _flag("out", Annotated[Path, NEW_BUNDLE]),
+    _board_flag("make it the way this board runs it, and show what to expect there (see: vlatool profiles list)"),
+    *COMMON_FLAGS,
 )
 MEASURE_FLAGS = (
-    _flag("out", Path | None, None, "-o", "--output", help="directory for report.html, report.md and report.json"),
-    _flag(
-        "profile",
-        str | None,
-        None,
-        "--profile",
-        help="add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set",
-        autocompletion=_complete.profiles,
+    _flag("out", Annotated[Path | None, REPORTS], None),
+    _board_flag(
+        "add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set"
     ),
-    _flag(
-        "workers",
-        int | None,
-        None,
-        "--workers",
-        min=1,
-        help="processes for closed-loop episodes; all cores if unset",
-    ),
-    _FORCE,
-    _JSON,
-    _flag("raw", bool, False, "--raw", help="keep every raw sample in the JSON of --json"),
+    _flag("workers", Annotated[int | None, WORKERS], None),
+    *COMMON_FLAGS,
+    _flag("raw", Raw, False),
+)
+REMOTE_FLAGS = (
+    _flag("target", Annotated[str | None, TARGET], None),
+    _flag("remote_python", Annotated[str | None, REMOTE_PYTHON], None),
 )
 
 
@@ -103,29 +90,30 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
                 stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
-        made = run_transform(stage, bundle, out, context, force=force)
-        there = for_board(made, bundle, board, context) if board else None
+        result = run_transform(stage, bundle, out, context, force=force)
+        on_board = board_summary(result, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""
-    summary = {"bundle": str(out), "hash": made.hash, "bytes": made.size_bytes}
-    precision = {name: graph.precision for name, graph in made.manifest.graphs.items()}
-    findings = made.manifest.findings
+    precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}
     if as_json:
-        document({**summary, "precision": precision, "findings": findings, "board": there.values() if there else None})
-        _refuse(made, baseline)
+        document({
+            "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
+            "findings": result.manifest.findings, "board": on_board.values() if on_board else None,
+        })  # fmt: skip
+        _refuse(result, baseline)
         return
-    graphs = f"graphs {graph_bytes(made) / 1e6:.2f} MB, " if made.manifest.graphs else ""
-    sizes = f"{graphs}in all {made.size_bytes / 1e6:.1f} MB"
-    typer.echo(f"{out}: {made.manifest.name} {made.manifest.version}, {sizes}")
-    for line in stage.lines(made):
+    graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
+    sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
+    typer.echo(f"{out}: {result.manifest.name} {result.manifest.version}, {sizes}")
+    for line in stage.lines(result):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         if not shares:
             typer.echo(f"  {name}: no matrix product or convolution")
             continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
-    for line in there.lines() if there else ():
+    for line in on_board.lines() if on_board else ():
         typer.echo(f"  {line}")
-    _refuse(made, baseline)
+    _refuse(result, baseline)
 
 
 def _onnx_source(export: Transform, source: Transform) -> Transform:
@@ -134,28 +122,28 @@ def _onnx_source(export: Transform, source: Transform) -> Transform:
     return source.model_copy(update={"opset": getattr(export, "opset", None)}) if asked else source
 
 
-def _refuse(made: Bundle, baseline: str = "") -> None:
-    """Leave with an error when a stage found the bundle to be wrong; it is there all the same, to be looked at.
+def _refuse(bundle: Bundle, baseline: str = "") -> None:
+    """Fail when a stage marked the bundle as wrong; it stays where it is, for inspection.
 
     Args:
-        made: The new bundle.
+        bundle: The new bundle.
         baseline: The bundle that it was made from, where a path leads to it.
 
     Raises:
         GateFailed: naming the first finding.
     """
-    for finding in made.manifest.findings:
+    for finding in bundle.manifest.findings:
         beside = f" --baseline {shlex.quote(baseline)}" if baseline else ""
         overrule = f"load, optimize and gate refuse the bundle (to overrule: {finding['name']})"
-        fix = f"vlatool explain {made.path}{beside}; {overrule}"
-        raise GateFailed(f"{made.path} was written, but it is wrong: {finding['message']}", fix)
+        fix = f"vlatool explain {bundle.path}{beside}; {overrule}"
+        raise GateFailed(f"{bundle.path} was written, but it is wrong: {finding['message']}", fix)
 
 
 def named_files(stage: Stage) -> tuple[Path, ...]:
     """Return the files and directories that the options of a stage name."""
     values = [getattr(stage, name) for name in type(stage).model_fields]
-    each = [one for value in values for one in (value if isinstance(value, tuple) else (value,))]
-    return tuple(one for one in each if isinstance(one, Path))
+    items = [item for value in values for item in (value if isinstance(value, tuple) else (value,))]
+    return tuple(item for item in items if isinstance(item, Path))
 
 
 def streamed(stage: Transform, source: str, context: Context) -> Bundle | None:
@@ -186,18 +174,6 @@ def opened(source: str, context: Context) -> Bundle:
     from vlatool.sources import is_bundle
 
     return Bundle.open(source) if is_bundle(source) else exported(source, cache_directory(), context)
-
-
-REMOTE_FLAGS = (
-    _flag(
-        "target",
-        str | None,
-        None,
-        "--target",
-        help="run there, through ssh: user@host, or a Host of your ssh config",
-    ),
-    _flag("remote_python", str | None, None, "--remote-python", help="Python of the target, such as ~/venv/bin/python"),
-)
 
 
 def measure(
@@ -247,14 +223,14 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
 
 
 def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
-    """Add what is predicted for a board; a robot without onnx measures all the same, and is told what is missing."""
+    """Add what is predicted for a board; without onnx, the measurement stands, with a warning."""
     from vlatool.boards.predict import predictions
 
     row = report.rows[-1] if report.kind == "evaluate" else report.rows[0]
     try:
-        told = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
+        predicted = replace(row, measurements=(*row.measurements, *predictions(board, bundle)))
     except MissingExtra as error:
         return replace(report, warnings=(*report.warnings, f"nothing is predicted for {board.name}: {error.message}"))
-    rows = tuple(told if each is row else each for each in report.rows)
+    rows = tuple(predicted if other is row else other for other in report.rows)
     first, *more = (*report.summary, "")
-    return replace(report, rows=rows, summary=(first + foretold(told, told, board.name), *filter(None, more)))
+    return replace(report, rows=rows, summary=(first + foretold(predicted, predicted, board.name), *filter(None, more)))

@@ -50,13 +50,13 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "samples list": ("samples",),
     "samples make": ("sample",),
 }
-"""Command, or group of commands -> what it prints when it ends well; the first is the usual one."""
+"""Command, or group of commands -> what it prints on success; the first is the usual one."""
 
 
-def a(told: str, /, **properties: Schema) -> Schema:
-    """Return the schema of an object with exactly these keys; an error may stand beside them."""
+def document(description: str, /, **properties: Schema) -> Schema:
+    """Return the schema of an object with exactly these keys; an error may be among them."""
     return {
-        "type": "object", "description": told, "properties": {**properties, "error": ERROR},
+        "type": "object", "description": description, "properties": {**properties, "error": ERROR},
         "required": list(properties), "additionalProperties": False,
     }  # fmt: skip
 
@@ -101,7 +101,7 @@ def definitions(report: Schema) -> dict[str, Schema]:
     return {
         **report["$defs"],
         "error": _error(),
-        "failed": a("What a command prints that found nothing out.") | {"required": ["error"]},
+        "failed": document("What a command prints that found nothing out.") | {"required": ["error"]},
         "report": {
             **{key: report[key] for key in ("type", "description", "required")},
             "properties": {**shown, "error": ERROR},
@@ -113,13 +113,13 @@ def definitions(report: Schema) -> dict[str, Schema]:
 
 
 def _documents() -> dict[str, Schema]:
-    """Return what is made for the command line alone."""
+    """Return the documents that only the command line has."""
     files = many(record(file=TEXT, bytes=INTEGER, identical=FLAG, why=TEXT))
     status = {"enum": ["ok", "warn", "missing"]}
     both = {"type": "array", "items": NUMBER}
     return {
-        "plan": a("What optimize would do.", plan=PLAN),
-        "made": a(
+        "plan": document("What optimize would do.", plan=PLAN),
+        "made": document(
             "A bundle that was written; precision: graph -> dtype -> share of its multiply-accumulates.",
             bundle=TEXT, hash=TEXT, bytes=INTEGER, precision=by_name(by_name(NUMBER)), findings=many(ANYTHING),
             board={"anyOf": [record(
@@ -132,29 +132,29 @@ def _documents() -> dict[str, Schema]:
             "type": "object", "description": "manifest.json of the bundle, byte by byte, when there is no error.",
             "required": ["name", "version", "spec", "graphs", "files"], "properties": {"error": ERROR},
         },
-        "rebuilt": a(
+        "rebuilt": document(
             "A bundle that was made again.",
             bundle=TEXT, source=TEXT, identical=FLAG, hash=record(recorded=TEXT, rebuilt=TEXT), left_out=many(TEXT),
             versions=by_name(SHIFT), stages=many(record(stage=TEXT, graphs_identical=FLAG)), files=files,
             output={"type": ["string", "null"]},
         ),
-        "cache_size": a("What the cache holds, stage by stage.", **CACHE, stages=many(
+        "cache_size": document("What the cache holds, stage by stage.", **CACHE, stages=many(
             record(stage=TEXT, entries=INTEGER, bytes=INTEGER))),
-        "cache_list": a("What the cache holds, the least recently used first.", **CACHE, entries=many(
+        "cache_list": document("What the cache holds, the least recently used first.", **CACHE, entries=many(
             record(name=TEXT, stage=TEXT, used=TEXT, bytes=INTEGER, shared_bytes=INTEGER))),
-        "cache_pruned": a(
+        "cache_pruned": document(
             "What was removed from the cache, or would be; stays: name -> why.",
             cache=TEXT, dry_run=FLAG, removed=many(TEXT), freed_bytes=INTEGER, bytes=INTEGER, stays=by_name(TEXT),
         ),
         "checks": many(record(name=TEXT, status=status, finding=TEXT, fix=TEXT)),
-        "simulation": a(
+        "simulation": document(
             "Predicted, not measured; latency_ms: value, low, high.",
             source=TEXT, profile=TEXT, mode=TEXT, engine=TEXT, precision=TEXT, origin={"const": "predicted"},
             latency_ms=both, regime=TEXT, memory_mb=both, watts=both, joules=NUMBER, execute=INTEGER,
             control_hz=NUMBER, phases=many(PHASE), timeline={"type": "array"}, changes={"type": "array"},
         ),
-        "telemetry": a(
-            "What the machine told; a reading's times are seconds.",
+        "telemetry": document(
+            "What the machine reported; a reading's times are seconds.",
             seconds=NUMBER, energy=many(ANYTHING), throttled={"type": ["boolean", "null"]}, throttling=many(TEXT),
             gauges=by_name(GAUGE), counters=by_name(COUNTER), unmeasured=many(record(reader=TEXT, reason=TEXT)),
         ),
@@ -162,11 +162,11 @@ def _documents() -> dict[str, Schema]:
         "scores": by_name({"$ref": "#/$defs/score"}),
         "profiles": many({"$ref": "#/$defs/profile"}),
         "differences": many({"type": "object", "required": ["field"]}),
-        "validated": a("Profiles by name, and what is wrong with others.", valid=many(TEXT), wrong=many(TEXT)),
-        "calibrated": a("What the latency model was told.", kept_in=TEXT, measured=many(ANYTHING)),
-        "written": a("Files that were written.", written=many(TEXT)),
+        "validated": document("Profiles by name, and what is wrong with others.", valid=many(TEXT), wrong=many(TEXT)),
+        "calibrated": document("Measurements given to the latency model.", kept_in=TEXT, measured=many(ANYTHING)),
+        "written": document("Files that were written.", written=many(TEXT)),
         "samples": many(record(name=TEXT, description=TEXT)),
-        "sample": a("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),
+        "sample": document("A policy that was written.", policy=TEXT, sample=TEXT, seed=INTEGER),
     }  # fmt: skip
 
 
@@ -174,7 +174,7 @@ def _error() -> Schema:
     classes = [name for name, kind in vars(errors).items() if inspect.isclass(kind)
                and issubclass(kind, errors.VlatoolError)]  # fmt: skip
     return {
-        "description": "Why a command did not end with 0; the same is said on standard error.",
+        "description": "Why a command did not end with 0; the same is printed on standard error.",
         **record(
             type={"enum": [*classes, *TYPES]}, message=TEXT, fix={**TEXT, "description": "what to do; may be empty"},
             exit_code={"type": "integer", "minimum": 1},
@@ -183,13 +183,13 @@ def _error() -> Schema:
 
 
 def _inlined(schema: Schema) -> Schema:
-    """Return a schema whose own definitions stand where they are used: a reference starts at the document's root."""
+    """Return a schema with its own definitions inlined: a reference starts at the document's root."""
     defs = schema.get("$defs", {})
 
     def walk(value: Any) -> Any:
         if isinstance(value, dict):
             named = str(value.get("$ref", "")).removeprefix("#/$defs/")
-            return walk(defs[named]) if named else {key: walk(each) for key, each in value.items() if key != "$defs"}
-        return [walk(each) for each in value] if isinstance(value, list) else value
+            return walk(defs[named]) if named else {key: walk(item) for key, item in value.items() if key != "$defs"}
+        return [walk(item) for item in value] if isinstance(value, list) else value
 
     return dict(walk(schema))

@@ -56,13 +56,13 @@ def read_reports(paths: Sequence[Path]) -> list[Report]:
 def side_by_side(paths: Sequence[Path], reports: Sequence[Report]) -> Report:
     """Return one report with the rows of all, the first row with a latency as the reference."""
     labels = short_names(paths)
-    findings = [*differences(labels, reports), *_carried(labels, reports)]
+    findings = [*differences(labels, reports), *_findings(labels, reports)]
     same = len({_circumstances(report) for report in reports}) == 1 and reports[0].environment.get("cpu") is not None
     rows = _rows(labels, reports, same)
     limits = {
-        name: wanted
-        for name, wanted in reports[0].limits.items()
-        if all(name in report.limits and report.limits[name] == wanted for report in reports)
+        name: value
+        for name, value in reports[0].limits.items()
+        if all(name in report.limits and report.limits[name] == value for report in reports)
     }
     return Report(
         "compare",
@@ -89,51 +89,51 @@ def short_names(paths: Sequence[Path]) -> list[str]:
             names.pop()
         names[-1] = names[-1].removesuffix(".json") or names[-1]
     for depth in range(1, max(map(len, parts)) + 1):
-        found = ["/".join(names[-depth:]).replace("//", "/") for names in parts]
-        if len(set(found)) == len(found):
-            return found
+        endings = ["/".join(names[-depth:]).replace("//", "/") for names in parts]
+        if len(set(endings)) == len(endings):
+            return endings
     return [str(path) for path in paths]
 
 
 def differences(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
     """Return what makes the reports hard to compare: other machine, engine, threads or clocks."""
-    machines, clocks = ([_facts(each, keys) for each in reports] for keys in (MACHINE, CLOCKS))
-    runs = [_run(each) for each in reports]
+    machines, clocks = ([_facts(report, keys) for report in reports] for keys in (MACHINE, CLOCKS))
+    runs = [_run(report) for report in reports]
     groups = (
         ("The machines differ", "repeat the runs on one machine", machines),
-        ("The versions differ", "measure again with the same versions", [_versions(each) for each in reports]),
-        ("The numbers of threads differ", "measure with the same --threads", [_threads(each) for each in reports]),
+        ("The versions differ", "measure again with the same versions", [_versions(report) for report in reports]),
+        ("The numbers of threads differ", "measure with the same --threads", [_threads(report) for report in reports]),
         ("The clocks were set differently", "set the same governor and clocks", clocks),
         ("The runs differ", "measure with the same --rate, --pin and limits", runs),
         ("The engines differ", "that may be what is compared; else measure with the same --engine", _engines(reports)),
     )
-    found = []
+    findings = []
     for what, remedy, facts in groups:
-        keys = dict.fromkeys(key for each in facts for key in each)
-        told = [text for key in keys if (text := _differs(key, labels, facts))]
-        if told:
+        keys = dict.fromkeys(key for fact in facts for key in fact)
+        differing = [text for key in keys if (text := _differs(key, labels, facts))]
+        if differing:
             engines = "engines" in what
             how = remedy if engines else f"{remedy}, or compare the bundles themselves"
-            found.append(Finding("note" if engines else "suspect", f"{what}: {'; '.join(told)}", how))
-    return found
+            findings.append(Finding("note" if engines else "suspect", f"{what}: {'; '.join(differing)}", how))
+    return findings
 
 
 def _validity(judged: Sequence[str], findings: Sequence[Finding]) -> str:
-    """Return the worst judgement; nothing when a report was not judged and nothing speaks against it."""
-    worst = max([*judged, *(found.effect for found in findings if found.effect != "note")], key=VALIDITIES.index)
+    """Return the worst judgement; empty when a report was not judged and no finding is against it."""
+    worst = max([*judged, *(finding.effect for finding in findings if finding.effect != "note")], key=VALIDITIES.index)
     return "" if worst == "valid" and "" in judged else worst
 
 
 def _differs(key: str, labels: Sequence[str], facts: Sequence[Mapping[str, Any]]) -> str:
     """Return ``cores 4 (a), 8 (b)``; nothing when all reports that know it agree."""
     by_value: dict[str, list[str]] = {}
-    for label, each in zip(labels, facts, strict=True):
-        if each.get(key) is not None:
-            by_value.setdefault(_text(each[key]), []).append(label)
+    for label, fact in zip(labels, facts, strict=True):
+        if fact.get(key) is not None:
+            by_value.setdefault(_text(fact[key]), []).append(label)
     if len(by_value) < 2:
         return ""
-    told = [f"{value} ({', '.join(names)})" for value, names in by_value.items()]
-    return f"{key.replace('_', ' ')} {', '.join(told)}"
+    values = [f"{value} ({', '.join(names)})" for value, names in by_value.items()]
+    return f"{key.replace('_', ' ')} {', '.join(values)}"
 
 
 def _text(value: Any) -> str:
@@ -154,30 +154,30 @@ def _versions(report: Report) -> dict[str, Any]:
 
 def _run(report: Report) -> dict[str, Any]:
     """Return how a report was measured; ``none`` for what was not asked for, so that it differs from what was."""
-    told = report.environment.get("run")
-    return {key: told.get(key, "none") for key in RUN} if isinstance(told, Mapping) else {}
+    run = report.environment.get("run")
+    return {key: run.get(key, "none") for key in RUN} if isinstance(run, Mapping) else {}
 
 
 def _engines(reports: Sequence[Report]) -> list[dict[str, Any]]:
-    """Return the engines of each report; what is compared within one report is no difference between several."""
+    """Return the engines of each report; engines that one report compares are not a difference between reports."""
     used = [
         sorted({str(record["engine"]) for row in report.rows for record in row.details.get("engine", ())})
         for report in reports
     ]
-    return [{"engine": ", ".join(each)} if each else {} for each in used]
+    return [{"engine": ", ".join(names)} if names else {} for names in used]
 
 
 def _threads(report: Report) -> dict[str, Any]:
     run = report.environment.get("run")
     if isinstance(run, Mapping) and run.get("threads") is not None:
         return {"threads": run["threads"]}
-    told = [record.get("threads") for row in report.rows for record in row.details.get("engine", ())]
-    known = {threads for threads in told or [report.environment.get("threads")] if threads is not None}
+    recorded = [record.get("threads") for row in report.rows for record in row.details.get("engine", ())]
+    known = {threads for threads in recorded or [report.environment.get("threads")] if threads is not None}
     return {"threads": sorted(known, key=str)} if known else {}
 
 
 def _circumstances(report: Report) -> tuple[str, str]:
-    """Return machine and pace: latencies of others give no speed-up."""
+    """Return machine and pace: latencies from other ones give no speed-up."""
     return str(_facts(report, MACHINE)), str(_run(report).get("rate_hz", "none"))
 
 
@@ -194,12 +194,12 @@ def _read(path: Path) -> Report:
         raise DataError(f"{path}: {error.message}", error.fix) from error
 
 
-def _carried(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
+def _findings(labels: Sequence[str], reports: Sequence[Report]) -> list[Finding]:
     """Return the findings of the reports themselves, with their report's name."""
     return [
-        replace(found, reason=f"{label}: {found.reason}")
+        replace(finding, reason=f"{label}: {finding.reason}")
         for label, report in zip(labels, reports, strict=True)
-        for found in report.findings
+        for finding in report.findings
     ]
 
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import typer
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
-from typer.core import TyperGroup
 
 from vlatool import registry
 from vlatool.cli import _complete, _run
+from vlatool.cli._default import DefaultGroup
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import Measure, Stage, validated
 
@@ -28,10 +28,10 @@ DEFAULTS = {
     "distill": "weights",
     "evaluate": "recorded",
 }
-"""The method that is meant when a command names none."""
+"""The method of a command that names none."""
 
 
-class StageGroup(TyperGroup):
+class StageGroup(DefaultGroup):
     """A group whose commands are the files of its kind; each is imported only when it is named."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -49,18 +49,12 @@ class StageGroup(TyperGroup):
         return built(stage_function(stage), cmd_name, stage.__doc__)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the default method when the first word is not a method."""
+        """Refuse a first word that is nearly a method."""
         known = self.list_commands(ctx)
-        if args and args[0] != "--help" and args[0].replace("_", "-") not in known:
-            likely = difflib.get_close_matches(args[0], known, n=1)
-            if likely and not ctx.resilient_parsing and not Path(args[0]).exists():
-                raise UsageError(f"There is no {self.name} method '{args[0]}'; {nearest(args[0], known)}.")
-            args = [DEFAULTS[self.name or ""], *args]
+        other = "" if self.names_command(ctx, args) or ctx.resilient_parsing else args[0]
+        if difflib.get_close_matches(other, known, n=1) and not Path(other).exists():
+            raise UsageError(f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.")
         return super().parse_args(ctx, args)
-
-    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return methods, and what the default method takes in their place."""
-        return [*super().shell_complete(ctx, incomplete), *_complete.items(_complete.sources(incomplete))]
 
 
 def built(function: Callable[..., Any], name: str, text: str | None = None, **settings: Any) -> Any:
@@ -73,7 +67,7 @@ def built(function: Callable[..., Any], name: str, text: str | None = None, **se
 
 
 def failing(name: str, error: PluginError) -> Any:
-    """Return a command of another package that says why it is none; so that ``--help`` lists all others."""
+    """Return a command that says why another package's cannot run, so that ``--help`` lists all others."""
 
     def fails(words: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
         raise error
@@ -87,15 +81,15 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
     measures = issubclass(stage, Measure)
     common = _run.MEASURE_FLAGS if measures else _run.TRANSFORM_FLAGS
 
-    def command(**given: Any) -> None:
-        context: typer.Context = given.pop("context")
-        options = {name: given.pop(name) for name in own}
+    def command(**arguments: Any) -> None:
+        context: typer.Context = arguments.pop("context")
+        options = {name: arguments.pop(name) for name in own}
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         built = validated(stage, chosen, f"vlatool {stage.kind()} {registry_name(stage)}")
         if measures:
-            _run.measure(typing.cast(Measure, built), **given)
+            _run.measure(typing.cast(Measure, built), **arguments)
         else:
-            _run.transform(typing.cast(Any, built), **given)
+            _run.transform(typing.cast(Any, built), **arguments)
 
     if issubclass(stage, Measure) and stage.remotely:
         common = (*common, *_run.REMOTE_FLAGS)
@@ -133,6 +127,6 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
 
 
 def _typed(context: typer.Context, name: str) -> bool:
-    """Say whether an option was given, here or by a variable, so that a board's wishes do not count."""
+    """Return whether an option was given, here or by a variable, so that a board's preferences do not count."""
     source = context.get_parameter_source(name)
     return source is not None and "DEFAULT" not in source.name

@@ -12,33 +12,32 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson
 from vlatool.errors import DataError, UsageError, nearest
 from vlatool.files.printable import printable
 
 if TYPE_CHECKING:
-    from vlatool.stage.cache import Contents, Entry, Removed
+    from vlatool.stage.cache import Contents, Entry
 
-app = typer.Typer(help="Look at finished stages that are kept, and remove them.", no_args_is_help=True,
+app = typer.Typer(help="List and remove finished stages that are kept.", no_args_is_help=True,
                   rich_markup_mode=None)  # fmt: skip
 SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 BYTES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 Place = Annotated[Path | None, typer.Option("--cache", help="the cache; $VLATOOL_CACHE or the user's if unset")]
-AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
 
 
 @app.command("size")
 def size(cache: Place = None, as_json: AsJson = False) -> None:
-    """Say how large the cache is, stage by stage; a recording that stages share is counted once."""
+    """Print how large the cache is, stage by stage; a recording that stages share is counted once."""
     held = _contents(cache)
     if as_json:
         document(_head(held) | {"stages": [_sum(held, what) for what in _kinds(held)]})
         return
     for what in _kinds(held):
-        told = _sum(held, what)
-        typer.echo(f"{what:28} {told['entries']:5d} kept  {_human(told['bytes']):>9} of their own")
+        stage = _sum(held, what)
+        typer.echo(f"{what:28} {stage['entries']:5d} kept  {_human(stage['bytes']):>9} of their own")
     typer.echo(f"{'shared':28} {'':10}  {_human(_head(held)['shared_bytes']):>9}")
-    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
-    _tell_unknown(held)
+    _print_total(held)
 
 
 @app.command("list")
@@ -46,22 +45,21 @@ def list_entries(cache: Place = None, as_json: AsJson = False) -> None:
     """List what is kept, the least recently used first: age, size of its own, size that it shares, name."""
     held = _contents(cache)
     if as_json:
-        document(_head(held) | {"entries": [_told(held, entry) for entry in held.entries]})
+        document(_head(held) | {"entries": [_entry_row(held, entry) for entry in held.entries]})
         return
     typer.echo(f"{'age':>6}  {'own':>9}  {'shared':>9}  name")
     for entry in held.entries:
         own, shared = held.sizes(entry)
         typer.echo(f"{_age(time.time_ns() / 1e9 - entry.used):>6}  {_human(own):>9}  {_human(shared):>9}  {entry.name}")
-    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
-    _tell_unknown(held)
+    _print_total(held)
 
 
 @app.command("prune")
 def prune(
-    older_than: Annotated[str, typer.Option(help="remove what was not used for so long: 30d, 12h, 2w")] = "",
-    max_size: Annotated[str, typer.Option(help="remove the least recently used until so much is left: 5GB")] = "",
+    older_than: Annotated[str, typer.Option(help="remove what was not used for this long: 30d, 12h, 2w")] = "",
+    max_size: Annotated[str, typer.Option(help="remove the least recently used until this much is left: 5GB")] = "",
     everything: Annotated[bool, typer.Option("--all", help="remove all that no running process uses")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be removed, and remove nothing")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="show what would be removed, and remove nothing")] = False,
     cache: Place = None,
     as_json: AsJson = False,
 ) -> None:
@@ -72,14 +70,17 @@ def prune(
     from vlatool.stage import cache as kept
 
     if everything == bool(older_than or max_size):
-        raise UsageError("Say what to remove.", "pass --older-than 30d, --max-size 5GB, or both; or --all alone")
+        raise UsageError(
+            "Nothing is chosen for removal.", "pass --older-than 30d, --max-size 5GB, or both; or only --all"
+        )
     age = 0.0 if everything else _amount("--older-than", older_than, SECONDS, "30d") if older_than else None
     most = int(_amount("--max-size", max_size, BYTES, "5GB")) if max_size else None
     place = _place(cache)
     removed = kept.prune(place, older_than_s=age, most_bytes=most, dry_run=dry_run)
     left = kept.contents(place).bytes - (removed.freed if dry_run else 0)
     if as_json:
-        document(_told_removed(place, removed, left, dry_run))
+        document({"cache": str(place), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
+                  "freed_bytes": removed.freed, "bytes": left, "stays": removed.stays})  # fmt: skip
         return
     for entry in removed.entries:
         typer.echo(f"{'would remove' if dry_run else 'removed'} {entry.name}")
@@ -95,9 +96,9 @@ def _place(cache: Path | None) -> Path:
 
     place = cache or cache_directory()
     if (cache is not None or place.exists()) and not place.is_dir():
-        raise DataError(f"There is no directory {place}.", "name the directory of a cache")
+        raise DataError(f"No such directory: {place}.", "name the directory of a cache")
     if cache is not None and not is_cache(place):
-        raise DataError(f"{place} is no cache: vlatool keeps nothing in it.", "name the directory of a cache")
+        raise DataError(f"{place} is not a cache: vlatool keeps nothing in it.", "name the directory of a cache")
     return place
 
 
@@ -109,13 +110,13 @@ def _contents(cache: Path | None) -> Contents:
 
 def _amount(option: str, text: str, units: dict[str, int], example: str) -> float:
     """Return what a person wrote as a number and a unit, in the smallest unit."""
-    found = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", text)
-    if found is None:
+    match = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", text)
+    if match is None:
         raise UsageError(f"{option} is '{text[:40]}'; it must be a number and a unit, such as {example}.")
-    unit = next((name for name in units if name.lower() == found[2].lower()), None)
+    unit = next((name for name in units if name.lower() == match[2].lower()), None)
     if unit is None:
-        raise UsageError(f"{option} is '{text[:40]}'; {nearest(found[2], units)}.")
-    value = float(found[1]) * units[unit]
+        raise UsageError(f"{option} is '{text[:40]}'; {nearest(match[2], units)}.")
+    value = float(match[1]) * units[unit]
     if not math.isfinite(value):
         raise UsageError(f"{option} is '{text[:40]}', which is too large.")
     return value
@@ -136,18 +137,14 @@ def _head(held: Contents) -> dict[str, Any]:
             "unknown": list(held.unknown)}  # fmt: skip
 
 
-def _told(held: Contents, entry: Entry) -> dict[str, Any]:
+def _entry_row(held: Contents, entry: Entry) -> dict[str, Any]:
     own, shared = held.sizes(entry)
     used = datetime.fromtimestamp(entry.used, timezone.utc).isoformat(timespec="seconds")
     return {"name": entry.name, "stage": entry.what, "used": used, "bytes": own, "shared_bytes": shared}
 
 
-def _told_removed(place: Path, removed: Removed, left: int, dry_run: bool) -> dict[str, Any]:
-    return {"cache": str(place), "dry_run": dry_run, "removed": [entry.name for entry in removed.entries],
-            "freed_bytes": removed.freed, "bytes": left, "stays": removed.stays}  # fmt: skip
-
-
-def _tell_unknown(held: Contents) -> None:
+def _print_total(held: Contents) -> None:
+    typer.echo(f"{held.cache}: {_human(held.bytes)} in {len(held.entries)} entries")
     if held.unknown:
         more = f" and {len(held.unknown) - 6} more" if len(held.unknown) > 6 else ""
         typer.echo(f"not vlatool's, never removed: {', '.join(map(_on_one_line, held.unknown[:6]))}{more}")

@@ -11,6 +11,7 @@ import typer
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._options import AsJson, Force, Raw, ReportFolder
 from vlatool.cli._side_by_side import read_reports, side_by_side
 from vlatool.errors import DataError, UsageError
 
@@ -22,12 +23,12 @@ def compare(
             help="two or more bundles, or two or more reports", show_default=False, autocompletion=_complete.reports
         ),
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    output: ReportFolder = None,
     iterations: Annotated[int, typer.Option(min=20, help="timed inferences of each bundle")] = 200,
     threads: Annotated[int, typer.Option(min=1, help="intra-op threads")] = 1,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
-    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+    raw: Raw = False,
 ) -> None:
     """Compare bundles in one interleaved run, or put reports side by side. The first is the baseline.
 
@@ -41,7 +42,7 @@ def compare(
     refuse_existing(output, force, *paths)
     for path in paths:
         if not path.exists():
-            raise DataError(f"There is no report at {path}, and no bundle.")
+            raise DataError(f"No report or bundle at {path}.")
     bundles = [(path / MANIFEST).is_file() for path in paths]
     if all(bundles):
         with progress() as context:

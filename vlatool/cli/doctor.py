@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
 
 import typer
 
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson
 
 
-def doctor(as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
-    """Say what this machine has: engines, instruction sets, telemetry, clocks, missing extras; and how to fix it."""
+def doctor(as_json: AsJson = False) -> None:
+    """Show what this machine has: engines, instruction sets, telemetry, clocks, missing extras; and how to fix it."""
     from vlatool.doctor.doctor import diagnose
 
     checks = diagnose()

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._options import AsJson, BundlePath, Force, ReportFolder
 
 
 def explain(
-    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)],
+    bundle: BundlePath,
     baseline: Annotated[
         Path | None, typer.Option(help="float32 bundle that it was made from; looked for in the cache when not given")
     ] = None,
@@ -26,16 +26,16 @@ def explain(
         float, typer.Option(min=1, help="the layers are measured on fewer observations when all would take longer")
     ] = 300.0,
     suggest: Annotated[bool, typer.Option(help="make and measure what could be done about it")] = True,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    output: ReportFolder = None,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Say which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
+    """Show which layers cost the accuracy, where the time goes, what fell back, and what to do about it."""
     from vlatool.explain import Options
-    from vlatool.explain import explain as found_out
+    from vlatool.explain import explain as explain_bundle
 
     refuse_existing(output, force, bundle, baseline, data)
     with progress() as context:
         options = Options(baseline, data, samples, threads=threads, suggest=suggest, seconds=seconds)
-        report = found_out(Bundle.open(bundle), options, context)
+        report = explain_bundle(Bundle.open(bundle), options, context)
     show(report, as_json=as_json, out=output, force=force)

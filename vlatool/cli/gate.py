@@ -18,6 +18,7 @@ from vlatool.cli import _complete
 from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
+from vlatool.cli._options import AsJson, Force, Raw, ReportFolder
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files.edited import refuse_file, write_own
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=group_with("run"), no_args_is_help=True, rich_markup_mode=None,
-    help="Hold a candidate against a baseline, both measured side by side: vlatool gate CANDIDATE --baseline BUNDLE.",
+    help="Compare a candidate with a baseline, both measured side by side: vlatool gate CANDIDATE --baseline BUNDLE.",
 )  # fmt: skip
 CONFIG = Path("gate.yaml")
 
@@ -54,16 +55,16 @@ def run(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="of observations, noise and order; fresh, and told in the report, if unset"),
+        typer.Option(min=0, help="of observations, noise and order; fresh, and recorded in the report, if unset"),
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
+    output: ReportFolder = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
-    raw: Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+    raw: Raw = False,
 ) -> None:
-    """Measure the baseline anew beside the candidate, and exit with 0 (pass), 1 (fail) or 5 (inconclusive).
+    """Measure the baseline again beside the candidate, and exit with 0 (pass), 1 (fail) or 5 (inconclusive).
 
     In a job of GitHub Actions it also prints annotations and writes the step summary.
     """
@@ -72,9 +73,11 @@ def run(
     gate = _gate(config, margin)
     base = baseline or gate.baseline
     if base is None:
-        raise UsageError("There is no baseline.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)")
+        raise UsageError(
+            "No baseline to compare with.", "pass --baseline BUNDLE, or name it in the gate (baseline: PATH)"
+        )
     if not base.exists():
-        raise BundleError(f"There is no baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
+        raise BundleError(f"No baseline at {base}.", f"make one: vlatool export POLICY -o {base}")
     refuse_existing(output, force, candidate, *_read_by(gate, base), config)
     if junit is not None:
         _place(junit, candidate, *_read_by(gate, base), config)
@@ -86,7 +89,7 @@ def run(
         _tell_github(report)
     try:
         show(report, as_json=as_json, out=output, force=force, raw=raw)
-    finally:  # after the directory of reports, for the file may lie in it
+    finally:  # after the directory of reports: the file may be in it
         if junit is not None:
             _write_junit(report, junit)
 
@@ -97,9 +100,11 @@ def init(
     baseline: Annotated[Path, typer.Option(help="bundle to compare with, relative to the repository")] = Path(
         "models/baseline"
     ),
-    candidate: Annotated[Path, typer.Option(help="what a change makes, relative to the repository")] = Path("policy"),
+    candidate: Annotated[Path, typer.Option(help="what a change produces, relative to the repository")] = Path(
+        "policy"
+    ),
     force: Annotated[bool, typer.Option("--force", help="replace files that exist")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write gate.yaml, and a job for GitHub Actions and for GitLab that runs it."""
     from vlatool.gate.files import gate_files
@@ -123,8 +128,10 @@ def init(
 @contextlib.contextmanager
 def _folders(files: Iterable[Path]) -> Iterator[None]:
     """Make the folders of files; of these, remove what stays empty when they cannot be written."""
-    wanted = sorted({folder for path in files for folder in path.absolute().parents}, key=lambda each: len(each.parts))
-    absent = [folder for folder in wanted if not folder.exists()]
+    folders = sorted(
+        {folder for path in files for folder in path.absolute().parents}, key=lambda folder: len(folder.parts)
+    )
+    absent = [folder for folder in folders if not folder.exists()]
     try:
         for folder in absent:
             with output_errors(folder):
@@ -153,7 +160,7 @@ def _gate(config: Path | None, margin: float | None) -> Gate:
 
 
 def _place(junit: Path, *inputs: str | Path | None) -> None:
-    """Say before the work that the file cannot be written, is or lies in an input, or is not vlatool's to replace.
+    """Refuse, before the work, a file that cannot be written, is or lies in an input, or is not vlatool's to replace.
 
     Raises:
         OutputError: when it cannot.
@@ -162,7 +169,7 @@ def _place(junit: Path, *inputs: str | Path | None) -> None:
         raise OutputError(f"--junit {junit} is a directory.", "name a file")
     above = next(folder for folder in junit.absolute().parents if folder.exists())
     if not (above.is_dir() and os.access(above, os.W_OK)):
-        raise OutputError(f"--junit {junit} cannot be written: {above} is no directory that may be written to.")
+        raise OutputError(f"--junit {junit} cannot be written: {above} is not a writable directory.")
     refuse_inputs(junit, inputs)
     if os.path.lexists(junit):
         refuse_file(junit, force=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,21 +12,27 @@ from vlatool.cli import _complete
 from vlatool.cli._console import file_or_none, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson, BundleOrSource, Force, ReportFolder
 from vlatool.errors import UsageError
+
+if TYPE_CHECKING:
+    from vlatool.boards.answer import Asked
 
 app = typer.Typer(
     cls=group_with("select"), no_args_is_help=True, rich_markup_mode=None,
     help="Say which board runs a policy, and in which precision: vlatool hwselect SOURCE --hz 20.",
 )  # fmt: skip
 
+Profiles = Annotated[
+    list[str] | None,
+    typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles),
+]
 POINTS = "published latencies: a CSV file with device, device_class, runtime, model, precision, metric, value"
 
 
 @app.command("select")
 def select(
-    source: Annotated[
-        str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
-    ],
+    source: BundleOrSource,
     hz: Annotated[
         float | None,
         typer.Option(
@@ -61,10 +67,7 @@ def select(
         str | None,
         typer.Option(help="start from a robot platform's rate, power and battery", autocompletion=_complete.platforms),
     ] = None,
-    boards: Annotated[
-        list[str] | None,
-        typer.Option(help="look at this profile only; may be repeated", autocompletion=_complete.profiles),
-    ] = None,
+    boards: Profiles = None,
     calibration: Annotated[
         Path | None,
         typer.Option(help="file that `vlatool profiles calibrate` keeps; all of them when not given"),
@@ -76,29 +79,22 @@ def select(
             help="write the policy's work to workload.json beside policy.yaml: torch is not needed again",
         ),
     ] = False,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    output: ReportFolder = None,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Rank the boards that can run a policy at a rate, within power, price and memory. Everything is predicted."""
     from vlatool.boards.answer import Asked, carry_count, select_boards
 
-    _above_zero(
-        hz=hz, latency_ms=latency_ms, max_watts=max_watts, max_price=max_price, memory=memory, battery_wh=battery_wh,
-        years=years, hours=hours, kwh_price=kwh_price,
+    asked = Asked(
+        hz=hz, latency_ms=latency_ms, watts=max_watts, price=max_price, memory_gb=memory, battery_wh=battery_wh,
+        robots=robots, years=years, hours_a_day=hours, kwh_price=kwh_price, network_ms=network_ms,
+        precisions=tuple(precision or ()), platform=platform, boards=tuple(boards or ()), cloud=cloud,
+        per_chunk=per_chunk,
     )  # fmt: skip
-    if not (math.isfinite(network_ms) and network_ms >= 0):
-        raise UsageError(f"--network-ms is {network_ms:g}; allowed: 0 or more.")
-    if hours > 24:
-        raise UsageError(f"--hours is {hours:g}; a day has 24.")
+    _check(asked)
     refuse_existing(output, force, source, calibration, *map(file_or_none, boards or ()))
     with progress() as context:
-        asked = Asked(
-            hz=hz, latency_ms=latency_ms, watts=max_watts, price=max_price, memory_gb=memory, battery_wh=battery_wh,
-            robots=robots, years=years, hours_a_day=hours, kwh_price=kwh_price, network_ms=network_ms,
-            precisions=tuple(precision or ()), platform=platform, boards=tuple(boards or ()), cloud=cloud,
-            per_chunk=per_chunk,
-        )  # fmt: skip
         file = carry_count(source, context) if carry else None
         report = select_boards(source, asked, context, calibration)
     if file:
@@ -106,10 +102,24 @@ def select(
     show(report, as_json=as_json, out=output, force=force)
 
 
-def _above_zero(**numbers: float | None) -> None:
-    for name, value in numbers.items():
+def _check(asked: Asked) -> None:
+    """Refuse numbers that mean nothing.
+
+    Raises:
+        UsageError: names the option.
+    """
+    above_zero = {
+        "hz": asked.hz, "latency-ms": asked.latency_ms, "max-watts": asked.watts, "max-price": asked.price,
+        "memory": asked.memory_gb, "battery-wh": asked.battery_wh, "years": asked.years, "hours": asked.hours_a_day,
+        "kwh-price": asked.kwh_price,
+    }  # fmt: skip
+    for name, value in above_zero.items():
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise UsageError(f"--{name.replace('_', '-')} is {value:g}; allowed: a number above 0.")
+            raise UsageError(f"--{name} is {value:g}; allowed: a number above 0.")
+    if not (math.isfinite(asked.network_ms) and asked.network_ms >= 0):
+        raise UsageError(f"--network-ms is {asked.network_ms:g}; allowed: 0 or more.")
+    if asked.hours_a_day > 24:
+        raise UsageError(f"--hours is {asked.hours_a_day:g}; a day has 24.")
 
 
 def _finite(**numbers: float) -> None:
@@ -168,7 +178,7 @@ def fit(
     anew: Annotated[
         bool, typer.Option("--anew", help="begin the search at built-in scales, not at those of the shipped model")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fit the latency model on published latencies, and write its data files."""
     from vlatool.latency_model.fit import fit_files

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -12,8 +11,8 @@ import typer
 from vlatool.bundle.bundle import Bundle, manifest_bytes
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
-from vlatool.cli import _complete
 from vlatool.cli._document import document
+from vlatool.cli._options import BundlePath
 from vlatool.errors import BundleError, GraphError
 from vlatool.files.printable import printable
 from vlatool.files.sealed import open_inside
@@ -24,12 +23,12 @@ from vlatool.runtime.probe import probe as try_once
 
 
 def inspect(
-    bundle: Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)],
+    bundle: BundlePath,
     as_json: Annotated[bool, typer.Option("--json", help="print the manifest as JSON")] = False,
     probe: Annotated[
         bool,
         typer.Option(
-            "--probe", help="run it once, too, in a child process with limits; ends with 3 where load would refuse it"
+            "--probe", help="run it once, too, in a child process with limits; exits with 3 if load would refuse it"
         ),
     ] = False,
     first_run: Annotated[
@@ -40,7 +39,7 @@ def inspect(
         typer.Option("--memory", min=1, help="MB that --probe may take; 2,000 and 8 times the graphs when not given"),
     ] = None,
 ) -> None:
-    """Verify a bundle and say what is in it."""
+    """Verify a bundle and show what is in it."""
     opened = Bundle.open(bundle)
     tried = try_once(bundle, first_run_s=first_run, memory_mb=memory) if probe else None
     if as_json:
@@ -83,7 +82,7 @@ def describe(bundle: Bundle) -> list[str]:
         )
         lines.append(f"  graph      {name}: {size}, opset {graph.opset}, MACs: {shares}")
     lines += _lineage(manifest)
-    lines += [f"  WRONG      {each['name']}: {each['message']}" for each in manifest.findings]
+    lines += [f"  WRONG      {finding['name']}: {finding['message']}" for finding in manifest.findings]
     return lines
 
 
@@ -110,13 +109,13 @@ def _tensor(tensor: TensorSpec) -> str:
 
 
 def _lineage(manifest: Manifest) -> list[str]:
-    made: dict[str, Any] = manifest.made_by
-    options = " ".join(f"{key}={value}" for key, value in made.get("options", {}).items())
-    versions = ", ".join(f"{key} {value}" for key, value in made.get("versions", {}).items())
-    lines = [f"  made by    {made.get('stage', '?')} {options}".rstrip()]
-    lines += [f"  with       vlatool {made.get('vlatool', '?')}{', ' + versions if versions else ''}"]
+    made_by: dict[str, Any] = manifest.made_by
+    options = " ".join(f"{key}={value}" for key, value in made_by.get("options", {}).items())
+    versions = ", ".join(f"{key} {value}" for key, value in made_by.get("versions", {}).items())
+    lines = [f"  made by    {made_by.get('stage', '?')} {options}".rstrip()]
+    lines += [f"  with       vlatool {made_by.get('vlatool', '?')}{', ' + versions if versions else ''}"]
     lines += [f"  parent     {manifest.parent[:19]}"] if manifest.parent else []
-    for name, found in manifest.accuracy.items():
-        interval = f" ({found['low']:.4f} to {found['high']:.4f})" if found.get("low") is not None else ""
-        lines.append(f"  accuracy   {name} {found['value']:.4f}{interval}, n = {found['samples']}")
+    for name, measured in manifest.accuracy.items():
+        interval = f" ({measured['low']:.4f} to {measured['high']:.4f})" if measured.get("low") is not None else ""
+        lines.append(f"  accuracy   {name} {measured['value']:.4f}{interval}, n = {measured['samples']}")
     return lines

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli import _complete
-from vlatool.cli._console import default_workers, file_or_none, leave, progress, refuse_existing, terminal_text
+from vlatool.cli._console import default_workers, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
 from vlatool.cli._document import document, put, report_document
+from vlatool.cli._options import Force
 from vlatool.cli._plan import plan_document
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
@@ -19,16 +20,21 @@ from vlatool.report import REPORT
 from vlatool.runtime.engine import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
-    from vlatool.optimize.pipeline import Plan
+    from vlatool.hardware.profile import Profile
+    from vlatool.optimize.plan import Plan
+    from vlatool.optimize.recipe import Recipe
+
+
+PolicySource = Annotated[
+    str,
+    typer.Argument(
+        help="policy directory, path.py:make or .onnx file", show_default=False, autocompletion=_complete.sources
+    ),
+]
 
 
 def optimize(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="policy directory, path.py:make or .onnx file", show_default=False, autocompletion=_complete.sources
-        ),
-    ],
+    source: PolicySource,
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
     profile: Annotated[
         str | None,
@@ -60,7 +66,7 @@ def optimize(
     cache: Annotated[Path | None, typer.Option(help="where finished stages are kept")] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="measure again, even what was measured before")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
+    force: Force = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="print JSON on stdout: the report, or the plan with --dry-run")
     ] = False,
@@ -73,35 +79,19 @@ def optimize(
     """
     from vlatool.hardware.profile import load_profile
     from vlatool.optimize import pipeline
-    from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
-    from vlatool.sources import brings_calibration
+    from vlatool.optimize.plan import make_plan
     from vlatool.stage.run import cache_directory
 
     if not dry_run:
         refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
     board = load_profile(profile) if profile else None
-    given = {"episodes": episodes, "iterations": iterations, "threads": threads}
-    effort = {name: value for name, value in given.items() if value is not None}
-    asked: dict[str, Any] = {} if max_drop is None else budget(max_drop)
-    asked |= {} if max_distance is None else {"max_distance": share(max_distance, "--max-distance")}
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
-    for name, value in limits.items():
-        if value is not None and not math.isfinite(value):
-            raise UsageError(f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.")
-        asked |= {} if value is None else {name: value}
-    asked |= {"accept": tuple(accept)} if accept else {}
-    if recipe is None:
-        calibrated = brings_calibration(source)
-        chosen = default_recipe(
-            Limits(**asked), Effort(**effort), calibrated, board.engine if board else DEFAULT_ENGINE
-        )
-    else:
-        read = read_recipe(recipe)
-        update = {"limits": read.limits.model_copy(update=asked), "effort": read.effort.model_copy(update=effort)}
-        chosen = read.model_copy(update=update)
+    asked = _limits(max_drop, max_distance, accept, limits)
+    effort = {"episodes": episodes, "iterations": iterations, "threads": threads}
+    chosen = _recipe(recipe, source, board, asked, {name: value for name, value in effort.items() if value is not None})
     if search is not None:
         chosen = chosen.model_copy(update={"search": search})
-    plan = pipeline.make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
+    plan = make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
     if dry_run:
         _show_plan(plan, as_json)
         return
@@ -112,7 +102,39 @@ def optimize(
     else:
         put(terminal_text(report, brief=True))
         put(f"bundle: {output}\nreport: {output / 'reports' / 'report.html'}\n")
-    leave(report)
+    raise_verdict(report)
+
+
+def _limits(
+    max_drop: str | None, max_distance: str | None, accept: list[str] | None, numbers: dict[str, float | None]
+) -> dict[str, Any]:
+    """Return the limits that were given: field of ``Limits`` -> value.
+
+    Raises:
+        UsageError: for one that is not a number above 0, or not a drop or a share.
+    """
+    limits: dict[str, Any] = {} if max_drop is None else budget(max_drop)
+    limits |= {} if max_distance is None else {"max_distance": share(max_distance, "--max-distance")}
+    for name, value in numbers.items():
+        if value is not None and not math.isfinite(value):
+            raise UsageError(f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.")
+        limits |= {} if value is None else {name: value}
+    return limits | ({"accept": tuple(accept)} if accept else {})
+
+
+def _recipe(
+    file: Path | None, source: str, board: Profile | None, limits: dict[str, Any], effort: dict[str, Any]
+) -> Recipe:
+    """Return the recipe of a file, or the default one, with the limits and the effort that were given."""
+    from vlatool.optimize.recipe import Effort, Limits, default_recipe, read_recipe
+    from vlatool.sources import brings_calibration
+
+    if file is None:
+        engine = board.engine if board else DEFAULT_ENGINE
+        return default_recipe(Limits(**limits), Effort(**effort), brings_calibration(source), engine)
+    recipe = read_recipe(file)
+    update = {"limits": recipe.limits.model_copy(update=limits), "effort": recipe.effort.model_copy(update=effort)}
+    return recipe.model_copy(update=update)
 
 
 def _show_plan(plan: Plan, as_json: bool) -> None:

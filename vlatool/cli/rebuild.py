@@ -11,6 +11,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document, put
+from vlatool.cli._options import AsJson, Force
 from vlatool.errors import GateFailed, UsageError
 from vlatool.files.outputs import BUNDLE
 
@@ -39,8 +40,8 @@ def rebuild(
     file: Annotated[
         list[Path] | None, typer.Option(help="a file that an option named (calibration), when not beside the source")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a bundle again from its build record, without the cache, and compare it byte by byte.
 
@@ -56,77 +57,78 @@ def rebuild(
     opened = Bundle.open(bundle)
     versions = version_changes(build_record(opened))
     if versions and not as_json:
-        put(f"versions differ from the recorded ones: {_told(versions)}\n")
+        put(f"versions differ from the recorded ones: {_shifts(versions)}\n")
     with progress() as context:
         files = tuple(file or ())
-        made = run(opened, context, source=source, files=files, cache=cache_directory(), out=output, force=force)
+        rebuilt = run(opened, context, source=source, files=files, cache=cache_directory(), out=output, force=force)
     if as_json:
-        document(_told_as_json(made, versions, output))
+        document(_as_json(rebuilt, versions, output))
     else:
-        put(_text(made, versions, output))
-    if check and not made.identical:
-        _fail(made, versions)
+        put(_text(rebuilt, versions, output))
+    if check and not rebuilt.identical:
+        _fail(rebuilt, versions)
 
 
-def _told(versions: Versions) -> str:
+def _shifts(versions: Versions) -> str:
     return ", ".join(f"{name} {recorded} recorded, {now} installed" for name, (recorded, now) in versions.items())
 
 
-def _text(made: Rebuilt, versions: Versions, output: Path | None) -> str:
+def _text(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> str:
     lines = [
-        f"source    {made.source}",
-        f"stages    {' -> '.join(name for name, _ in made.stages)}",
+        f"source    {rebuilt.source}",
+        f"stages    {' -> '.join(name for name, _ in rebuilt.stages)}",
         f"versions  {'not as recorded' if versions else 'as recorded'}",
     ]
-    if made.left_out:
+    if rebuilt.left_out:
         lines.append(
-            f"left out  {', '.join(made.left_out)} in manifest.json: measured, so not the same twice; reports/"
+            f"left out  {', '.join(rebuilt.left_out)} in manifest.json: measured, so not the same twice; reports/"
         )
-    width = max(len(item.file) for item in made.files)
+    width = max(len(item.file) for item in rebuilt.files)
     lines += ["", f"{'file':<{width}}  {'bytes':>12}  identical"]
-    lines += [f"{item.file:<{width}}  {item.bytes:>12}  {'yes' if item.identical else 'NO'}" for item in made.files]
-    differing = [item for item in made.files if not item.identical]
+    lines += [f"{item.file:<{width}}  {item.bytes:>12}  {'yes' if item.identical else 'NO'}" for item in rebuilt.files]
+    differing = [item for item in rebuilt.files if not item.identical]
     lines += ["", *(f"{item.file}: {item.why}" for item in differing)]
-    total = sum(item.bytes for item in made.files)
+    total = sum(item.bytes for item in rebuilt.files)
     if differing:
         lines.append(
-            f"differs: {len(differing)} of {len(made.files)} files; {made.bundle.hash[:19]} is {made.hash[:19]}"
+            f"differs: {len(differing)} of {len(rebuilt.files)} files; "
+            f"{rebuilt.bundle.hash[:19]} is {rebuilt.hash[:19]}"
         )
     else:
-        lines.append(f"identical: {len(made.files)} files, {total} bytes, {made.hash}")
+        lines.append(f"identical: {len(rebuilt.files)} files, {total} bytes, {rebuilt.hash}")
     return "\n".join([*lines, *([f"bundle: {output}"] if output else [])]) + "\n"
 
 
-def _told_as_json(made: Rebuilt, versions: Versions, output: Path | None) -> dict[str, Any]:
+def _as_json(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> dict[str, Any]:
     return {
-        "bundle": str(made.bundle.path),
-        "source": made.source,
-        "identical": made.identical,
-        "hash": {"recorded": made.bundle.hash, "rebuilt": made.hash},
-        "left_out": list(made.left_out),
+        "bundle": str(rebuilt.bundle.path),
+        "source": rebuilt.source,
+        "identical": rebuilt.identical,
+        "hash": {"recorded": rebuilt.bundle.hash, "rebuilt": rebuilt.hash},
+        "left_out": list(rebuilt.left_out),
         "versions": {name: {"recorded": one, "installed": two} for name, (one, two) in versions.items()},
-        "stages": [{"stage": name, "graphs_identical": same} for name, same in made.stages],
+        "stages": [{"stage": name, "graphs_identical": same} for name, same in rebuilt.stages],
         "files": [
             {"file": item.file, "bytes": item.bytes, "identical": item.identical, "why": item.why}
-            for item in made.files
+            for item in rebuilt.files
         ],
         "output": str(output) if output else None,
     }
 
 
-def _fail(made: Rebuilt, versions: Versions) -> None:
+def _fail(rebuilt: Rebuilt, versions: Versions) -> None:
     """Raise for the first file that differs.
 
     Raises:
         GateFailed: with the likely cause as the fix.
     """
-    first = made.first_difference
+    first = rebuilt.first_difference
     if first is None:
         return
-    stage = next((name for name, same in made.stages if not same), None)
+    stage = next((name for name, same in rebuilt.stages if not same), None)
     since = f" The graphs differ since {stage}." if stage else ""
     if versions:
-        cause = f"the likely cause are the versions ({_told(versions)}); install the recorded ones"
+        cause = f"the likely cause are the versions ({_shifts(versions)}); install the recorded ones"
     elif first.file.startswith("golden/"):
         cause = "golden outputs are what the graphs gave on the machine that made the bundle; check on that processor"
     else:

@@ -11,6 +11,7 @@ from vlatool import registry
 from vlatool.cli import _complete
 from vlatool.cli._console import progress, refuse_existing
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson, Force
 from vlatool.errors import MissingExtra, UsageError, VlatoolError, nearest
 from vlatool.files.writing import writing
 
@@ -19,16 +20,15 @@ app = typer.Typer(help="Random-weight policies of realistic shape.", no_args_is_
 
 @app.command("list")
 def list_samples(
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List the shapes that can be made."""
+    descriptions = {name: registry.module("samples", name).DESCRIPTION for name in _complete.samples("")}
     if as_json:
-        known = registry.names("samples")
-        found = [(name.replace("_", "-"), registry.module("samples", name).DESCRIPTION) for name in known]
-        document([{"name": name, "description": text} for name, text in found])
+        document([{"name": name, "description": text} for name, text in descriptions.items()])
         return
-    for name in registry.names("samples"):
-        typer.echo(f"{name.replace('_', '-'):16} {registry.module('samples', name).DESCRIPTION}")
+    for name, text in descriptions.items():
+        typer.echo(f"{name:16} {text}")
 
 
 @app.command("make")
@@ -41,16 +41,16 @@ def make(
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new policy", show_default=False)],
     seed: Annotated[int, typer.Option(min=0, help="seed of weights and data")] = 0,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a policy with seeded random weights, for latency and memory work."""
     from vlatool.boards.answer import carry_count
     from vlatool.samples import write_sample
 
-    known = [entry.replace("_", "-") for entry in registry.names("samples")]
+    known = _complete.samples("")
     if name.replace("_", "-") not in known:
-        raise UsageError(f"There is no sample '{name}'; {nearest(name, known)}.")
+        raise UsageError(f"Unknown sample '{name}'; {nearest(name, known)}.")
     refuse_existing(output, force, kind="")
     with writing(output, force=force) as draft:
         write_sample(name.replace("-", "_"), draft, seed)
@@ -58,9 +58,9 @@ def make(
         with progress() as context:
             carry_count(str(output), context)
     except MissingExtra:
-        pass  # it is counted where torch is
+        pass  # counted where torch is installed
     except (VlatoolError, OSError) as error:
-        typer.echo(f"warning: it carries no count: {error}", err=True)
+        typer.echo(f"warning: it has no count: {error}", err=True)
     if as_json:
         document({"policy": str(output), "sample": name.replace("_", "-"), "seed": seed})
         return

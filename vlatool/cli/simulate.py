@@ -9,12 +9,11 @@ import typer
 from vlatool.cli import _complete
 from vlatool.cli._console import progress
 from vlatool.cli._document import document
+from vlatool.cli._options import AsJson, BundleOrSource
 
 
 def simulate(
-    source: Annotated[
-        str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
-    ],
+    source: BundleOrSource,
     profile: Annotated[str, typer.Option(help="the board", show_default=False, autocompletion=_complete.profiles)],
     mode: Annotated[str | None, typer.Option(help="power mode; the default one when not given")] = None,
     engine: Annotated[
@@ -24,15 +23,15 @@ def simulate(
     precision: Annotated[
         str, typer.Option(help="precision; as the policy is stored when not given", autocompletion=_complete.precisions)
     ] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show where a policy's time would go on a board, and what int8, fewer steps or pruning would give. Predicted."""
     from vlatool.boards.answer import simulated, simulation_lines
 
     with progress() as context:
-        found = simulated(source, profile, mode, engine, precision, context)
+        prediction = simulated(source, profile, mode, engine, precision, context)
     if as_json:
-        document(found)
+        document(prediction)
         return
-    for line in simulation_lines(found):
+    for line in simulation_lines(prediction):
         typer.echo(line)

@@ -12,6 +12,7 @@ import typer
 
 from vlatool.cli._document import document
 from vlatool.errors import DataError, UsageError
+from vlatool.files.messages import to_json
 
 if TYPE_CHECKING:
     from vlatool.telemetry import Recorded
@@ -25,37 +26,39 @@ def telemetry(
     root: Annotated[Path, typer.Option(help="file system to read, such as a copied tree")] = Path("/"),
     as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout, with every sample")] = False,
 ) -> None:
-    """Watch what this machine tells of power, energy, temperatures, clocks and throttling, and what it does not."""
+    """Watch power, energy, temperatures, clocks and throttling, and list what this machine does not report."""
     from vlatool.telemetry import Recorder, open_all
 
     for name, value in (("seconds", seconds), ("period", period)):
         if not (math.isfinite(value) and 0 < value <= LONGEST_S):
             raise UsageError(f"--{name} is {value:g}; allowed: above 0, up to {LONGEST_S:g}.")
     if not root.is_dir():
-        raise DataError(f"There is no directory {root}.")
+        raise DataError(f"No such directory: {root}.")
     with Recorder(open_all(root), period) as recorder:
         time.sleep(seconds)
-    found = recorder.recorded
+    recorded = recorder.recorded
     if as_json:
-        document(found.to_dict())
+        document(to_json(recorded))
         return
-    for line in lines(found):
+    for line in lines(recorded):
         typer.echo(line)
 
 
-def lines(found: Recorded) -> Iterator[str]:
+def lines(recorded: Recorded) -> Iterator[str]:
     """Return what a person reads: energy first, then every reading, then what is unmeasured and why."""
-    for energy in found.energy:
-        told = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"
-        yield f"{told}: {energy.label} ({energy.source})"
-    said = {None: "nothing on this machine tells", False: "no"}.get(found.throttled, "; ".join(found.throttling))
-    yield f"throttled: {said}"
-    for name, gauge in sorted(found.gauges.items()):
+    for energy in recorded.energy:
+        power = f"{energy.mean_w:.3g} W, {energy.joules:.3g} J in {energy.seconds:.1f} s"
+        yield f"{power}: {energy.label} ({energy.source})"
+    throttled = {None: "not reported by this machine", False: "no"}.get(
+        recorded.throttled, "; ".join(recorded.throttling)
+    )
+    yield f"throttled: {throttled}"
+    for name, gauge in sorted(recorded.gauges.items()):
         span = f" ({gauge.min:.4g} to {gauge.max:.4g})" if gauge.min != gauge.max else ""
         yield f"  {name}: {gauge.mean:.4g} {gauge.unit}{span}"
-    for name, counter in sorted(found.counters.items()):
+    for name, counter in sorted(recorded.counters.items()):
         yield f"  {name}: +{counter.difference:.4g} {counter.unit} in {counter.seconds:.1f} s"
-    if found.absent:
+    if recorded.unmeasured:
         yield "unmeasured:"
-    for absent in found.absent:
+    for absent in recorded.unmeasured:
         yield f"  {absent.reader}: {absent.reason}"

@@ -9,6 +9,7 @@ import typer
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli._console import progress, refuse_existing, show
+from vlatool.cli._options import AsJson, Force, ReportFolder
 from vlatool.sources import is_bundle
 
 
@@ -21,11 +22,11 @@ def verify(
     samples: Annotated[int, typer.Option(min=1, max=100_000, help="observations at most, spread over the data")] = 32,
     tolerance: Annotated[float, typer.Option(help="largest relative error of an action, and of each stage")] = 1e-3,
     seed: Annotated[int, typer.Option(min=0, help="of the noise that both are given")] = 0,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")] = None,
-    force: Annotated[bool, typer.Option("--force", help="replace an output that exists")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON on stdout")] = False,
+    output: ReportFolder = None,
+    force: Force = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Say whether a policy gives what the code that it was made from gives, and if not, which stage differs.
+    """Check whether a policy gives what the code that it was made from gives, and if not, show which stage differs.
 
     FUNCTION takes an observation (a dict of physical values, without a batch axis) and returns the action in physical
     units. Exits 1 when the actions differ.
@@ -33,12 +34,12 @@ def verify(
     from vlatool.machine.host import cache_directory
     from vlatool.sources import sourced
     from vlatool.verify import Options, check
-    from vlatool.verify import verify as verified
+    from vlatool.verify import verify as verify_policy
 
     refuse_existing(output, force, source, data)
     options = Options(against, data, samples, tolerance, seed)
     check(options)
     with progress() as context:
         bundle = Bundle.open(source) if is_bundle(source) else sourced(source, cache_directory(), context)
-        report = verified(bundle, options, context)
+        report = verify_policy(bundle, options, context)
     show(report, as_json=as_json, out=output, force=force)

@@ -2,37 +2,21 @@
 
 from __future__ import annotations
 
-from vlatool.data._calibration_checks import doubts
-from vlatool.data._drawn import DRAWN, OTHER, RECORDED, Drawer, Drawn, read_drawn, save_drawn
-from vlatool.data._halves import halves
-from vlatool.data._observations import (
-    CALIBRATION,
-    EVALUATION,
-    calibration_recording,
-    evaluation_recording,
-    observations_for,
-    recorded_observations,
-    synthetic_observations,
-)
-from vlatool.data._recording import Recording, read_recording
-
-__all__ = [
-    "CALIBRATION",
-    "DRAWN",
-    "EVALUATION",
-    "OTHER",
-    "RECORDED",
-    "Drawer",
-    "Drawn",
-    "Recording",
-    "calibration_recording",
-    "doubts",
-    "evaluation_recording",
-    "halves",
-    "observations_for",
-    "read_drawn",
-    "read_recording",
-    "recorded_observations",
-    "save_drawn",
-    "synthetic_observations",
-]
+from vlatool.data._calibration_checks import calibration_checks as calibration_checks
+from vlatool.data._drawn import DRAWN as DRAWN
+from vlatool.data._drawn import OTHER as OTHER
+from vlatool.data._drawn import RECORDED as RECORDED
+from vlatool.data._drawn import Drawer as Drawer
+from vlatool.data._drawn import Drawn as Drawn
+from vlatool.data._drawn import read_drawn as read_drawn
+from vlatool.data._drawn import save_drawn as save_drawn
+from vlatool.data._halves import halves as halves
+from vlatool.data._observations import CALIBRATION as CALIBRATION
+from vlatool.data._observations import EVALUATION as EVALUATION
+from vlatool.data._observations import calibration_recording as calibration_recording
+from vlatool.data._observations import evaluation_recording as evaluation_recording
+from vlatool.data._observations import observations_for as observations_for
+from vlatool.data._observations import recorded_observations as recorded_observations
+from vlatool.data._observations import synthetic_observations as synthetic_observations
+from vlatool.data._recording import Recording as Recording
+from vlatool.data._recording import read_recording as read_recording

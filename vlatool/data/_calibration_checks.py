@@ -23,7 +23,9 @@ NAMED = 6
 """Channels that a message lists."""
 
 
-def doubts(recording: Recording, numbers: Sequence[int], spec: PolicySpec, assets: Path, wanted: int = 0) -> list[str]:
+def calibration_checks(
+    recording: Recording, numbers: Sequence[int], spec: PolicySpec, assets: Path, wanted: int = 0
+) -> list[str]:
     """Return a sentence for each thing that makes ranges of activations unreliable.
 
     Args:
@@ -33,32 +35,32 @@ def doubts(recording: Recording, numbers: Sequence[int], spec: PolicySpec, asset
         assets: Directory of its statistics.
         wanted: Samples that were asked for; 0 when nobody did.
     """
-    found = [*_of_count(recording, len(numbers), wanted), *_of_names(recording, spec)]
+    sentences = [*_of_count(recording, len(numbers), wanted), *_of_names(recording, spec)]
     same = len(numbers) > 1 and _identical(recording, numbers)
     if same:
-        found.append(
+        sentences.append(
             f"all {len(numbers)} calibration samples of {recording.path} are identical; "
             "record different moments, or the ranges fit one of them alone"
         )
     for tensor in spec.inputs:
         where = f"'{tensor.name}' in {recording.path}"
         if tensor.dtype == "uint8":
-            found += _of_pixels(where, recording, tensor.name, numbers)
+            sentences += _of_pixels(where, recording, tensor.name, numbers)
             continue
         values = recording.inputs[tensor.name][list(numbers)]
         if tensor.kind == "text":
-            found += _of_text(where, values, numbers)
+            sentences += _of_text(where, values, numbers)
         elif values.dtype.kind in "iuf" and np.dtype(tensor.dtype).kind == "f":
-            found += [] if same else _of_channels(where, tensor, values)
-            found += _of_distance(where, tensor, values, numbers, assets)
+            sentences += [] if same else _of_channels(where, tensor, values)
+            sentences += _of_distance(where, tensor, values, numbers, assets)
             if values.dtype == np.float64:
-                found.append(f"{where} is float64; the policy takes {tensor.dtype}, so it is rounded")
-    return found
+                sentences.append(f"{where} is float64; the policy takes {tensor.dtype}, so it is rounded")
+    return sentences
 
 
-def _of_count(recording: Recording, count: int, wanted: int) -> Iterator[str]:
-    if count < wanted:
-        yield f"{wanted} calibration samples were asked for; {recording.path} holds {count}"
+def _of_count(recording: Recording, count: int, requested: int) -> Iterator[str]:
+    if count < requested:
+        yield f"{requested} calibration samples were asked for; {recording.path} holds {count}"
     if count < FEW:
         yield f"ranges from {count} calibration samples are unreliable; use {FEW} or more, better 64"
 
@@ -66,8 +68,9 @@ def _of_count(recording: Recording, count: int, wanted: int) -> Iterator[str]:
 def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
     known = [tensor.name for tensor in spec.inputs]
     for name in recording.ignored:
-        yield f"{recording.path} has the array '{name}', which is no input of the policy and is ignored; " + nearest(
-            name, known
+        yield (
+            f"{recording.path} has the array '{name}', which is not an input of the policy and is ignored; "
+            + nearest(name, known)
         )
 
 
@@ -90,8 +93,8 @@ def _of_pixels(where: str, recording: Recording, name: str, numbers: Sequence[in
     values = recording.inputs[name]
     highest = max(int(values[number].max(initial=0)) for number in numbers)
     if values.ndim > 2 and highest <= 1:
-        told = "looks normalised: no pixel is above 1" if highest else "is black in every calibration sample"
-        yield f"{where} {told}; the policy takes raw pixel values from 0 to 255"
+        look = "looks normalised: no pixel is above 1" if highest else "is black in every calibration sample"
+        yield f"{where} {look}; the policy takes raw pixel values from 0 to 255"
 
 
 def _of_channels(where: str, tensor: TensorSpec, values: Array) -> Iterator[str]:

@@ -61,8 +61,9 @@ class Drawer:
         self._inputs = bundle.manifest.spec.inputs
         self._recordings = [recording for recording in recordings if len(recording)]
         assets = bundle.path / "assets"
-        self._words = {each.name: words_of(assets / each.tokenizer) for each in self._inputs if each.kind == "text"}
-        self._normalisers = {each.name: load_normaliser(each, assets) for each in self._inputs if each.kind != "text"}
+        texts = [tensor for tensor in self._inputs if tensor.kind == "text"]
+        self._words = {text.name: words_of(assets / text.tokenizer) for text in texts}
+        self._normalisers = {tensor.name: load_normaliser(tensor, assets) for tensor in self._inputs}
 
     def draw(self, count: int, random: np.random.Generator) -> list[Drawn]:
         """Return ``count`` observations of all kinds that can be drawn, in random order."""
@@ -79,14 +80,14 @@ class Drawer:
     def _other(self, random: np.random.Generator) -> dict[str, Any]:
         """A recorded sample under another instruction; without text, inputs of samples that differ."""
         if not self._words:
-            return {each.name: self._recorded(random)[each.name] for each in self._inputs}
+            return {tensor.name: self._recorded(random)[tensor.name] for tensor in self._inputs}
         return self._recorded(random) | {
-            each.name: self._sentence(each, random) for each in self._inputs if each.kind == "text"
+            tensor.name: self._sentence(tensor, random) for tensor in self._inputs if tensor.kind == "text"
         }
 
     def _drawn(self, random: np.random.Generator, structured: Structures) -> dict[str, Any]:
         like = self._recorded(random) if self._recordings else {}
-        return {each.name: self._value(each, like.get(each.name), random, structured) for each in self._inputs}
+        return {tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs}
 
     def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator, structured: Structures) -> Any:
         if tensor.kind == "text":
@@ -118,9 +119,9 @@ def words_of(path: Path) -> list[str]:
     except (OSError, ValueError) as error:
         raise DataError(f"The vocabulary {path} cannot be read: {error}.") from error
     if not isinstance(data, dict) or not isinstance(data.get("model", {}), dict):
-        raise DataError(f"The vocabulary {path} is no mapping of words or tokens.")
-    found = data.get("words") if data.get("kind") == "words" else data.get("model", {}).get("vocab", ())
-    tokens = [item[0] if isinstance(item, list) else item for item in found or ()]
+        raise DataError(f"The vocabulary {path} is not a mapping of words or tokens.")
+    listed = data.get("words") if data.get("kind") == "words" else data.get("model", {}).get("vocab", ())
+    tokens = [item[0] if isinstance(item, list) else item for item in listed or ()]
     if data.get("kind") == "words":
         return [token for token in tokens if token] or list(string.ascii_lowercase)
     bare = {token.lstrip("\u0120\u2581") for token in tokens if token[:1] in "\u0120\u2581" or token.isalpha()}
@@ -165,12 +166,7 @@ def _extreme(shape: tuple[int, ...], random: np.random.Generator) -> Array:
     return random.choice([-EXTREME, EXTREME], size=shape)
 
 
-STRUCTURES: tuple[Callable[[tuple[int, ...], np.random.Generator], Array], ...] = (
-    _noise,
-    _constant,
-    _gradient,
-    _extreme,
-)
+STRUCTURES = (_noise, _constant, _gradient, _extreme)
 
 
 class Structures:
@@ -216,19 +212,19 @@ def save_drawn(path: Path, drawn: Sequence[Drawn]) -> None:
     """Write observations to an ``.npz`` file."""
     arrays: dict[str, Any] = {
         f"{place}.{name}": np.asarray(value)
-        for place, each in enumerate(drawn)
-        for name, value in each.observation.items()
+        for place, item in enumerate(drawn)
+        for name, value in item.observation.items()
     }
-    np.savez(path, kind=np.array([each.kind for each in drawn]), **arrays)
+    np.savez(path, kind=np.array([item.kind for item in drawn]), **arrays)
 
 
 def read_drawn(path: Path) -> list[Drawn]:
     """Read what ``save_drawn`` wrote."""
     with np.load(path, allow_pickle=False) as stored:
-        found = [Drawn(str(kind), {}) for kind in stored["kind"]]
+        observations = [Drawn(str(kind), {}) for kind in stored["kind"]]
         for key in stored.files:
             place, _, name = key.partition(".")
             if name:
                 value = stored[key]
-                found[int(place)].observation[name] = str(value) if value.dtype.kind == "U" else value
-    return found
+                observations[int(place)].observation[name] = str(value) if value.dtype.kind == "U" else value
+    return observations

@@ -109,8 +109,8 @@ def recorded_observations(source: Bundle, count: int, path: Path | None = None) 
 
 def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
     """Return recorded observations, in memory, or synthetic ones when the bundle carries none."""
-    found = list(recorded_observations(source, count, path))
-    return found or synthetic_observations(source.manifest.spec, count)
+    observations = list(recorded_observations(source, count, path))
+    return observations or synthetic_observations(source.manifest.spec, count)
 
 
 def synthetic_observations(spec: PolicySpec, count: int, seed: int = 0) -> list[dict[str, Any]]:

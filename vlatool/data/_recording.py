@@ -98,7 +98,7 @@ def read_recording(path: Path, spec: PolicySpec) -> Recording:
         DataError: when the file is missing, of an unknown format, corrupt, or does not fit the spec.
     """
     if not path.exists():
-        raise DataError(f"There is no data file {path}.")
+        raise DataError(f"Data file {path} not found.")
     known = registry.names("data")
     suffix = path.suffix.removeprefix(".")
     if suffix not in known:
@@ -137,8 +137,8 @@ def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recor
 
 def _in_memory(arrays: Mapping[str, Values], *names: str) -> Array | None:
     """Return the first of the arrays that there is, all of it: actions and episodes are held against each other."""
-    found = next((arrays[name] for name in names if name in arrays), None)
-    return found.read(0, len(found)) if isinstance(found, Rows) else found
+    array = next((arrays[name] for name in names if name in arrays), None)
+    return array.read(0, len(array)) if isinstance(array, Rows) else array
 
 
 def _length(path: Path, name: str, values: Values) -> int:
@@ -169,22 +169,22 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
 
 
 def _fits(tensor: TensorSpec, values: Values) -> bool:
-    wanted = tensor.shape[1:]
-    return values.ndim == len(wanted) + 1 and all(
-        isinstance(want, str) or want == got for want, got in zip(wanted, values.shape[1:], strict=True)
+    expected = tensor.shape[1:]
+    return values.ndim == len(expected) + 1 and all(
+        isinstance(want, str) or want == got for want, got in zip(expected, values.shape[1:], strict=True)
     )
 
 
 def _check_type(where: str, tensor: TensorSpec, values: Values) -> None:
     """Refuse a type that the runtime would refuse, and numbers that the policy's type cannot hold."""
-    wanted, got = np.dtype(tensor.dtype), values.dtype
-    numbers = got == wanted or (got.kind in "iu" and wanted.kind in "iu" and np.can_cast(got, wanted))
-    if wanted.kind == "f":
+    expected, got = np.dtype(tensor.dtype), values.dtype
+    numbers = got == expected or (got.kind in "iu" and expected.kind in "iu" and np.can_cast(got, expected))
+    if expected.kind == "f":
         numbers = got.kind in "iuf"
     if not numbers:
         hint = "store raw pixel values from 0 to 255" if tensor.dtype == "uint8" else f"store it as {tensor.dtype}"
         raise DataError(f"{where} is {values.dtype}; the policy takes {tensor.dtype}.", hint)
-    if wanted.kind == "f" and values.dtype.kind == "f" and values.dtype.itemsize > wanted.itemsize:
+    if expected.kind == "f" and values.dtype.kind == "f" and values.dtype.itemsize > expected.itemsize:
         _check_size(where, tensor, values)
 
 
@@ -235,7 +235,7 @@ def _indices(where: str, values: Array, labels: int) -> Array:
         raise DataError(f"{where} must be indices from 0 to {labels - 1}; got {values.dtype}.")
     wrong = (values < 0) | (values >= labels)
     if wrong.any():
-        sample, step = (int(each) for each in np.argwhere(wrong)[0])
+        sample, step = (int(index) for index in np.argwhere(wrong)[0])
         raise DataError(
             f"{where} must be indices from 0 to {labels - 1}; got {int(values[sample, step])} in sample {sample}"
             f" (and in {int(wrong.any(axis=1).sum())} of {len(values)} samples such a value).",

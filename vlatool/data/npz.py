@@ -31,6 +31,6 @@ class NpzReader:
 
 def _free_mb() -> float | None:
     """Return how much memory a process may still take in MB; None where it is not known."""
-    found = memory()
-    told = [found[name] for name in ("memory_available_mb", "memory_limit_mb")]
-    return min((each for each in told if each is not None), default=None)
+    figures = memory()
+    known = [figures[name] for name in ("memory_available_mb", "memory_limit_mb")]
+    return min((value for value in known if value is not None), default=None)

@@ -1,4 +1,4 @@
-"""Weights that were trained elsewhere, in the place of the policy's own."""
+"""Weights that were trained elsewhere, instead of the policy's own."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Weights(ModuleStage):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file is there."""
         if not self.file.is_file():
-            raise SourceError(f"There is no file {self.file}.")
+            raise SourceError(f"No such file: {self.file}.")
         super().check(source, profile)
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vlatool import registry
-from vlatool.errors import MissingExtra, PluginError, VlatoolError
+from vlatool.errors import MissingExtra, PluginError, VlatoolError, install
 from vlatool.files.printable import message_of
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
@@ -33,11 +33,20 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "text": ("tokenizers",),
     "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
 }
-"""Extra -> the distributions that it brings, as in ``pyproject.toml``."""
+"""Extra -> the distributions that it installs, as in ``pyproject.toml``."""
 PYTHON = (3, 10)
 FREE_GB = 5.0
 """Below this a build (export, several candidates, reports) of a 0.5 GB policy runs out of disk."""
 MEMORY_GB = 2.0
+COMPARE_INT8 = "compare int8 with float32 on this machine"
+INT8_FEATURES = {
+    "amx_int8": "AMX: int8 is computed in tiles, many times faster than float32; use uint8 activations",
+    "avx512_vnni": "AVX-512 VNNI: int8 is up to 4 times as fast as float32; use uint8 activations",
+    "avx_vnni": "AVX-VNNI: int8 is up to 4 times as fast as float32; use uint8 activations",
+    "i8mm": "i8mm: int8 matrix instructions, up to 8 times float32; use int8 activations",
+    "asimddp": "dot product (asimddp): int8 is up to 4 times as fast as float32; use int8 activations",
+}
+"""Features of processors with int8 instructions, the fastest first -> what they mean."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +92,13 @@ def diagnose(root: Path = host.ROOT) -> list[Check]:
 
 def python_version(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
     """Python is new enough."""
-    said = ".".join(str(part) for part in version)
+    running = ".".join(str(part) for part in version)
     if version < PYTHON:
-        wanted = ".".join(str(part) for part in PYTHON)
-        return Check("python", "missing", f"Python {said}; vlatool needs {wanted}", f"install Python {wanted} or later")
-    return Check("python", "ok", f"Python {said}")
+        needed = ".".join(str(part) for part in PYTHON)
+        return Check(
+            "python", "missing", f"Python {running}; vlatool needs {needed}", f"install Python {needed} or later"
+        )
+    return Check("python", "ok", f"Python {running}")
 
 
 def engines(
@@ -97,12 +108,12 @@ def engines(
     jetson = bool(board and "jetson" in board.lower())
     for library in usable_engines().values():
         title = f"engine {library.package}"
-        found = next((each for each in (library.package, *library.substitutes) if each in installed), None)
-        if found is not None:
-            yield _engine(title, f"{found} {installed[found]}", library, jetson, ask)
+        package = next((name for name in (library.package, *library.substitutes) if name in installed), None)
+        if package is not None:
+            yield _engine(title, f"{package} {installed[package]}", library, jetson, ask)
             continue
         advice = f" ({library.advice})" if library.advice else ""
-        fix = "" if jetson and advice else f"pip install 'vlatool[{library.extra}]'{advice}"
+        fix = "" if jetson and advice else f"{install(library.extra)}{advice}"
         yield Check(title, "missing", "not installed", fix)
 
 
@@ -113,7 +124,7 @@ def _engine(
         providers = ask(library)
     except MissingExtra as error:
         return Check(title, "warn", f"{words} is installed, but cannot be imported", error.fix)
-    except Exception as error:  # the seam: a library, or another package's engine, raises what it likes
+    except Exception as error:  # the seam: a library, or another package's engine, may raise anything
         return Check(title, "warn", f"{words} fails: {type(error).__name__}: {message_of(error)}", "update it")
     if providers is None:
         return Check(title, "ok", words)
@@ -129,20 +140,18 @@ def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
     for name, library in usable_engines().items():
         try:
-            found = str(library.arithmetic())  # type: ignore[attr-defined]
+            products = library.arithmetic()
         except VlatoolError:
             continue
-        title = f"int8 {name}"
-        if found == EXACT:
-            yield Check(title, "ok", "products of uint8 and int8 are exact")
-        elif name == DEFAULT_ENGINE:
-            yield Check(title, "warn", f"products of uint8 and int8 are {found}", "measure int8 against float32 here")
-        else:
-            fix = (
-                "vlatool quantize static-int8 SOURCE -o BUNDLE --layout ort: ONNX Runtime is told to be exact here; or "
-            )
-            fix += f"--layout {name} --reduce-range"
-            yield Check(title, "warn", f"products of uint8 and int8 are {found}", fix)
+        finding = f"products of uint8 and int8 are {products}"
+        if products == EXACT:
+            yield Check(f"int8 {name}", "ok", finding)
+            continue
+        fix = COMPARE_INT8
+        if name != DEFAULT_ENGINE:
+            fix = "vlatool quantize static-int8 SOURCE -o BUNDLE --layout ort: ONNX Runtime is set to be exact here; "
+            fix += f"or --layout {name} --reduce-range"
+        yield Check(f"int8 {name}", "warn", finding, fix)
 
 
 def extras(installed: Mapping[str, str]) -> Iterator[Check]:
@@ -150,24 +159,24 @@ def extras(installed: Mapping[str, str]) -> Iterator[Check]:
     for extra, packages in EXTRAS.items():
         absent = [name for name in packages if _present(name, installed) is None]
         if absent:
-            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", f"pip install 'vlatool[{extra}]'")
+            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", install(extra))
         else:
-            said = ", ".join(f"{name} {installed[_present(name, installed) or name]}" for name in packages)
-            yield Check(f"extra {extra}", "ok", said)
+            versions = ", ".join(f"{name} {installed[_present(name, installed) or name]}" for name in packages)
+            yield Check(f"extra {extra}", "ok", versions)
 
 
 def _present(name: str, installed: Mapping[str, str]) -> str | None:
     """The distribution that provides ``name``, or None."""
-    return next((found for found in (name, *_substitutes().get(name, ())) if found in installed), None)
+    return next((package for package in (name, *_substitutes().get(name, ())) if package in installed), None)
 
 
 def plugins() -> Iterator[Check]:
     """What other packages add to vlatool."""
     for title, added in registry.all_plugins().items():
         name, broken = f"plugin {title.partition(' ')[0]}", []
-        for each in added:
+        for entry in added:
             try:
-                registry.module(*each.split(".", 1))
+                registry.module(*entry.split(".", 1))
             except PluginError as error:
                 broken.append(error.message)
         finding = "; ".join([f"{title} adds {', '.join(added)}", *broken])
@@ -183,21 +192,13 @@ def instruction_set(features: Sequence[str] | None) -> Check:
     """Whether the processor multiplies int8 natively, and what that means."""
     name = "int8"
     if features is None:
-        return Check(name, "warn", "the processor's features cannot be read", "measure int8 against float32 here")
-    for wanted, meaning in (
-        ("amx_int8", "AMX: int8 is computed in tiles, many times faster than float32; use uint8 activations"),
-        ("avx512_vnni", "AVX-512 VNNI: int8 is up to 4 times as fast as float32; use uint8 activations"),
-        ("avx_vnni", "AVX-VNNI: int8 is up to 4 times as fast as float32; use uint8 activations"),
-        ("i8mm", "i8mm: int8 matrix instructions, up to 8 times float32; use int8 activations"),
-        ("asimddp", "dot product (asimddp): int8 is up to 4 times as fast as float32; use int8 activations"),
-    ):
-        if wanted in features:
-            return Check(name, "ok", meaning)
+        return Check(name, "warn", "the processor's features cannot be read", COMPARE_INT8)
+    fastest = next((feature for feature in INT8_FEATURES if feature in features), None)
+    if fastest is not None:
+        return Check(name, "ok", INT8_FEATURES[fastest])
     if "avx2" in features:
-        finding = (
-            "AVX2 without VNNI: int8 is at best twice as fast as float32, and 8-bit weights saturate in OpenVINO; "
-        )
-        finding += "ONNX Runtime is told to be exact, which is slower"
+        finding = "AVX2 without VNNI: int8 is at best twice as fast as float32, and 8-bit weights saturate in "
+        finding += "OpenVINO; ONNX Runtime is set to be exact, which is slower"
         fix = "quantize with --layout ort, or with --reduce-range, and measure it; or stay with float32"
         return Check(name, "warn", finding, fix)
     finding = "no int8 dot product: int8 saves memory here, but may be slower than float32"
@@ -207,29 +208,25 @@ def instruction_set(features: Sequence[str] | None) -> Check:
 def confined(isa: str | None) -> Iterator[Check]:
     """Whether a variable keeps OpenVINO from instructions that the processor has."""
     if isa is not None:
-        finding = (
-            f"{host.MAX_CPU_ISA}={isa} confines OpenVINO to older instructions: it is slower and may round otherwise"
-        )
+        setting = f"{host.MAX_CPU_ISA}={isa}"
+        finding = f"{setting} confines OpenVINO to older instructions: it is slower and may round differently"
         yield Check("oneDNN", "warn", finding, f"unset {host.MAX_CPU_ISA}, unless you mean to try another processor")
 
 
 def telemetry(root: Path = host.ROOT) -> Iterator[Check]:
     """Where power and temperature can be read."""
-    found = [*_rapl(root), *_ina3221(root), *_vcgencmd(root)]
-    if not found:
+    checks = [*_rapl(root), *_ina3221(root), *_vcgencmd(root)]
+    if not checks:
         finding = "no RAPL, INA3221 or vcgencmd: power is reported as unmeasured"
-        found = [Check("power", "missing", finding, "measure at the wall, or on the board itself")]
-    yield from found
-    zones = [
-        host.read_text(root, f"{zone.relative_to(root)}/type")
-        for zone in _glob(root, "sys/class/thermal", "thermal_zone*")
-    ]
+        checks = [Check("power", "missing", finding, "measure at the wall, or on the board itself")]
+    yield from checks
+    folders = _glob(root, "sys/class/thermal", "thermal_zone*")
+    zones = [host.read_text(root, f"{folder.relative_to(root)}/type") for folder in folders]
     if zones:
         yield Check("temperature", "ok", f"{len(zones)} thermal zones: {', '.join(dict.fromkeys(filter(None, zones)))}")
     else:
-        yield Check(
-            "temperature", "missing", "no thermal zone: throttling cannot be seen", "measure on the board itself"
-        )
+        finding = "no thermal zone: throttling cannot be seen"
+        yield Check("temperature", "missing", finding, "measure on the board itself")
 
 
 def _glob(root: Path, folder: str, pattern: str) -> list[Path]:
@@ -241,9 +238,8 @@ def _rapl(root: Path) -> Iterator[Check]:
     if not counters:
         return
     if any(_readable(counter) for counter in counters):
-        yield Check(
-            "power RAPL", "ok", "the energy counter of the processor package can be read; it leaves out the board"
-        )
+        finding = "the energy counter of the processor package can be read; it leaves out the board"
+        yield Check("power RAPL", "ok", finding)
     else:
         fix = f"as root, write into a udev rule, with your group for GROUP: {UDEV_RULE}"
         yield Check("power RAPL", "warn", "the energy counter is there, but only root may read it", fix)
@@ -278,8 +274,8 @@ def _vcgencmd(root: Path) -> Iterator[Check]:
 
 def clocks(root: Path = host.ROOT) -> Check:
     """Whether the clocks are held, so that two runs compare."""
-    found = host.frequency(root)
-    governor, model = found["governor"], host.board(root) or ""
+    frequency = host.frequency(root)
+    governor, model = frequency["governor"], host.board(root) or ""
     if governor is None:
         finding = "no frequency policy is visible (a virtual machine or container); clocks cannot be checked"
         return Check("clocks", "warn", finding, "repeat measurements and interleave what you compare")
@@ -309,24 +305,16 @@ def cores(root: Path = host.ROOT) -> Check:
 
 def memory(root: Path = host.ROOT) -> Check:
     """How much memory this process may take."""
-    found = host.memory(root)
-    available, limit = found["memory_available_mb"], found["memory_limit_mb"]
+    sizes = host.memory(root)
+    available, limit = sizes["memory_available_mb"], sizes["memory_limit_mb"]
     known = [value for value in (available, limit) if value is not None]
     if not known:
         return Check("memory", "warn", "the amount of memory cannot be read")
-    finding = " and ".join(
-        text
-        for value, text in (
-            (available, f"{(available or 0) / 1e3:.1f} GB available"),
-            (limit, f"a control group's limit of {(limit or 0) / 1e3:.1f} GB"),
-        )
-        if value is not None
-    )
-    if min(known) < MEMORY_GB * 1e3:
-        return Check(
-            "memory", "warn", finding, "close other programs (a desktop takes about 0.5 GB), or add swap to build"
-        )
-    return Check("memory", "ok", finding)
+    parts = [] if available is None else [f"{available / 1e3:.1f} GB available"]
+    parts += [] if limit is None else [f"a control group's limit of {limit / 1e3:.1f} GB"]
+    low = min(known) < MEMORY_GB * 1e3
+    fix = "close other programs (a desktop takes about 0.5 GB), or add swap to build"
+    return Check("memory", "warn" if low else "ok", " and ".join(parts), fix if low else "")
 
 
 def disk(root: Path = host.ROOT, usage: Callable[[Path], Any] = shutil.disk_usage) -> Check:

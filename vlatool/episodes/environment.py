@@ -48,13 +48,13 @@ class World:
         Raises:
             DataError: when it does not give an observation and an info.
         """
-        given = self._environment.reset(seed=seed)
-        if not (isinstance(given, tuple) and len(given) == 2):
+        answer = self._environment.reset(seed=seed)
+        if not (isinstance(answer, tuple) and len(answer) == 2):
             raise DataError(
-                f"reset() of {self._name} gives {_told(given)}; it must give (observation, info).",
+                f"reset() of {self._name} gives {_told(answer)}; it must give (observation, info).",
                 f"return observation, {{}}: that is gymnasium's interface, and no longer gym's; {GUIDE}",
             )
-        return self._observation(given[0])
+        return self._observation(answer[0])
 
     def step(self, action: Any) -> tuple[Mapping[str, Any], bool, Any]:
         """Take an action; return the next observation, whether the episode is over, and the info.
@@ -62,32 +62,32 @@ class World:
         Raises:
             DataError: when it does not give the five values of gymnasium.
         """
-        given = self._environment.step(action)
-        if not (isinstance(given, tuple | list) and len(given) == 5):
+        answer = self._environment.step(action)
+        if not (isinstance(answer, tuple | list) and len(answer) == 5):
             raise DataError(
-                f"step() of {self._name} gives {_told(given)}; it must give five values: observation, reward, "
+                f"step() of {self._name} gives {_told(answer)}; it must give five values: observation, reward, "
                 "terminated, truncated, info.",
                 f"return observation, reward, done, False, info where gym had observation, reward, done, info; {GUIDE}",
             )
-        observation, _, terminated, truncated, info = given
+        observation, _, terminated, truncated, info = answer
         return self._observation(observation), self._over(terminated) or self._over(truncated), info
 
-    def _over(self, said: Any) -> bool:
-        if np.size(said) != 1:
+    def _over(self, flag: Any) -> bool:
+        if np.size(flag) != 1:
             raise DataError(
-                f"step() of {self._name} tells of {np.size(said)} episodes at once whether they are over.",
+                f"step() of {self._name} tells of {np.size(flag)} episodes at once whether they are over.",
                 "name a single environment, not a vector of them",
             )
-        return bool(np.asarray(said).reshape(-1)[0])
+        return bool(np.asarray(flag).reshape(-1)[0])
 
-    def _observation(self, given: Any) -> Mapping[str, Any]:
+    def _observation(self, observation: Any) -> Mapping[str, Any]:
         """Return an observation by the names of the policy; one that has no name is that of its only input."""
-        if isinstance(given, Mapping):
-            return given
+        if isinstance(observation, Mapping):
+            return observation
         if len(self._inputs) == 1:
-            return {self._inputs[0]: given}
+            return {self._inputs[0]: observation}
         raise DataError(
-            f"{self._name.capitalize()} gives its observation as {_told(given)}, without names; the policy takes "
+            f"{self._name.capitalize()} gives its observation as {_told(observation)}, without names; the policy takes "
             f"{', '.join(self._inputs)}.",
             f"wrap it, so that it gives a dict with these names; {GUIDE}",
         )
@@ -101,16 +101,16 @@ def _takes_seed(reset: Any) -> bool:
         return True
     named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     return any(
-        each.kind is inspect.Parameter.VAR_KEYWORD or (each.name == "seed" and each.kind in named)
-        for each in parameters
+        parameter.kind is inspect.Parameter.VAR_KEYWORD or (parameter.name == "seed" and parameter.kind in named)
+        for parameter in parameters
     )
 
 
-def _told(given: Any) -> str:
+def _told(value: Any) -> str:
     """Return what something is, as a part of a sentence."""
-    if isinstance(given, tuple | list):
-        return f"{len(given)} values"
-    if isinstance(given, np.ndarray):
-        return f"an array of {given.dtype} with the shape {list(given.shape)}"
-    name = type(given).__name__
+    if isinstance(value, tuple | list):
+        return f"{len(value)} values"
+    if isinstance(value, np.ndarray):
+        return f"an array of {value.dtype} with the shape {list(value.shape)}"
+    name = type(value).__name__
     return f"{'an' if name[0].lower() in 'aeio' else 'a'} {name}"

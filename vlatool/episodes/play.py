@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from vlatool.accuracy.outcome import Outcome
+from vlatool.accuracy.paired import Outcome
 from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.environment import GUIDE, World
 from vlatool.episodes.frames import Frames, Noisy
 from vlatool.errors import DataError, VlatoolError, require
+from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import message_of
-from vlatool.module.factory import call_factory, exits_told
+from vlatool.module.factory import call_factory, exits_caught
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context
@@ -31,7 +32,7 @@ PRELOAD = ("numpy", "onnxruntime", __name__)
 
 
 @dataclass(frozen=True)
-class Job:
+class EpisodesJob:
     """Some episodes of one task.
 
     Args:
@@ -57,29 +58,49 @@ class Job:
     record: str = ""
 
 
-def run_jobs(bundle: Bundle, jobs: list[Job], engine: str, context: Context) -> list[Outcome]:
+@dataclass(frozen=True)
+class Request:
+    """Episodes that a child plays with a bundle, each of at most ``limit`` control steps."""
+
+    bundle: str
+    engine: str
+    limit: int
+    job: EpisodesJob
+
+
+@dataclass(frozen=True)
+class Played:
+    """What a child answers: how the episodes of a job ended, in the order of its seeds."""
+
+    outcomes: tuple[Outcome, ...]
+
+
+def run_jobs(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context) -> list[Outcome]:
     """Play all episodes and return their outcomes in the order of the jobs, whatever the number of workers.
 
     Raises:
         DataError: when the environment fails or does not fit the policy's spec.
         SourceError: when it ends the process that it runs in.
     """
-    opening = {"bundle": str(bundle.path.absolute()), "engine": engine, "limit": STEP_LIMIT}
-    requests = [{**opening, "job": asdict(job)} for job in jobs]
+    path = str(bundle.path.absolute())
+    requests = [to_json(Request(path, engine, STEP_LIMIT, job)) for job in jobs]
     about = jobs[0].environment.rpartition(":")[0] if jobs else ""
     here = f"{__name__}:"
-    found = spread(f"{here}play", requests, context.workers, context.tell, about, PRELOAD, last=f"{here}close")
-    with contextlib.closing(found):
-        played = (_played(part, job) for part, job in zip(found, jobs, strict=True))
+    answers = spread(f"{here}play", requests, context.workers, context.tell, about, PRELOAD, last=f"{here}close")
+    with contextlib.closing(answers):
+        played = (_outcomes(answer, job) for answer, job in zip(answers, jobs, strict=True))
         return _collect(played, len(jobs), context)
 
 
-def _played(found: Any, job: Job) -> list[Outcome]:
+def _outcomes(answer: Any, job: EpisodesJob) -> tuple[Outcome, ...]:
     """Return what a child says of the episodes of a job."""
     try:
-        return [Outcome(job.task, int(seed), bool(success), int(steps)) for seed, success, steps in found]
-    except (TypeError, ValueError) as error:
-        raise DataError(f"The process that played '{job.task}' answers what are no episodes.") from error
+        outcomes = from_json(Played, answer).outcomes
+    except ValueError as error:
+        raise DataError(f"The process that played '{job.task}' did not answer with episodes: {error}.") from error
+    if [(outcome.task, outcome.seed) for outcome in outcomes] != [(job.task, seed) for seed in job.seeds]:
+        raise DataError(f"The process that played '{job.task}' answered with other episodes.")
+    return outcomes
 
 
 def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
@@ -126,7 +147,7 @@ class Worker:
         self._key: tuple[str, ...] = ()
         self._environment: Any = None
 
-    def environment(self, job: Job) -> Any:
+    def environment(self, job: EpisodesJob) -> Any:
         """Return the environment of a job; one is open at a time, since some renderers allow no more."""
         key = (job.environment, job.folder, job.task, job.instruction)
         if key != self._key:
@@ -136,7 +157,7 @@ class Worker:
             self._key = key
         return self._environment
 
-    def play(self, job: Job, limit: int = STEP_LIMIT) -> list[Outcome]:
+    def play(self, job: EpisodesJob, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
         world = World(self.environment(job), job.task, self.queue.policy.spec)
         actors = ((seed, self._actor(job, seed)) for seed in job.seeds)
@@ -145,7 +166,7 @@ class Worker:
         with self._frames.kept(Path(job.record)):
             return [_episode(world, actor, job.task, seed, limit) for seed, actor in actors]
 
-    def _actor(self, job: Job, seed: int) -> Actor:
+    def _actor(self, job: EpisodesJob, seed: int) -> Actor:
         """Return who acts: the policy, the policy with noise, or a control that does not look."""
         if not job.control and not job.noise:
             return self.queue
@@ -178,13 +199,14 @@ def _opened(bundle: Bundle, engine: str) -> Policy:
 _worker: Worker | None = None
 
 
-def play(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> list[list[Any]]:
-    """Play the episodes of a job in this process: seed, success and steps of each."""
+def play(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Answer a ``Request`` in this process with ``Played``."""
     global _worker
+    asked = from_json(Request, request)
     if _worker is None:
-        _worker = Worker(request["bundle"], request["engine"])
-    job = Job(**{**request["job"], "seeds": tuple(request["job"]["seeds"])})
-    return [[each.seed, each.success, each.steps] for each in _worker.play(job, request["limit"])]
+        _worker = Worker(asked.bundle, asked.engine)
+    answer: dict[str, Any] = to_json(Played(tuple(_worker.play(asked.job, asked.limit))))
+    return answer
 
 
 def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> None:
@@ -197,16 +219,16 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
 
 def _episode(world: World, queue: Actor, task: str, seed: int, limit: int) -> Outcome:
     try:
-        with exits_told(f"the environment of task '{task}', at seed {seed},"):
+        with exits_caught(f"the environment of task '{task}', at seed {seed},"):
             observation = world.reset(seed)
             queue.reset()
-            told = Success()
+            success = Success()
             for step in range(1, limit):
                 action = _acted(queue, observation, f"task '{task}' at seed {seed}, step {step},")
                 observation, over, info = world.step(action.item() if action.ndim == 0 else action)
-                told.look(info)
+                success.look(info)
                 if over:
-                    return Outcome(task, seed, told.at_the_end(task, seed), step)
+                    return Outcome(task, seed, success.at_the_end(task, seed), step)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: a user's environment may raise anything

@@ -11,7 +11,7 @@ from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.paired import compare_success, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.play import Job, run_jobs
+from vlatool.episodes.play import EpisodesJob, run_jobs
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.machine.host import fingerprint
@@ -76,32 +76,35 @@ class ClosedLoop(Measure):
         rows.append(compare_success(rows[0], row) if rows else row)
         success = rows[-1].get("success")
         count = success.samples if success else 0
-        told = "" if self.instruction == "right" else " told the wrong instruction"
-        title = f"{source.manifest.name}{told} in {count} closed-loop episodes"
-        told = f" with {self.control} actions in the place of the policy's" if self.control else told
-        text = f"{row.value('success'):.1%} of {count} episodes succeed{told and ',' + told}."
+        how = "" if self.instruction == "right" else " told the wrong instruction"
+        title = f"{source.manifest.name}{how} in {count} closed-loop episodes"
+        how = f" with {self.control} actions in the place of the policy's" if self.control else how
+        text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else "info"
         return Report(
             "evaluate", title, verdict, (*believed.sentences, text), tuple(rows), environment=fingerprint(),
             warnings=(*believed.warnings, *found_wrong(source)),
         )  # fmt: skip
 
-    def _reference(self, baseline: Bundle, jobs: list[Job], context: Context) -> Row:
+    def _reference(self, baseline: Bundle, jobs: list[EpisodesJob], context: Context) -> Row:
         """Play the baseline, and the controls that show what succeeds by chance."""
         row = success_row("baseline", "baseline", run_jobs(baseline, jobs, self.engine, context))
         if self.instruction != "right":
             return row
-        return with_chance(
-            row, [success_row(each.control, "subject", run_jobs(baseline, each._jobs(baseline), self.engine, context))
-                  for each in self.controls()]
-        )  # fmt: skip
+        controls = []
+        for control in self.controls():
+            outcomes = run_jobs(baseline, control._jobs(baseline), self.engine, context)
+            controls.append(success_row(control.control, "subject", outcomes))
+        return with_chance(row, controls)
 
     def controls(self) -> list[ClosedLoop]:
         """Return the evaluations that show what succeeds by chance, on the first of the same seeds."""
         episodes = min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))
-        return [self.model_copy(update={"control": each, "episodes": episodes, "baseline": None}) for each in CONTROLS]
+        return [
+            self.model_copy(update={"control": control, "episodes": episodes, "baseline": None}) for control in CONTROLS
+        ]
 
-    def _may_run(self, job: Job) -> None:
+    def _may_run(self, job: EpisodesJob) -> None:
         """Let the environment's code run where it was named in the options; what a bundle names must be trusted.
 
         Raises:
@@ -120,7 +123,7 @@ class ClosedLoop(Measure):
             )
         trust.require(file.parent, f"{function}() of {file.name}")
 
-    def _jobs(self, source: Bundle | None) -> list[Job]:
+    def _jobs(self, source: Bundle | None) -> list[EpisodesJob]:
         described = read_description(self.policy) if self.policy else None
         named = described.environment if described else (source.manifest.environment if source else {})
         known = tuple(named.get("tasks", ()))
@@ -140,9 +143,11 @@ class ClosedLoop(Measure):
         for task in self.tasks:
             if known and task not in known and not self.environment:
                 raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.")
-        each = -(-self.episodes // len(tasks))
-        seeds = range(self.first_seed, self.first_seed + each)
-        slices = [tuple(seeds[start : start + SLICE]) for start in range(0, each, SLICE)]
+        count = -(-self.episodes // len(tasks))
+        seeds = range(self.first_seed, self.first_seed + count)
+        slices = [tuple(seeds[start : start + SLICE]) for start in range(0, count, SLICE)]
         return [
-            Job(where, str(folder), task, part, self.instruction, self.control) for task in tasks for part in slices
+            EpisodesJob(where, str(folder), task, part, self.instruction, self.control)
+            for task in tasks
+            for part in slices
         ]

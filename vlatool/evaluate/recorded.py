@@ -73,20 +73,20 @@ class Recorded(Measure):
             reference = self._reference(Bundle.open(self.baseline), source, recording, indices, context)
             own = alone(action, reference, expert, episodes)
             rows.append(Row("baseline", "baseline", measurements=tuple(own)))
-        got = run_recorded(source, recording, indices, self.engine, context)
-        measurements = alone(action, got, expert, episodes)
+        actions = run_recorded(source, recording, indices, self.engine, context)
+        measurements = alone(action, actions, expert, episodes)
         if reference is not None:
-            measurements += compare(action, got, reference, "baseline")
+            measurements += compare(action, actions, reference, "baseline")
         rows.append(Row(source.manifest.name, measurements=tuple(measurements)))
         kind = "calibration" if reservation else "recorded"
         title = f"{source.manifest.name} on {len(indices)} {kind} observations"
         trust = credibility(rows[0]) if self.baseline else Credibility("unknown")
         text = f"{title}: {_summary(rows[-1])}."
         verdict = "inconclusive" if trust.fails else "info"
-        said = (*trust.sentences, text)
-        told = (reservation,) if reservation else ()
-        warnings = (*told, *trust.warnings, *recording.unjudged, *found_wrong(source))
-        return Report("evaluate", title, verdict, said, tuple(rows), environment=fingerprint(), warnings=warnings)
+        sentences = (*trust.sentences, text)
+        reserved = (reservation,) if reservation else ()
+        warnings = (*reserved, *trust.warnings, *recording.unjudged, *found_wrong(source))
+        return Report("evaluate", title, verdict, sentences, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _reference(
         self, baseline: Bundle, source: Bundle, recording: Recording, indices: Sequence[int], context: Context
@@ -111,31 +111,31 @@ def carries_recordings(bundle: Bundle) -> bool:
 
 
 def _summary(row: Row) -> str:
-    told = []
+    sentences = []
     for whose, words in (("expert", "the expert"), ("baseline", "the baseline")):
         agreement, error = row.get(f"agreement_{whose}"), row.get(f"error_{whose}")
         if agreement is not None:
-            told.append(f"{agreement.value:.1%} of the actions are those of {words}")
+            sentences.append(f"{agreement.value:.1%} of the actions are those of {words}")
         elif error is not None and error.known:
-            told.append(f"actions differ from {words}'s by {error.value:.1%} of their standard deviation")
+            sentences.append(f"actions differ from {words}'s by {error.value:.1%} of their standard deviation")
         elif error is not None:
-            told.append(f"{error.note}; {_worst(row, f'error_{whose}.')}")
-    return "; ".join(told) or "nothing to compare with"
+            sentences.append(f"{error.note}; {_worst(row, f'error_{whose}.')}")
+    return "; ".join(sentences) or "nothing to compare with"
 
 
 def _worst(row: Row, start: str) -> str:
     """Return the largest error of an element, in its unit."""
-    worst = max((each for each in row.measurements if each.name.startswith(start)), key=lambda each: each.value)
+    worst = max((error for error in row.measurements if error.name.startswith(start)), key=lambda error: error.value)
     unit = "" if worst.unit == "1" else f" {worst.unit}"
     return f"{worst.name.removeprefix(start)} is off by {worst.value:.3g}{unit} on average"
 
 
 def alone(action: TensorSpec, got: Array, expert: Array | None, episodes: Array | None) -> list[Measurement]:
     """Return what the actions of one policy say without another one: against the expert's, and how much they vary."""
-    found = compare(action, got, expert, "expert")
+    measured = compare(action, got, expert, "expert")
     if expert is not None:
-        found.append(skill(action, got, expert, episodes))
-    return [*found, *variation(action, got, expert)]
+        measured.append(skill(action, got, expert, episodes))
+    return [*measured, *variation(action, got, expert)]
 
 
 def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], engine: str, context: Context) -> Array:
@@ -188,16 +188,16 @@ def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) ->
     note = "mean |error| / standard deviation" if varies else NEVER_VARIES[whose]
     norms = np.linalg.norm(wanted.reshape(count, -1), axis=1)
     distances = np.linalg.norm((got - wanted).reshape(count, -1), axis=1) / np.where(norms > 0, norms, 1.0)
-    found = [Measurement(f"error_{whose}", relative, "1", samples=count, note=note)]
+    measured = [Measurement(f"error_{whose}", relative, "1", samples=count, note=note)]
     if whose == "baseline":
         note = "mean over samples of |difference|2 / |action|2"
-        found.append(Measurement("relative_error", float(distances.mean()), "1", samples=count, note=note))
+        measured.append(Measurement("relative_error", float(distances.mean()), "1", samples=count, note=note))
     for index, (label, unit) in enumerate(zip(labels, action.units(), strict=True)):
-        found.append(
+        measured.append(
             Measurement(f"error_{whose}.{label}", float(mean[index]), unit, samples=count, note="mean |error|")
         )
-    found += _gripper_flips(labels, got, wanted, whose)
-    return found
+    measured += _gripper_flips(labels, got, wanted, whose)
+    return measured
 
 
 def _middles(wanted: Array) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, VlatoolError
 from vlatool.explain import _tables as tables
-from vlatool.explain._bfloat16 import Phases, phases, told
+from vlatool.explain._bfloat16 import Phases, phase_sentences, phases
 from vlatool.explain._islands import Fallback, Island, QuantizedGraph, fallbacks, timed
 from vlatool.explain._operators import Operator, profile, reference_engine, table
 from vlatool.explain._origin import (
@@ -61,7 +61,7 @@ class Options:
 
 
 @dataclass
-class _Found:
+class _Findings:
     """What was found out about a bundle."""
 
     bundle: Bundle
@@ -92,28 +92,35 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
         GraphError: when a graph cannot be run.
     """
     host = fingerprint()
-    found = _find(bundle, options, context)
+    findings = _find(bundle, options, context)
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
         engine = bundle.manifest.engine or DEFAULT_ENGINE
-        wanted = options.suggest and found.baseline is not None and found.seen.recorded
-        tried = plans(found.made.stage, found.layers, found.fallen, engine) if wanted else []
-        values = found.seen.values
-        contest = measure(bundle, found.baseline, tried, values, Path(scratch), options.threads, context)
-        sentences = _sentences(found, contest.speed)
-        sentences[1:1] = tables.suggested(contest, found.source)
-        sentences += tables.tried_told(contest, found.layers)
-        found.warnings += [f"the candidate '{each.name}' failed: {each.failed}" for each in tried if each.failed]
-        details = _details(found)
+        suggests = options.suggest and findings.baseline is not None and findings.seen.recorded
+        tried = plans(findings.made.stage, findings.layers, findings.fallen, engine) if suggests else []
+        values = findings.seen.values
+        contest = measure(bundle, findings.baseline, tried, values, Path(scratch), options.threads, context)
+        sentences = _sentences(findings, contest.speed)
+        sentences[1:1] = tables.suggestion(contest, findings.source)
+        sentences += tables.trial_sentences(contest, findings.layers)
+        findings.warnings += [
+            f"the candidate '{candidate.name}' failed: {candidate.failed}" for candidate in tried if candidate.failed
+        ]
+        details = _details(findings)
         rows: list[Row] = []
-        for each in (contest.baseline, contest.now, *contest.others):
-            if each is not None:
-                own = details if each is contest.now else {}
-                rows.append(tables.candidate_row(each, contest, own, found.source))
+        for candidate in (contest.baseline, contest.now, *contest.others):
+            if candidate is not None:
+                own = details if candidate is contest.now else {}
+                rows.append(tables.candidate_row(candidate, contest, own, findings.source))
     name = str(bundle.manifest.made_by.get("stage", "")).rpartition(".")[2]
     rows = [replace(row, name=name or row.name) if row.name == "as it is" else row for row in rows]
     title = f"Why {bundle.manifest.name} ({name or 'as it is'}) is as accurate and as fast as it is"
     return Report(
-        "explain", title, summary=tuple(sentences), rows=tuple(rows), environment=host, warnings=tuple(found.warnings)
+        "explain",
+        title,
+        summary=tuple(sentences),
+        rows=tuple(rows),
+        environment=host,
+        warnings=tuple(findings.warnings),
     )
 
 
@@ -143,97 +150,108 @@ def explanation(
         return (f"This could not be explained: {error.message}",)
 
 
-def _find(bundle: Bundle, options: Options, context: Context) -> _Found:
+def _find(bundle: Bundle, options: Options, context: Context) -> _Findings:
     if not bundle.manifest.graphs:
         raise BundleError(f"{bundle.path} has no graph to explain.", "export it first: vlatool export SOURCE -o BUNDLE")
-    made = origin(bundle)
-    baseline = find_baseline(bundle, made, options.baseline)
+    quantization = origin(bundle)
+    baseline = find_baseline(bundle, quantization, options.baseline)
     seen = observations_of(bundle, baseline, options.data, options.samples)
-    found = _Found(bundle, baseline, made, seen, warnings=list(made.notes))
+    findings = _Findings(bundle, baseline, quantization, seen, warnings=list(quantization.notes))
     if not seen.recorded:
-        found.warnings.append("there are no recorded observations: the layers' errors are not measured (--data FILE)")
-    _layers(found, options.seconds, context)
-    _times(found, options, context)
-    found.phases = phases(bundle, baseline, seen.values, context)
-    return found
+        findings.warnings.append(
+            "there are no recorded observations: the layers' errors are not measured (--data FILE)"
+        )
+    _layers(findings, options.seconds, context)
+    _times(findings, options, context)
+    findings.phases = phases(bundle, baseline, seen.values, context)
+    return findings
 
 
-def _layers(found: _Found, seconds: float, context: Context) -> None:
+def _layers(findings: _Findings, seconds: float, context: Context) -> None:
     """Measure each layer alone in int8."""
-    stage = sensitivity_stage(found.made.stage)
-    if stage is None or not found.seen.recorded:
+    stage = sensitivity_stage(findings.made.stage)
+    if stage is None or not findings.seen.recorded:
         return
-    if found.baseline is None:
-        found.warnings.append(
+    if findings.baseline is None:
+        findings.warnings.append(
             "the float32 bundle that this one was made from is not in the cache, so no layer could be measured: "
-            f"vlatool explain {found.bundle.path} --baseline FLOAT_BUNDLE"
+            f"vlatool explain {findings.bundle.path} --baseline FLOAT_BUNDLE"
         )
         return
     try:
-        static = isinstance(found.made.stage, StaticInt8)
-        ranges = ranges_of(found.baseline, stage, context) if static else {}
-        found.layers = sensitivities(found.baseline, stage, ranges, found.seen.values, context, seconds=seconds)
+        static = isinstance(findings.made.stage, StaticInt8)
+        ranges = ranges_of(findings.baseline, stage, context) if static else {}
+        findings.layers = sensitivities(
+            findings.baseline, stage, ranges, findings.seen.values, context, seconds=seconds
+        )
     except VlatoolError as error:
-        found.warnings.append(f"the layers could not be measured: {error.message} {error.fix}".strip())
+        findings.warnings.append(f"the layers could not be measured: {error.message} {error.fix}".strip())
 
 
-def _times(found: _Found, options: Options, context: Context) -> None:
+def _times(findings: _Findings, options: Options, context: Context) -> None:
     """Profile the bundle and the float32 one, and look at the quantized graphs."""
-    values = found.seen.values
+    values = findings.seen.values
     context.tell("profiling the operators", None)
-    found.operators = profile(found.bundle, values, options.runs, options.threads)
-    if found.baseline is not None:
+    findings.operators = profile(findings.bundle, values, options.runs, options.threads)
+    if findings.baseline is not None:
         context.tell("profiling the operators of float32", None)
-        compared = reference_engine(found.bundle)
-        found.before = profile(found.baseline, values, options.runs, options.threads, compared)
-    engine = found.bundle.manifest.engine or DEFAULT_ENGINE
-    for name, graph in found.bundle.manifest.graphs.items():
-        seen = QuantizedGraph(name, found.bundle.file(graph.file))
-        found.islands += seen.islands()
-        found.pairs = tuple(a + b for a, b in zip(found.pairs, seen.pairs(), strict=True))  # type: ignore[assignment]
-        found.fallen += fallbacks(seen, found.operators, engine)
-    found.islands = timed(found.islands, found.operators)
+        compared = reference_engine(findings.bundle)
+        findings.before = profile(findings.baseline, values, options.runs, options.threads, compared)
+    engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
+    for name, graph in findings.bundle.manifest.graphs.items():
+        seen = QuantizedGraph(name, findings.bundle.file(graph.file))
+        findings.islands += seen.islands()
+        findings.pairs = tuple(a + b for a, b in zip(findings.pairs, seen.pairs(), strict=True))  # type: ignore[assignment]
+        findings.fallen += fallbacks(seen, findings.operators, engine)
+    findings.islands = timed(findings.islands, findings.operators)
 
 
-def _sentences(found: _Found, speed: float = math.nan) -> list[str]:
+def _sentences(findings: _Findings, speed: float = math.nan) -> list[str]:
     """Return the findings, what matters most first."""
-    again = command(found.made.stage, found.source) if found.made.stage is not None else "see vlatool quantize --help"
-    about_phases = [*(each["message"] for each in found.bundle.manifest.findings), *told(found.phases, again)]
-    ruined = len(found.bundle.manifest.findings) + sum(bool(each.nodes) for each in found.phases)
+    again = (
+        command(findings.made.stage, findings.source)
+        if findings.made.stage is not None
+        else "see vlatool quantize --help"
+    )
+    about_phases = [
+        *(finding["message"] for finding in findings.bundle.manifest.findings),
+        *phase_sentences(findings.phases, again),
+    ]
+    ruined = len(findings.bundle.manifest.findings) + sum(bool(finding.nodes) for finding in findings.phases)
     sentences = about_phases[:ruined]
-    if found.layers:
-        sentences.append(tables.layers_told(found.layers))
-    sentences.append(tables.time_told(found.operators))
-    if found.fallen or found.pairs[0]:
-        sentences.append(tables.fallbacks_told(found.fallen, found.operators))
-    if found.pairs[0]:
-        sentences.append(tables.islands_told(found.islands, found.pairs, found.operators))
-    sentences += tables.limit_told(found.operators, found.before, _macs(found.bundle), speed)
+    if findings.layers:
+        sentences.append(tables.layers_sentence(findings.layers))
+    sentences.append(tables.time_sentence(findings.operators))
+    if findings.fallen or findings.pairs[0]:
+        sentences.append(tables.fallbacks_sentence(findings.fallen, findings.operators))
+    if findings.pairs[0]:
+        sentences.append(tables.islands_sentence(findings.islands, findings.pairs, findings.operators))
+    sentences += tables.limit_sentences(findings.operators, findings.before, _macs(findings.bundle), speed)
     return sentences + about_phases[ruined:]
 
 
 def _macs(bundle: Bundle) -> dict[str, int]:
     """Return precision -> multiply-accumulates of one inference, as the graphs are computed."""
     counted = workload(bundle)
-    found: Counter[str] = Counter()
+    macs: Counter[str] = Counter()
     for name, graph in counted.graphs.items():
         compute = bundle.manifest.graphs[name].compute or "float32"
         for kind, count in graph.macs.items():
-            found[compute if kind == "float32" else kind] += count * counted.runs.get(name, 0)
-    return dict(found)
+            macs[compute if kind == "float32" else kind] += count * counted.runs.get(name, 0)
+    return dict(macs)
 
 
-def _details(found: _Found) -> Mapping[str, Sequence[Mapping[str, Any]]]:
+def _details(findings: _Findings) -> Mapping[str, Sequence[Mapping[str, Any]]]:
     """Return the tables that belong to the bundle."""
-    action = found.bundle.manifest.spec.action
+    action = findings.bundle.manifest.spec.action
     units = dict(zip(action.labels, action.units(), strict=False))
-    several = len({each.graph for each in found.layers}) > 1
+    several = len({layer.graph for layer in findings.layers}) > 1
     every = {
-        "Layers that cost the accuracy, each alone in int8": tables.layers_table(found.layers, several),
-        "What the worst layers do to the action": tables.elements_table(found.layers, units),
-        "Time by what it is computed in": tables.precision_table(found.operators),
-        "Time by operator": table(found.operators),
-        "Layers that fell back": tables.fallbacks_table(found.fallen),
-        "Round trips through float": tables.islands_table(found.islands),
+        "Layers that cost the accuracy, each alone in int8": tables.layers_table(findings.layers, several),
+        "What the worst layers do to the action": tables.elements_table(findings.layers, units),
+        "Time by what it is computed in": tables.precision_table(findings.operators),
+        "Time by operator": table(findings.operators),
+        "Layers that fell back": tables.fallbacks_table(findings.fallen),
+        "Round trips through float": tables.islands_table(findings.islands),
     }
     return {title: rows for title, rows in every.items() if rows}

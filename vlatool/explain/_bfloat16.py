@@ -12,8 +12,9 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
+from vlatool.explain._operators import raw_actions
 from vlatool.graph.files import load, part_phases, save
-from vlatool.graph.phase import PERIODIC, cut_phases
+from vlatool.graph.phase import cut_phases, periodic
 from vlatool.runtime.engine import computing, engine_class
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program, Session
@@ -57,72 +58,60 @@ def phases(
         observations: Raw observations.
         context: For progress.
     """
-    found = []
+    known = []
     graphs = bundle.manifest.graphs
     for name, graph in graphs.items():
         if graph.compute != "bfloat16":
             continue
         kept = f"{name}_phases" if f"{name}_phases" in graphs else ""
-        nodes = _periodic(load(bundle.file(graph.file)))
-        each = Phases(name, kept, nodes)
+        nodes = tuple(node.name for node in periodic(load(bundle.file(graph.file))))
+        state = Phases(name, kept, nodes)
         if nodes:
-            found.append(_measured(bundle, each, observations, context))
+            known.append(_measured(bundle, state, observations, context))
         elif kept:
             whole = set(graph.precision) <= {"bfloat16", "float32"}  # else int8 errors would be mixed in
-            found.append(_without(bundle, baseline, each, observations, context) if baseline and whole else each)
-    return found
+            known.append(_without(bundle, baseline, state, observations, context) if baseline and whole else state)
+    return known
 
 
 def _without(
-    bundle: Bundle, baseline: Bundle, each: Phases, observations: Sequence[Mapping[str, Any]], context: Context
+    bundle: Bundle, baseline: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context
 ) -> Phases:
     """Run float32, the bundle with its cut, and the whole float32 graph in bfloat16."""
-    context.tell(f"measuring what the phases of {each.graph} would be in bfloat16", None)
+    context.tell(f"measuring what the phases of {phase.graph} would be in bfloat16", None)
     graphs = baseline.manifest.graphs
     try:
         plain = _actions(baseline, {}, observations, dict.fromkeys(graphs, ""))
-        computes = {name: made.compute for name, made in bundle.manifest.graphs.items() if name in graphs}
+        computes = {name: graph.compute for name, graph in bundle.manifest.graphs.items() if name in graphs}
         uncut = _actions(baseline, {}, observations, computes)
         cut = _actions(bundle, {}, observations, {})
     except VlatoolError as error:
-        return replace(each, note=f"not measured: {error.message}")
-    return replace(each, error=_error(uncut, plain), cut=_error(cut, plain))
+        return replace(phase, note=f"not measured: {error.message}")
+    return replace(phase, error=_error(uncut, plain), cut=_error(cut, plain))
 
 
-def _periodic(model: Any) -> tuple[str, ...]:
-    """Return the Sin and Cos whose argument depends on an input of the graph."""
-    dependent = {value.name for value in model.graph.input}
-    found = []
-    for node in model.graph.node:
-        if not dependent.isdisjoint(node.input):
-            dependent.update(node.output)
-            if node.op_type in PERIODIC:
-                found.append(node.name)
-    return tuple(found)
-
-
-def _measured(bundle: Bundle, each: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
+def _measured(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str, Any]], context: Context) -> Phases:
     """Run float32, the bundle as it is, and the bundle with the cut."""
-    context.tell(f"measuring what bfloat16 does to the phases of {each.graph}", None)
+    context.tell(f"measuring what bfloat16 does to the phases of {phase.graph}", None)
     manifest = bundle.manifest
     note = ""
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-        path = Path(scratch) / f"{each.graph}.onnx"
-        model = load(bundle.file(manifest.graphs[each.graph].file))
+        path = Path(scratch) / f"{phase.graph}.onnx"
+        model = load(bundle.file(manifest.graphs[phase.graph].file))
         save(model, path)
         if cut_phases(model) is None:
             note = "the network itself computes the phase, so that it cannot be cut out"
-        program, parted = part_phases(manifest.program, each.graph, path)
+        program, parted = part_phases(manifest.program, phase.graph, path)
         if not parted:
             note = note or "the graph runs in a loop, which a program cannot share between two graphs"
         try:
             plain = _actions(bundle, {}, observations, dict.fromkeys(manifest.graphs, ""))
             now = _actions(bundle, {}, observations, {})
-            replaced = {each.graph: path, **{name: path.with_name(f"{name}.onnx") for name in parted}}
+            replaced = {phase.graph: path, **{name: path.with_name(f"{name}.onnx") for name in parted}}
             cut = _actions(bundle, replaced, observations, {}, program) if parted else []
         except VlatoolError as error:
-            return replace(each, note=f"not measured: {error.message}")
-    return replace(each, error=_error(now, plain), cut=_error(cut, plain) if cut else float("nan"), note=note)
+            return replace(phase, note=f"not measured: {error.message}")
+    return replace(phase, error=_error(now, plain), cut=_error(cut, plain) if cut else float("nan"), note=note)
 
 
 def _actions(
@@ -143,45 +132,41 @@ def _actions(
     for name, path in replaced.items():
         sessions.setdefault(name, library(path, 1, ""))
     policy = Policy(bundle, Program(program or manifest.program, sessions, seed=0), engine)
-    found = []
-    for observation in observations:
-        policy.reset()
-        found.append(np.array(policy.infer(observation).outputs[manifest.spec.action.name]))
-    return found
+    return raw_actions(policy, observations)
 
 
 def _error(got: Sequence[Any], wanted: Sequence[Any]) -> float:
     return float(np.mean([relative_error(*pair) for pair in zip(got, wanted, strict=True)]))
 
 
-def told(found: Sequence[Phases], again: str) -> list[str]:
+def phase_sentences(known: Sequence[Phases], again: str) -> list[str]:
     """Return the sentences for a reader, the bad news first.
 
     Args:
-        found: From ``phases``.
+        known: From ``phases``.
         again: The command that makes the bundle again.
     """
     sentences = []
-    for each in sorted(found, key=lambda item: not item.nodes):
-        if each.kept:
-            text = f"The phases of {each.graph} stay in float32, in the graph {each.kept}: {REASON}."
-            if not each.nodes and each.error == each.error:
-                text += f" Measured: relative error {each.cut:.3g}; it would be {each.error:.3g} all in bfloat16."
+    for phase in sorted(known, key=lambda item: not item.nodes):
+        if phase.kept:
+            text = f"The phases of {phase.graph} stay in float32, in the graph {phase.kept}: {REASON}."
+            if not phase.nodes and phase.error == phase.error:
+                text += f" Measured: relative error {phase.cut:.3g}; it would be {phase.error:.3g} all in bfloat16."
             sentences.append(text)
-        if each.nodes:
-            sentences.append(_ruined(each, again))
+        if phase.nodes:
+            sentences.append(_ruined(phase, again))
     return sentences
 
 
-def _ruined(each: Phases, again: str) -> str:
-    nodes = ", ".join(each.nodes[:3]) + (f" and {len(each.nodes) - 3} more" if len(each.nodes) > 3 else "")
-    text = f"{each.graph} computes {nodes} of its inputs in bfloat16, which ruins such phases: {REASON}."
-    if each.error == each.error:
-        text += f" Measured: relative error {each.error:.3g} now"
-        text += f", {each.cut:.3g} with the phases in float32" if each.cut == each.cut else ""
+def _ruined(phase: Phases, again: str) -> str:
+    nodes = ", ".join(phase.nodes[:3]) + (f" and {len(phase.nodes) - 3} more" if len(phase.nodes) > 3 else "")
+    text = f"{phase.graph} computes {nodes} of its inputs in bfloat16, which ruins such phases: {REASON}."
+    if phase.error == phase.error:
+        text += f" Measured: relative error {phase.error:.3g} now"
+        text += f", {phase.cut:.3g} with the phases in float32" if phase.cut == phase.cut else ""
         text += "."
-    if each.note:
-        text += f" {each.note[0].upper()}{each.note[1:]}."
-    elif each.cut < each.error:
+    if phase.note:
+        text += f" {phase.note[0].upper()}{phase.note[1:]}."
+    elif phase.cut < phase.error:
         text += f" Make it again: {again}"
     return text

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from vlatool.errors import require
 from vlatool.explain._operators import Operator
+from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.runtime.engine import FLOAT32, MOVES, Engine, engine_class
 
 QUANTIZERS = ("QuantizeLinear", "DynamicQuantizeLinear")
 COMPUTING = ("MatMul", "Gemm", "Conv", "ConvTranspose", "Einsum", "Attention")
 INTEGER = ("MatMulIntegerToFloat", "MatMulInteger", "ConvInteger", "DynamicQuantizeMatMul")
+EIGHT_BITS = (2, 3)  # onnx.TensorProto: uint8, int8
 LONGEST = 4
 """Operators between a DequantizeLinear and the next QuantizeLinear that still count as one island."""
 
@@ -55,26 +58,12 @@ class Fallback:
     ms: float
 
 
-class QuantizedGraph:
+class QuantizedGraph(OnnxGraph):
     """The nodes of an ONNX file, seen from its int8 layers."""
 
     def __init__(self, name: str, path: Path) -> None:
-        onnx = require("onnx", "build")
-        self.name = name
-        model = onnx.load(str(path), load_external_data=False)
-        graph = model.graph
-        self.nodes = list(graph.node)
-        self.types = {tensor.name: tensor.data_type for tensor in graph.initializer}
-        self.producers = {name: node for node in self.nodes for name in node.output if name}
-        self.readers: dict[str, list[Any]] = {}
-        for node in self.nodes:
-            for value in node.input:
-                self.readers.setdefault(value, []).append(node)
-        self._zeros = {
-            tensor.name: onnx.numpy_helper.to_array(tensor)
-            for tensor in graph.initializer
-            if tensor.data_type in (2, 3) and len(tensor.dims) == 0
-        }
+        super().__init__(require("onnx", "build").load(str(path), load_external_data=False))
+        self.name, self.nodes = name, list(self.graph.node)
 
     def layers(self) -> list[str]:
         """Return the names of the layers that are int8 in the file."""
@@ -87,22 +76,19 @@ class QuantizedGraph:
 
     def islands(self) -> list[Island]:
         """Return the round trips: int8 -> float -> int8 with nothing but light operators in between."""
-        found = []
-        for node in self.nodes:
-            if self._activation(node):
-                found += self._ways(node)
-        return found
+        return [island for node in self.nodes if self._activation(node) for island in self._ways(node)]
 
     def asymmetric(self) -> list[str]:
         """Return the quantizers of activations with a zero point other than 0."""
-        return [
-            node.name
-            for node in self.nodes
-            if node.op_type == "QuantizeLinear" and len(node.input) > 2 and self._zeros.get(node.input[2], 0) != 0
-        ]
+        quantizers = [node for node in self.nodes if node.op_type == "QuantizeLinear" and len(node.input) > 2]
+        return [node.name for node in quantizers if node.input[2] in self.constants and self._offset(node.input[2])]
+
+    def _offset(self, zero: str) -> bool:
+        tensor = self.constants[zero]
+        return tensor.data_type in EIGHT_BITS and not tensor.dims and bool(self.array(zero))
 
     def _activation(self, node: Any) -> bool:
-        return node.op_type == "DequantizeLinear" and node.input[0] not in self.types
+        return node.op_type == "DequantizeLinear" and node.input[0] not in self.constants
 
     def _paired(self, node: Any) -> bool:
         """Whether both operands of a float layer are dequantized, perhaps moved since."""
@@ -120,77 +106,63 @@ class QuantizedGraph:
 
     def _ways(self, start: Any) -> list[Island]:
         """Follow a dequantized value to each QuantizeLinear that it reaches without a heavy layer on the way."""
-        found = []
+        islands = []
         pending: list[tuple[str, tuple[Any, ...]]] = [(start.output[0], ())]
         while pending:
             value, way = pending.pop()
-            for reader in self.readers.get(value, ()):
+            for reader in self.readers[value]:
                 if reader.op_type in QUANTIZERS:
                     names = tuple(node.name for node in (start, *way, reader))
                     kinds = tuple(node.op_type for node in way)
-                    found.append(Island(self.name, start.name, kinds, reader.name, names))
+                    islands.append(Island(self.name, start.name, kinds, reader.name, names))
                 elif reader.op_type not in (*COMPUTING, *INTEGER) and len(way) < LONGEST:
                     pending.append((reader.output[0], (*way, reader)))
-        return found
+        return islands
 
 
 def timed(islands: Iterable[Island], operators: Sequence[Operator]) -> list[Island]:
     """Return the islands with what their nodes cost in the profile, the dearest first."""
-    spent: dict[tuple[str, str], float] = {}
-    for each in operators:
-        spent[each.graph, each.name] = spent.get((each.graph, each.name), 0.0) + each.ms
-    made = [
-        Island(
-            each.graph,
-            each.start,
-            each.between,
-            each.end,
-            each.nodes,
-            sum(spent.get((each.graph, name), 0.0) for name in each.nodes),
-        )
-        for each in islands
-    ]
-    return sorted(made, key=lambda each: -each.ms)
+    spent: Counter[tuple[str, str]] = Counter()
+    for operator in operators:
+        spent[operator.graph, operator.name] += operator.ms  # type: ignore[assignment]
+    costs = [replace(island, ms=sum(spent[island.graph, name] for name in island.nodes)) for island in islands]
+    return sorted(costs, key=lambda island: -island.ms)
 
 
 def fallbacks(graph: QuantizedGraph, operators: Sequence[Operator], engine: str) -> list[Fallback]:
     """Return the int8 layers of a file that the engine did not run as fast int8 kernels, the dearest first."""
-    own = [each for each in operators if each.graph == graph.name]
-    found = [*_in_float(graph, own), *_weights(graph, own)]
-    found += _slow(graph, own, engine_class(engine))
-    return sorted(found, key=lambda each: -each.ms)
+    own = [operator for operator in operators if operator.graph == graph.name]
+    fallen = [*_in_float(graph, own), *_weights(graph, own), *_slow(graph, own, engine_class(engine))]
+    return sorted(fallen, key=lambda fallback: -fallback.ms)
 
 
-def _in_float(graph: QuantizedGraph, operators: Sequence[Operator]) -> list[Fallback]:
-    """Find layers that are int8 in the file and a float product in the profile."""
+def _in_float(graph: QuantizedGraph, operators: Sequence[Operator]) -> Iterator[Fallback]:
+    """Yield layers that are int8 in the file and a float product in the profile."""
     layers = set(graph.layers())
     why = "int8 in the file, computed in float: the engine did not fuse its quantize-dequantize pairs"
-    found = []
-    for each in operators:
-        layer = next((name for name in (each.name, each.name.partition("/MatMul")[0]) if name in layers), "")
-        layer = layer or next((name for name in layers if each.name.startswith((f"{name}/", f"{name}_token_"))), "")
-        if each.product and each.precision == FLOAT32 and layer:
-            found.append(Fallback(graph.name, layer, why, each.ms))
-    return found
+    for operator in operators:
+        name = operator.name
+        layer = next((known for known in (name, name.partition("/MatMul")[0]) if known in layers), "")
+        layer = layer or next((known for known in layers if name.startswith((f"{known}/", f"{known}_token_"))), "")
+        if operator.product and operator.precision == FLOAT32 and layer:
+            yield Fallback(graph.name, layer, why, operator.ms)
 
 
-def _weights(graph: QuantizedGraph, operators: Sequence[Operator]) -> list[Fallback]:
-    """Find weights that are dequantized at every inference."""
-    stored = {
-        node.name: node for node in graph.nodes if node.op_type == "DequantizeLinear" and node.input[0] in graph.types
-    }
-    why = "its int8 weight is dequantized to float at every inference"
-    found = []
-    for each in operators:
-        node = stored.get(each.name)
-        if node is not None and each.kind == "DequantizeLinear":
-            readers = graph.readers.get(node.output[0], [])
-            found.append(Fallback(graph.name, readers[0].name if readers else each.name, why, each.ms))
-    return found
+def _weights(graph: QuantizedGraph, operators: Sequence[Operator]) -> Iterator[Fallback]:
+    """Yield weights that are dequantized at every inference."""
+    quantized = [node for node in graph.nodes if node.op_type == "DequantizeLinear" and not graph._activation(node)]
+    stored = {node.name: node.output[0] for node in quantized}
+    for operator in operators:
+        if operator.kind == "DequantizeLinear" and operator.name in stored:
+            readers = graph.readers[stored[operator.name]]
+            layer = readers[0].name if readers else operator.name
+            yield Fallback(graph.name, layer, "its int8 weight is dequantized to float at every inference", operator.ms)
 
 
-def _slow(graph: QuantizedGraph, operators: Sequence[Operator], library: type[Engine]) -> list[Fallback]:
-    """Find int8 nodes that do not run as the engine's fast kernels, as it says itself."""
+def _slow(graph: QuantizedGraph, operators: Sequence[Operator], library: type[Engine]) -> Iterator[Fallback]:
+    """Yield int8 nodes that do not run as the engine's fast kernels, as it says itself."""
     zero_points = len(graph.asymmetric())
-    told = ((each, library.slow(each.node, each.precision, each.product, zero_points)) for each in operators)
-    return [Fallback(graph.name, each.name, why, each.ms) for each, why in told if why]
+    for operator in operators:
+        why = library.slow(operator.node, operator.precision, operator.product, zero_points)
+        if why:
+            yield Fallback(graph.name, operator.name, why, operator.ms)

@@ -97,8 +97,21 @@ def profile(
         turns: Counter[str] = Counter()
         for step in bundle.manifest.program:
             turns[step.graph] += step.repeat
-        found = [each for name, session in sessions.items() for each in _operators(name, session, turns[name], library)]
-    return sorted(found, key=lambda each: -each.ms)
+        operators = [
+            operator
+            for name, session in sessions.items()
+            for operator in _operators(name, session, turns[name], library)
+        ]
+    return sorted(operators, key=lambda operator: -operator.ms)
+
+
+def raw_actions(policy: Policy, observations: Iterable[Mapping[str, Any]]) -> list[Any]:
+    """Return the raw action of each observation, each an episode of its own."""
+    actions = []
+    for observation in observations:
+        policy.reset()
+        actions.append(np.array(policy.infer(observation).outputs[policy.spec.action.name]))
+    return actions
 
 
 def reference_engine(bundle: Bundle) -> str:
@@ -135,9 +148,9 @@ def shares(operators: Iterable[Operator]) -> dict[str, float]:
     """Return precision -> share of the time (0-1), the groups first and in their order."""
     spent: Counter[str] = Counter()
     listed = list(operators)
-    total = sum(each.ms for each in listed) or 1.0
-    for each in listed:
-        spent[each.precision] += each.ms  # type: ignore[assignment]
+    total = sum(operator.ms for operator in listed) or 1.0
+    for operator in listed:
+        spent[operator.precision] += operator.ms  # type: ignore[assignment]
     order = [*(group for group in GROUPS if group in spent), *(name for name in spent if name not in GROUPS)]
     return {name: spent[name] / total for name in order}
 
@@ -145,10 +158,10 @@ def shares(operators: Iterable[Operator]) -> dict[str, float]:
 def table(operators: Iterable[Operator], most: int = 14) -> list[dict[str, Any]]:
     """Return rows of operator type, calls, ms, share (per cent) and effective precision; the slowest first."""
     sums: dict[tuple[str, str], list[float]] = defaultdict(lambda: [0.0, 0.0])
-    for each in operators:
-        found = sums[each.kind, each.precision]
-        found[0] += each.calls
-        found[1] += each.ms
+    for operator in operators:
+        row = sums[operator.kind, operator.precision]
+        row[0] += operator.calls
+        row[1] += operator.ms
     total = sum(spent for _, spent in sums.values()) or 1.0
     ordered = sorted(sums.items(), key=lambda item: -item[1][1])
     rows = [_table_row(kind, precision, calls, spent, total) for (kind, precision), (calls, spent) in ordered[:most]]

@@ -82,23 +82,23 @@ def _stage(name: str, options: Mapping[str, Any]) -> tuple[Stage | None, tuple[s
         return None, (*notes, error.message)
 
 
-def find_baseline(bundle: Bundle, made: Origin, given: Path | None) -> Bundle | None:
+def find_baseline(bundle: Bundle, quantization: Origin, path: Path | None) -> Bundle | None:
     """Return the float32 bundle that a bundle was quantized from: the one given, else one in the cache.
 
     Raises:
         BundleError: when the given one is damaged, or is another policy's.
     """
-    if given is None:
-        return _cached(made.inputs)
-    found = Bundle.open(given)
-    missing = [name for name in bundle.manifest.graphs if name not in found.manifest.graphs and not _phases(name)]
-    if missing or found.manifest.spec != bundle.manifest.spec:
+    if path is None:
+        return _cached(quantization.inputs)
+    baseline = Bundle.open(path)
+    missing = [name for name in bundle.manifest.graphs if name not in baseline.manifest.graphs and not _phases(name)]
+    if missing or baseline.manifest.spec != bundle.manifest.spec:
         what = f"it has no graph '{missing[0]}'" if missing else "its inputs or outputs are others"
         raise BundleError(
-            f"{given} is not what {bundle.path} was made from: {what}.",
+            f"{path} is not what {bundle.path} was made from: {what}.",
             "name the float32 bundle of the same policy: vlatool export SOURCE -o BUNDLE",
         )
-    return found
+    return baseline
 
 
 def _phases(name: str) -> bool:
@@ -110,11 +110,11 @@ def _cached(hashes: tuple[str, ...]) -> Bundle | None:
     for path in sorted((cache_directory() / "stages").glob(f"*/{MANIFEST}")):
         if "sha256:" + hashlib.sha256(path.read_bytes()).hexdigest() in hashes:
             try:
-                found = Bundle.open(path.parent)
+                bundle = Bundle.open(path.parent)
             except BundleError:
                 continue
-            if found.manifest.graphs:
-                return found
+            if bundle.manifest.graphs:
+                return bundle
     return None
 
 
@@ -126,16 +126,16 @@ def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, 
     """
     if data is not None:
         return Observations(list(recorded_observations(bundle, count, data)), data.name)
-    sources = [each for each in (bundle, baseline) if each is not None]
+    sources = [candidate for candidate in (bundle, baseline) if candidate is not None]
     for source in sources:
         if EVALUATION in source.manifest.files:
-            found = list(recorded_observations(source, count, source.path / EVALUATION))
-            return Observations(found, "recorded observations that calibration has not seen")
+            values = list(recorded_observations(source, count, source.path / EVALUATION))
+            return Observations(values, "recorded observations that calibration has not seen")
     for source in sources:
-        if found := list(recorded_observations(source, count)):
-            return Observations(found, "the calibration's own observations")
-    made = synthetic_observations(bundle.manifest.spec, count)
-    return Observations(made, "synthetic observations", recorded=False)
+        if values := list(recorded_observations(source, count)):
+            return Observations(values, "the calibration's own observations")
+    values = synthetic_observations(bundle.manifest.spec, count)
+    return Observations(values, "synthetic observations", recorded=False)
 
 
 def sensitivity_stage(stage: Stage | None) -> StaticInt8 | None:

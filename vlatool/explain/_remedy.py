@@ -13,7 +13,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.explain._islands import Fallback
-from vlatool.explain._operators import reference_engine
+from vlatool.explain._operators import raw_actions, reference_engine
 from vlatool.measurement.interleaved import Contestant, run_interleaved
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
@@ -84,20 +84,27 @@ class Contest:
     @property
     def suggested(self) -> Candidate | None:
         """Return the candidate that helps most for the least change; None when none does."""
-        fair = [each for each in self.others if each.error <= self.now.error * NEAR]
-        exact = [each for each in fair if each.error <= BETTER * self.now.error and each.ms <= SLOWER * self.now.ms]
+        fair = [candidate for candidate in self.others if candidate.error <= self.now.error * NEAR]
+        exact = [
+            candidate
+            for candidate in fair
+            if candidate.error <= BETTER * self.now.error and candidate.ms <= SLOWER * self.now.ms
+        ]
         if exact:
-            least = min(each.error for each in exact)
-            return min((each for each in exact if each.error <= NEAR * least), key=lambda each: each.layers)
-        fast = [each for each in fair if each.ms <= BETTER * self.now.ms]
-        return min(fast, key=lambda each: each.ms) if fast else None
+            least = min(candidate.error for candidate in exact)
+            return min(
+                (candidate for candidate in exact if candidate.error <= NEAR * least),
+                key=lambda candidate: candidate.layers,
+            )
+        fast = [candidate for candidate in fair if candidate.ms <= BETTER * self.now.ms]
+        return min(fast, key=lambda candidate: candidate.ms) if fast else None
 
 
-def plans(stage: Stage | None, worst: Sequence[LayerError], found: Sequence[Fallback], engine: str) -> list[Candidate]:
-    """Return what is worth trying for a stage: the worst layers in float32, other ranges, the layout for the engine."""
+def plans(stage: Stage | None, worst: Sequence[LayerError], fallen: Sequence[Fallback], engine: str) -> list[Candidate]:
+    """Return the candidates for a stage: the worst layers in float32, other ranges, the layout for the engine."""
     tried: list[Candidate] = []
     fixed, before = stage, ""
-    if isinstance(stage, StaticInt8) and found:
+    if isinstance(stage, StaticInt8) and fallen:
         integer = next((name for name, layout in engine_class(engine).layouts.items() if layout.integer), stage.layout)
         if stage.layout != integer:
             fixed, before = stage.model_copy(update={"layout": integer}), f"layout {integer}"
@@ -108,7 +115,7 @@ def plans(stage: Stage | None, worst: Sequence[LayerError], found: Sequence[Fall
     if isinstance(fixed, StaticInt8 | DynamicInt8):
         for count in MOST_LAYERS:
             if count < len(worst):
-                names = tuple(pattern(each.name) for each in worst[:count])
+                names = tuple(pattern(layer.name) for layer in worst[:count])
                 words = f"without {count} layer{'s' if count > 1 else ''}"
                 changed = fixed.model_copy(update={"exclude": (*fixed.exclude, *names)})
                 tried.append(Candidate(", ".join(filter(None, (before, words))), changed, count))
@@ -145,35 +152,32 @@ def measure(
     """
     now = Candidate("as it is", None, bundle=bundle)
     base = Candidate("float32", None, bundle=baseline) if baseline is not None else None
-    for number, each in enumerate(tried):
-        context.tell(f"making a candidate: {each.name}", None)
-        if baseline is None or not isinstance(each.stage, Transform):
+    for number, candidate in enumerate(tried):
+        context.tell(f"making a candidate: {candidate.name}", None)
+        if baseline is None or not isinstance(candidate.stage, Transform):
             continue
         try:
-            each.bundle = run_transform(each.stage, baseline, scratch / str(number), Context())
+            candidate.bundle = run_transform(candidate.stage, baseline, scratch / str(number), Context())
         except VlatoolError as error:
-            each.failed = error.message
-    made = [each for each in (base, now, *tried) if each is not None and each.bundle is not None]
+            candidate.failed = error.message
+    candidates = [
+        candidate for candidate in (base, now, *tried) if candidate is not None and candidate.bundle is not None
+    ]
     reference: list[Any] = []
-    for each in made:
-        if each.bundle is None:
+    for candidate in candidates:
+        if candidate.bundle is None:
             continue
-        context.tell(f"errors of the candidate: {each.name}", None)
-        engine = reference_engine(bundle) if each is base else ""
-        policy = Policy.open(each.bundle, engine=engine, threads=threads, seed=0)
-        outputs = _outputs(policy, observations)
+        context.tell(f"errors of the candidate: {candidate.name}", None)
+        engine = reference_engine(bundle) if candidate is base else ""
+        policy = Policy.open(candidate.bundle, engine=engine, threads=threads, seed=0)
+        outputs = raw_actions(policy, observations)
         if base is not None:
             reference = reference or outputs
-            each.error = float(np.mean([relative_error(*pair) for pair in zip(outputs, reference, strict=True)]))
-        each.contestant = Contestant(each.name, each.bundle, policy, [dict(item) for item in observations])
-    run_interleaved([each.contestant for each in made if each.contestant], ITERATIONS, 5, context.tell)
-    return Contest(now, base, [each for each in tried if each.bundle is not None])
-
-
-def _outputs(policy: Policy, observations: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """Return the raw action of each observation, each an episode of its own."""
-    found = []
-    for observation in observations:
-        policy.reset()
-        found.append(np.array(policy.infer(observation).outputs[policy.spec.action.name]))
-    return found
+            candidate.error = float(np.mean([relative_error(*pair) for pair in zip(outputs, reference, strict=True)]))
+        candidate.contestant = Contestant(
+            candidate.name, candidate.bundle, policy, [dict(item) for item in observations]
+        )
+    run_interleaved(
+        [candidate.contestant for candidate in candidates if candidate.contestant], ITERATIONS, 5, context.tell
+    )
+    return Contest(now, base, [candidate for candidate in tried if candidate.bundle is not None])

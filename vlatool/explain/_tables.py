@@ -22,114 +22,117 @@ FASTER = 4.0
 """What int8 does with one instruction of the same width that float32 does with four."""
 
 
-def layers_table(found: Sequence[LayerError], several: bool) -> list[dict[str, Any]]:
+def layers_table(layers: Sequence[LayerError], several: bool) -> list[dict[str, Any]]:
     """Return the ten worst layers: error, largest error of an element, flips, jump, share of the MACs."""
     rows = []
-    names = short_names(found)
-    for each in found[:MOST]:
-        name = names[each.name]
-        row: dict[str, Any] = {"layer": f"{each.graph}: {name}" if several else name}
-        row |= {"error %": round(100 * each.error, 3), "flips %": round(100 * each.flips, 1)}
-        row |= {"jump %": round(100 * each.jump, 1), "MACs %": round(100 * each.macs_share, 2)}
+    names = short_names(layers)
+    for layer in layers[:MOST]:
+        name = names[layer.name]
+        row: dict[str, Any] = {"layer": f"{layer.graph}: {name}" if several else name}
+        row |= {"error %": round(100 * layer.error, 3), "flips %": round(100 * layer.flips, 1)}
+        row |= {"jump %": round(100 * layer.jump, 1), "MACs %": round(100 * layer.macs_share, 2)}
         rows.append(row)
     return rows
 
 
-def short_names(found: Sequence[LayerError]) -> dict[str, str]:
+def short_names(layers: Sequence[LayerError]) -> dict[str, str]:
     """Return node name -> name of its module (``a.b`` of ``a.b/MatMul``) where no other layer has the same one."""
-    modules = Counter(each.name.rpartition("/")[0] for each in found)
-    made = {}
-    for each in found:
-        module = each.name.rpartition("/")[0]
-        made[each.name] = module if module and modules[module] == 1 else each.name
-    return made
+    modules = Counter(layer.name.rpartition("/")[0] for layer in layers)
+    names = {}
+    for layer in layers:
+        module = layer.name.rpartition("/")[0]
+        names[layer.name] = module if module and modules[module] == 1 else layer.name
+    return names
 
 
-def elements_table(found: Sequence[LayerError], units: Mapping[str, str]) -> list[dict[str, Any]]:
+def elements_table(layers: Sequence[LayerError], units: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return what the three worst layers do to each element of the action, in its unit."""
-    worst = [each for each in found[:3] if each.elements]
-    names = short_names(found)
+    worst = [layer for layer in layers[:3] if layer.elements]
+    names = short_names(layers)
     rows: list[dict[str, Any]] = []
     labels = list(worst[0].elements) if worst else []
     largest = sorted(labels, key=lambda label: -worst[0].elements[label])[:MOST_ELEMENTS]
     for label in (label for label in labels if label in largest):
         unit = units.get(label, "")
         shown, factor = ("mm", 1000.0) if unit == "m" else (unit, 1.0)
-        numbers = {names[each.name]: float(f"{each.elements[label] * factor:.3g}") for each in worst}
+        numbers = {names[layer.name]: float(f"{layer.elements[label] * factor:.3g}") for layer in worst}
         rows.append({"element": label, "unit": shown, **numbers})
     return rows
 
 
-def layers_told(found: Sequence[LayerError]) -> str:
+def layers_sentence(layers: Sequence[LayerError]) -> str:
     """Return the sentence about the layers that cost the accuracy."""
-    worst = found[0]
-    squares = sum(each.error**2 for each in found) or 1.0
-    text = f"The layer that costs most is '{short_names(found)[worst.name]}': alone in int8 it moves the action by"
+    worst = layers[0]
+    squares = sum(layer.error**2 for layer in layers) or 1.0
+    text = f"The layer that costs most is '{short_names(layers)[worst.name]}': alone in int8 it moves the action by"
     text += f" {worst.error:.2%}"
     text += f" ({worst.macs_share:.1%} of its graph's MACs)" if not math.isnan(worst.macs_share) else ""
-    if len(found) > 2:
-        middle = sorted(each.error for each in found)[len(found) // 2]
-        text += f"; the middle one of {len(found)} by {middle:.2%}"
+    if len(layers) > 2:
+        middle = sorted(layer.error for layer in layers)[len(layers) // 2]
+        text += f"; the middle one of {len(layers)} by {middle:.2%}"
     share = worst.error**2 / squares
     return f"{text}. It makes {share:.0%} of the sum of squared errors of all layers (on {worst.samples} observations)."
 
 
-def time_told(operators: Sequence[Operator]) -> str:
+def time_sentence(operators: Sequence[Operator]) -> str:
     """Return the sentence about where the time goes."""
-    total = sum(each.ms for each in operators)
+    total = sum(operator.ms for operator in operators)
     parts = [f"{share:.0%} {name}" for name, share in shares(operators).items() if share >= 0.005]
     return f"Of {total:.3g} ms inside operators: {', '.join(parts)}."
 
 
-def islands_table(found: Sequence[Island]) -> list[dict[str, Any]]:
+def islands_table(islands: Sequence[Island]) -> list[dict[str, Any]]:
     """Return the ten dearest round trips."""
     return [
         {
-            "from": each.start.removesuffix("/dequantize"),
-            "in float": " ".join(each.between) or "nothing",
-            "to": each.end.removesuffix("/quantize"),
-            "ms": round(each.ms, 4),
+            "from": island.start.removesuffix("/dequantize"),
+            "in float": " ".join(island.between) or "nothing",
+            "to": island.end.removesuffix("/quantize"),
+            "ms": round(island.ms, 4),
         }
-        for each in found[:MOST]
+        for island in islands[:MOST]
     ]
 
 
-def islands_told(found: Sequence[Island], pairs: tuple[int, int], operators: Sequence[Operator]) -> str:
+def islands_sentence(islands: Sequence[Island], pairs: tuple[int, int], operators: Sequence[Operator]) -> str:
     """Return the sentence about round trips through float."""
-    total = sum(each.ms for each in operators) or 1.0
+    total = sum(part.ms for part in operators) or 1.0
     text = f"The file quantizes {pairs[0]} values and dequantizes {pairs[1]} at run time"
-    if not found:
+    if not islands:
         return f"{text}; no value goes from int8 to float and back without a layer in between."
-    spent = sum(each.ms for each in found)
-    direct = sum(not each.between for each in found)
-    text += f"; {len(found)} of them go int8 -> float -> int8 with only light operators in between"
+    spent = sum(part.ms for part in islands)
+    direct = sum(not part.between for part in islands)
+    text += f"; {len(islands)} of them go int8 -> float -> int8 with only light operators in between"
     text += f" ({direct} with none)" if direct else ""
     if not spent:
         return f"{text}. The profile shows none of them: the engine fused them, so they cost nothing."
     return f"{text}. They take {spent:.3g} ms, {spent / total:.1%} of the time."
 
 
-def fallbacks_table(found: Sequence[Fallback]) -> list[dict[str, Any]]:
+def fallbacks_table(fallen: Sequence[Fallback]) -> list[dict[str, Any]]:
     """Return the ten dearest layers that fell back."""
-    return [{"layer": each.layer, "what happened": each.why, "ms": round(each.ms, 4)} for each in found[:MOST]]
+    return [
+        {"layer": fallback.layer, "what happened": fallback.why, "ms": round(fallback.ms, 4)}
+        for fallback in fallen[:MOST]
+    ]
 
 
-def fallbacks_told(found: Sequence[Fallback], operators: Sequence[Operator]) -> str:
+def fallbacks_sentence(fallen: Sequence[Fallback], operators: Sequence[Operator]) -> str:
     """Return the sentence about layers that did not run as fast int8 kernels."""
-    total = sum(each.ms for each in operators) or 1.0
-    if not found:
+    total = sum(part.ms for part in operators) or 1.0
+    if not fallen:
         return "Every layer that is int8 in the file runs as an int8 kernel."
     whys: dict[str, list[Fallback]] = {}
-    for each in found:
-        whys.setdefault(each.why, []).append(each)
+    for part in fallen:
+        whys.setdefault(part.why, []).append(part)
     parts = []
     for why, members in whys.items():
-        spent = sum(each.ms for each in members)
+        spent = sum(part.ms for part in members)
         parts.append(f"{len(members)} layers: {why} ({spent:.3g} ms, {spent / total:.0%} of the time)")
     return "Fell back: " + "; ".join(parts) + "."
 
 
-def limit_told(
+def limit_sentences(
     operators: Sequence[Operator], before: Sequence[Operator], macs: Mapping[str, int], speed: float
 ) -> list[str]:
     """Return why int8 could not be faster: Amdahl's law on the measured time of both bundles.
@@ -140,18 +143,18 @@ def limit_told(
         macs: Precision -> multiply-accumulates of one inference of the bundle.
         speed: Measured speed-up over float32; that of the profiles when NaN.
     """
-    found = []
-    products = sum(each.ms for each in operators if each.product)
-    total = sum(each.ms for each in operators) or 1.0
+    sentences = []
+    products = sum(operator.ms for operator in operators if operator.product)
+    total = sum(operator.ms for operator in operators) or 1.0
     all_macs = sum(macs.values()) or 1
     kinds = ", ".join(f"{count / all_macs:.0%} {kind}" for kind, count in macs.items() if count)
     text = f"By count the MACs are {kinds}; matrix products and convolutions take {products / total:.0%} of the time"
     text += f", at {all_macs / products / 1e6:.3g} GMAC/s" if products and macs else ""
-    heavy = sum(each.ms for each in before if each.product)
+    heavy = sum(operator.ms for operator in before if operator.product)
     text += f" (float32: {all_macs / heavy / 1e6:.3g})" if heavy and products and macs else ""
-    found.append(f"{text}.")
+    sentences.append(f"{text}.")
     if before:
-        base = sum(each.ms for each in before) or 1.0
+        base = sum(operator.ms for operator in before) or 1.0
         actual = base / total if math.isnan(speed) else speed
         rest = base - heavy
         ideal, most = base / (rest + heavy / FASTER), base / rest if rest else math.inf
@@ -162,47 +165,47 @@ def limit_told(
         grown = total - products - rest
         if grown > 0.02 * total:
             text += f" What is not a product takes {grown:.2g} ms more than in float32: quantizing and moving data."
-        found.append(text)
-    return found
+        sentences.append(text)
+    return sentences
 
 
 def precision_table(operators: Sequence[Operator]) -> list[dict[str, Any]]:
     """Return ms and share of the time by effective precision."""
-    total = sum(each.ms for each in operators) or 1.0
-    found = shares(operators)
-    order = [*GROUPS, *(name for name in found if name not in GROUPS)]
+    total = sum(operator.ms for operator in operators) or 1.0
+    time_shares = shares(operators)
+    order = [*GROUPS, *(name for name in time_shares if name not in GROUPS)]
     return [
-        {"computed as": name, "ms": round(found[name] * total, 4), "share %": round(100 * found[name], 1)}
+        {"computed as": name, "ms": round(time_shares[name] * total, 4), "share %": round(100 * time_shares[name], 1)}
         for name in order
-        if name in found
+        if name in time_shares
     ]
 
 
-def candidate_row(each: Candidate, contest: Contest, where: Mapping[str, Any], source: str) -> Row:
+def candidate_row(candidate: Candidate, contest: Contest, where: Mapping[str, Any], source: str) -> Row:
     """Return the row of a candidate, of the bundle as it is, or of the float32 bundle."""
     measurements = []
     samples: list[float] = []
     reference = contest.baseline or contest.now
-    if each.contestant is not None and reference.contestant is not None:
-        samples = each.contestant.samples
+    if candidate.contestant is not None and reference.contestant is not None:
+        samples = candidate.contestant.samples
         measurements = latency_measurements(samples)
-        if each is not reference:
-            measurements.append(speedup(each.contestant, reference.contestant))
-    if not math.isnan(each.error) and each is not contest.baseline:
+        if candidate is not reference:
+            measurements.append(speedup(candidate.contestant, reference.contestant))
+    if not math.isnan(candidate.error) and candidate is not contest.baseline:
         note = "mean over observations of |difference|2 / |raw action|2, to float32"
-        count = len(each.contestant.observations) if each.contestant else 0
-        measurements.append(Measurement("raw_relative_error", each.error, "1", samples=count, note=note))
+        count = len(candidate.contestant.observations) if candidate.contestant else 0
+        measurements.append(Measurement("raw_relative_error", candidate.error, "1", samples=count, note=note))
     role, reason = "subject", ""
-    if each is contest.baseline:
+    if candidate is contest.baseline:
         role = "baseline"
-    elif each is contest.suggested:
+    elif candidate is contest.suggested:
         role = "chosen"
-    if each.stage is not None:
-        reason = command(each.stage, source)
-    return Row(each.name, role, reason, tuple(measurements), {"latency_ms": samples} if samples else {}, where)
+    if candidate.stage is not None:
+        reason = command(candidate.stage, source)
+    return Row(candidate.name, role, reason, tuple(measurements), {"latency_ms": samples} if samples else {}, where)
 
 
-def suggested(contest: Contest, source: str) -> list[str]:
+def suggestion(contest: Contest, source: str) -> list[str]:
     """Return the sentence with the command that is suggested; none when nothing helps enough."""
     best = contest.suggested
     if best is None or best.stage is None:
@@ -210,24 +213,24 @@ def suggested(contest: Contest, source: str) -> list[str]:
     return [f"Do this: {command(best.stage, source)} ({_effect(best, contest.now)})."]
 
 
-def tried_told(contest: Contest, worst: Sequence[LayerError]) -> list[str]:
+def trial_sentences(contest: Contest, worst: Sequence[LayerError]) -> list[str]:
     """Return a sentence for each candidate, with what was measured."""
-    found = []
-    for each in contest.others:
-        names = ", ".join(f"'{short_names(worst)[layer.name]}'" for layer in worst[: each.layers])
-        what = each.name.partition("without")[0] + (f"exclude {names}" if each.layers else "")
-        found.append(f"Tried: {what}: {_effect(each, contest.now)}.")
+    sentences = []
+    for candidate in contest.others:
+        names = ", ".join(f"'{short_names(worst)[layer.name]}'" for layer in worst[: candidate.layers])
+        what = candidate.name.partition("without")[0] + (f"exclude {names}" if candidate.layers else "")
+        sentences.append(f"Tried: {what}: {_effect(candidate, contest.now)}.")
     if contest.others and contest.suggested is None:
-        found.append("None of these helps enough to be suggested: the error is spread over many layers.")
-    return found
+        sentences.append("None of these helps enough to be suggested: the error is spread over many layers.")
+    return sentences
 
 
-def _effect(each: Candidate, now: Candidate) -> str:
+def _effect(candidate: Candidate, now: Candidate) -> str:
     """Return error and latency of a candidate beside the bundle as it is, the latency with its 95 % interval."""
-    error = f"error {now.error:.2%} -> {each.error:.2%}"
-    if each.contestant is None or now.contestant is None:
+    error = f"error {now.error:.2%} -> {candidate.error:.2%}"
+    if candidate.contestant is None or now.contestant is None:
         return error
-    ratio = speedup(now.contestant, each.contestant)  # its latency in units of the other's
+    ratio = speedup(now.contestant, candidate.contestant)  # its latency in units of the other's
     change = f"latency {ratio.value - 1:+.0%}"
     if ratio.low is None or ratio.high is None:
         return f"{error}, {change}"

@@ -72,9 +72,9 @@ class ExportOnnx(Transform):
             graphs[name] = self._export(name, session, out)
         carry_over(bundle, out)
         context.tell("checking in ONNX Runtime", None)
-        made = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
-        self._compare(made, observations, expected)
-        return made
+        exported = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
+        self._compare(exported, observations, expected)
+        return exported
 
     def _export(self, name: str, session: TorchSession, out: Path) -> Graph:
         torch = require("torch", "build")
@@ -89,11 +89,11 @@ class ExportOnnx(Transform):
         exported.save(str(out / file), external_data=weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
         return Graph(file, {"float32": 1.0}, self.opset)
 
-    def _compare(self, made: Bundle, observations: list[dict[str, Any]], expected: list[Any]) -> None:
-        policy = Policy.open(made, threads=1, seed=0)
-        for number, (observation, wanted) in enumerate(zip(observations, expected, strict=True)):
-            got = policy.infer(observation).outputs[made.manifest.spec.action.name]
-            error = relative_error(got, wanted)
+    def _compare(self, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any]) -> None:
+        policy = Policy.open(exported, threads=1, seed=0)
+        for number, (observation, reference) in enumerate(zip(observations, expected, strict=True)):
+            got = policy.infer(observation).outputs[exported.manifest.spec.action.name]
+            error = relative_error(got, reference)
             if not error <= self.tolerance:
                 raise GraphError(
                     f"ONNX Runtime and torch differ on calibration sample {number}: relative L2 error {error:.3g}, "

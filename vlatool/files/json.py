@@ -28,16 +28,16 @@ def parse_json(content: bytes, *, strict: bool = False) -> Any:
     if strict:
         numbers = {"parse_constant": _no_constant, "parse_int": _whole, "parse_float": _finite}
     try:
-        found = json.loads(content.decode("utf-8"), object_pairs_hook=_once, **numbers)
+        value = json.loads(content.decode("utf-8"), object_pairs_hook=_once, **numbers)
     except RecursionError:
         raise ValueError("lists and mappings are too deep inside each other") from None
     except MemoryError:
         raise ValueError("it does not fit into the memory") from None
     if strict:
-        _check_depth(found)
+        _check_depth(value)
         if b"\\u" in content:
-            _check_text(found)
-    return found
+            _check_text(value)
+    return value
 
 
 def read_json(content: bytes, where: str, error: type[VlatoolError], fix: str = "", *, strict: bool = False) -> Any:
@@ -53,16 +53,16 @@ def read_json(content: bytes, where: str, error: type[VlatoolError], fix: str = 
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         seen: set[str] = set()
         twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
         raise ValueError(f"the key {shown(twice)} occurs twice")
-    return found
+    return mapping
 
 
 def _no_constant(text: str) -> Any:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")
 
 
 def _whole(text: str) -> int:
@@ -78,23 +78,25 @@ def _finite(text: str) -> float:
     return value
 
 
-def _check_depth(found: Any) -> None:
+def _check_depth(value: Any) -> None:
     """Go through the levels one after the other: what is too deep for a recursion is too deep for others, too."""
     allowed = limit("json_depth")
-    level = [found]
+    level = [value]
     for _ in range(allowed + 1):
-        level = [inner for each in level if isinstance(each, dict | list) for inner in _inner(each)]
+        level = [inner for item in level for inner in _inner(item)]
         if not level:
             return
     raise ValueError(f"more than {allowed} lists and mappings inside each other (the limit 'json_depth')")
 
 
-def _inner(each: dict[str, Any] | list[Any]) -> list[Any]:
-    return [inner for inner in (each.values() if isinstance(each, dict) else each) if isinstance(inner, dict | list)]
+def _inner(value: Any) -> list[Any]:
+    """Return the lists and mappings directly inside a value."""
+    members = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [member for member in members if isinstance(member, dict | list)]
 
 
-def _check_text(found: Any) -> None:
+def _check_text(value: Any) -> None:
     try:
-        json.dumps(found, ensure_ascii=False).encode()
+        json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:
         raise ValueError("half of a character (a surrogate) in a text") from None

@@ -73,8 +73,8 @@ def limit(name: str) -> int:
         >>> limit("files")
         10000
     """
-    told = os.environ.get(VARIABLE)
-    return _told(told).get(name, LIMITS[name].default) if told else LIMITS[name].default
+    text = os.environ.get(VARIABLE)
+    return _told(text).get(name, LIMITS[name].default) if text else LIMITS[name].default
 
 
 def check(name: str, got: int, where: str, error: type[VlatoolError]) -> None:
@@ -100,13 +100,13 @@ def _number(value: int) -> str:
 
 
 def _told(text: str) -> dict[str, int]:
-    found = {}
+    limits = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = part.partition("=")
         if name not in LIMITS:
             raise UsageError(f"{VARIABLE} names the unknown limit '{name}'; {nearest(name, LIMITS)}.")
-        found[name] = _whole(name, value)
-    return found
+        limits[name] = _whole(name, value)
+    return limits
 
 
 def _whole(name: str, value: str) -> int:

@@ -125,8 +125,8 @@ def _foreign_errors(where: str, error: type[VlatoolError]) -> Iterator[None]:
     except VlatoolError:
         raise
     except FOREIGN as foreign:
-        told = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
-        raise error(f"{where} cannot be read: {told}.", "write it again with np.savez") from foreign
+        reason = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
+        raise error(f"{where} cannot be read: {reason}.", "write it again with np.savez") from foreign
 
 
 def _told(error: BaseException) -> str:
@@ -142,7 +142,7 @@ def _stream(source: bytes | str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     handle = os.open(source, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as stream:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise ValueError("it is no regular file")
+            raise ValueError("it is not a regular file")
         yield stream
 
 
@@ -158,7 +158,7 @@ def _with_small_directory(stream: IO[bytes]) -> IO[bytes]:
     if end < 0 or tail[end : end + 4] != b"PK\5\6" or tail[-2:] != b"\0\0":
         end = tail.rfind(b"PK\5\6")
     if end < 0 or end + 22 > len(tail):
-        raise ValueError("it is no zip archive, or its end is missing")
+        raise ValueError("it is not a zip archive, or its end is missing")
     sizes = [struct.unpack_from("<I", tail, end + 12)[0]]
     if b"PK\6\7" in tail[:end]:
         sizes = [struct.unpack_from("<Q", tail, at + 40)[0] for at in _all(tail, b"PK\6\6") if at + 48 <= len(tail)]
@@ -186,7 +186,7 @@ def _members(
     for entry in entries:
         name = entry.filename.removesuffix(".npy")
         if name == entry.filename or name in members:
-            raise error(f"{where} has the entry '{entry.filename[:80]}' twice, or it is no array (NAME.npy).")
+            raise error(f"{where} has the entry '{entry.filename[:80]}' twice, or it is not an array (NAME.npy).")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or entry.flag_bits & 1:
             raise error(f"{where} has '{name[:80]}' encrypted or packed in a way that numpy does not write.")
         members[name] = entry
@@ -237,7 +237,7 @@ def _checked_header(
     if dtype.hasobject:
         raise ValueError("it holds pickled objects, which are refused")
     if dtype.kind not in "biufcSU" or not dtype.itemsize:
-        raise ValueError(f"'{name}' has the dtype {dtype}, which is none of numbers or text")
+        raise ValueError(f"'{name}' has the dtype {dtype}, which is neither numbers nor text")
     start = stream.tell()
     if start + math.prod(shape) * dtype.itemsize != entry.file_size:
         raise ValueError(f"'{name}' declares the shape {str(shape)[:80]}, but has {entry.file_size - start} bytes")
@@ -249,15 +249,15 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     start = stream.read(8)
     size = {b"\1": 2, b"\2": 4}.get(start[6:7], 0)
     if start[:6] != b"\x93NUMPY" or not size:
-        raise ValueError("an entry is no array in the .npy format 1 or 2")
+        raise ValueError("an entry is not an array in the .npy format 1 or 2")
     length = int.from_bytes(stream.read(size), "little")
     if length > HEADER_BYTES:
         raise ValueError(f"the header of an array has {length} bytes; allowed: {HEADER_BYTES}")
-    found = HEADER.fullmatch(stream.read(length).decode("latin-1"))
-    if found is None:
+    match = HEADER.fullmatch(stream.read(length).decode("latin-1"))
+    if match is None:
         raise ValueError("the header of an array is not one of plain numbers or text")
-    shape = tuple(int(axis) for axis in found["shape"].replace(" ", "").split(",") if axis)
-    return shape, found["fortran"] == "True", np.dtype(found["descr"])
+    shape = tuple(int(axis) for axis in match["shape"].replace(" ", "").split(",") if axis)
+    return shape, match["fortran"] == "True", np.dtype(match["descr"])
 
 
 def _fill(stream: IO[bytes], array: Array, name: str) -> None:
@@ -280,7 +280,7 @@ def _sound(array: Array, name: str) -> Array:
     if native.dtype.kind == "U" and native.size:
         codes = native.view(np.uint32)
         if codes.max() > 0x10FFFF or bool(((codes >= 0xD800) & (codes <= 0xDFFF)).any()):
-            raise ValueError(f"'{name}' holds text that is no Unicode")
+            raise ValueError(f"'{name}' holds text that is not valid Unicode")
     if native.dtype.kind == "b" and native.size and int(native.view(np.uint8).max()) > 1:
         raise ValueError(f"'{name}' holds truth values that are neither 0 nor 1")
     return native

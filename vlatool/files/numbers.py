@@ -32,8 +32,8 @@ def _numbers_alone(annotation: Any) -> bool:
 
 
 def _leaves(annotation: Any) -> Iterator[Any]:
-    inner = [each for each in get_args(annotation) if isinstance(each, type) or get_args(each) or each is Any]
-    if not inner:
+    parts = [part for part in get_args(annotation) if isinstance(part, type) or get_args(part) or part is Any]
+    if not parts:
         yield annotation
-    for each in inner:
-        yield from _leaves(each)
+    for part in parts:
+        yield from _leaves(part)

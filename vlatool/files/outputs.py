@@ -51,24 +51,24 @@ def refuse_replacing(
     if not force:
         raise OutputError(f"{final} exists already.", EXISTS)
     if not final.is_dir():
-        raise OutputError(f"{final} is no directory, so --force does not replace it.", "choose another output")
+        raise OutputError(f"{final} is not a directory, so --force does not replace it.", "choose another output")
     if os.path.ismount(final):
         raise OutputError(f"{final} is a file system of its own.", "name a directory on it")
     there = kind_of(final)
     if kind is not None and there and there != kind:
-        wanted = f", not {kind}" if kind else " and nothing of that is to be written"
-        raise OutputError(f"{final}: it is {there}{wanted}.", "give another -o, or remove it yourself")
+        instead = f", not {kind}" if kind else " and nothing of that is to be written"
+        raise OutputError(f"{final}: it is {there}{instead}.", "give another -o, or remove it yourself")
     refuse_foreign(final)
 
 
 def _dear() -> dict[str, Path]:
     """Return directories that are never replaced, and neither is what holds them."""
-    found = {}
+    places = {}
     with contextlib.suppress(OSError):  # it may be gone
-        found["the current directory"] = Path.cwd()
+        places["the current directory"] = Path.cwd()
     with contextlib.suppress(RuntimeError):
-        found["the home directory"] = Path.home()
-    return found
+        places["the home directory"] = Path.home()
+    return places
 
 
 def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) -> None:
@@ -86,16 +86,16 @@ def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) 
         OutputError: naming the input.
     """
     place = Path(os.path.realpath(final))
-    for given in filter(None, map(str, (each for each in inputs if each is not None))):
-        file = next((each for each in (given, given.rpartition(":")[0]) if each and os.path.exists(each)), None)
+    for named in filter(None, map(str, (item for item in inputs if item is not None))):
+        file = next((item for item in (named, named.rpartition(":")[0]) if item and os.path.exists(item)), None)
         if file is None:
             continue
         source = Path(os.path.realpath(file))
         if source.is_relative_to(place) and source != place / RECIPE:
-            what = "is an input of this command" if source == place else f"holds {given}, an input of this command"
+            what = "is an input of this command" if source == place else f"holds {named}, an input of this command"
             raise OutputError(f"{final} {what}.", "name a directory for the output alone")
         if source.is_dir() and place.is_relative_to(source) and any((source / name).exists() for name in WRITTEN):
-            raise OutputError(f"{final} lies in {given}, an input of this command.", f"name a directory beside {given}")
+            raise OutputError(f"{final} lies in {named}, an input of this command.", f"name a directory beside {named}")
 
 
 @contextlib.contextmanager

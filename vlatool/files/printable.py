@@ -18,7 +18,7 @@ def printable(text: str) -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(_written(each) for each in text)
+    return "".join(_written(character) for character in text)
 
 
 def one_line(text: str, longest: int = 400) -> str:

@@ -225,7 +225,7 @@ class Rows:
             DataError: when the file became shorter since it was opened.
         """
         if isinstance(at, Sequence):
-            return np.stack([self[each] for each in at]) if at else np.empty((0, *self.shape[1:]), self.dtype)
+            return np.stack([self[index] for index in at]) if at else np.empty((0, *self.shape[1:]), self.dtype)
         number = range(len(self))[at]
         row: Array = self.read(number, 1)[0]
         return row

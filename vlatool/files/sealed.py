@@ -55,9 +55,9 @@ def check_size(root: Path, name: str, handle: int, size: int) -> None:
         raise BundleError(f"{root / name} has {got} bytes; the manifest says {size}.", FIX)
 
 
-def check_content(root: Path, name: str, got: str, wanted: str) -> None:
+def check_content(root: Path, name: str, got: str, recorded: str) -> None:
     """Refuse another SHA-256 than recorded."""
-    if got != wanted:
+    if got != recorded:
         raise BundleError(f"{root / name} has changed: its SHA-256 is not the manifest's.", FIX)
 
 
@@ -107,7 +107,7 @@ def open_regular(root: Path, name: str) -> Iterator[int]:
         handle = os.open(last, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=parent)
     try:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise OSError(errno.ELOOP, "it is no regular file", str(root / name))
+            raise OSError(errno.ELOOP, "it is not a regular file", str(root / name))
         yield handle
     finally:
         os.close(handle)
@@ -209,21 +209,21 @@ def _place(root: Path, folder: str, handle: int) -> Path:
 
 def _settled(handles: list[int]) -> None:
     """Wait until another change would be seen in the time stamps."""
-    newest = max(max(found.st_mtime_ns, found.st_ctime_ns) for found in map(os.fstat, handles))
+    newest = max(max(status.st_mtime_ns, status.st_ctime_ns) for status in map(os.fstat, handles))
     if 0 <= time.time_ns() - newest < TICK_NS:
         time.sleep(TICK_NS / 1e9)
 
 
 def _stamp(handle: int) -> tuple[int, ...]:
-    found = os.fstat(handle)
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    status = os.fstat(handle)
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _still_there(name: str, handles: dict[str, int], directories: dict[str, int]) -> bool:
     folder, _, last = name.rpartition("/")
     try:
-        found = os.stat(last, dir_fd=directories[folder], follow_symlinks=False)
+        entry = os.stat(last, dir_fd=directories[folder], follow_symlinks=False)
     except OSError:
         return False
     own = os.fstat(handles[name])
-    return (found.st_dev, found.st_ino) == (own.st_dev, own.st_ino)
+    return (entry.st_dev, entry.st_ino) == (own.st_dev, own.st_ino)

@@ -45,8 +45,8 @@ def known(value: Mapping[str, Any], keys: Iterable[str], where: str, error: type
     keys = list(keys)
     for key in value:
         if key not in keys:
-            told = nearest(key if isinstance(key, str) else shown(key), keys)
-            raise error(f"{where} has the unknown key {shown(key)}; {told}.")
+            hint = nearest(key if isinstance(key, str) else shown(key), keys)
+            raise error(f"{where} has the unknown key {shown(key)}; {hint}.")
 
 
 def text(value: Any, where: str, error: type[VlatoolError], *, empty: bool = True) -> str:
@@ -97,7 +97,7 @@ def outside(path: Any) -> str:
         'it leaves the directory'
     """
     if not isinstance(path, str) or not path:
-        return "it is empty" if path == "" else "it is no text"
+        return "it is empty" if path == "" else "it is not text"
     parts = path.split("/")
     if path.startswith("/"):
         return "it is absolute"

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vlatool.errors import OutputError
+from vlatool.files.locks import alone
 from vlatool.files.moves import exchange, move_new
 from vlatool.files.outputs import kind_of, output_errors, refuse_replacing
 from vlatool.files.written import note, prune
@@ -167,17 +168,8 @@ def _is_alive(place: Path) -> bool:
     pid = place.name.rpartition(".tmp-")[2].partition("-")[0]
     if pid.isdigit() and int(pid) != os.getpid() and Path(f"/proc/{pid}").exists():
         return True
-    try:
-        handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(handle)
-    return False
+    with alone(place) as free:
+        return not free and os.path.lexists(place)
 
 
 def _flush(directory: Path) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import OutputError
+from vlatool.files.sealed import hash_handle
 
 LEDGER = ".written-by-vlatool.json"
 MANIFEST = "manifest.json"
@@ -67,12 +68,12 @@ def note(directory: Path) -> None:
     known = _recorded(directory)
     files, folders = {}, []
     for path in sorted(directory.rglob("*")):
-        name, found = path.relative_to(directory).as_posix(), path.lstat()
-        if stat.S_ISDIR(found.st_mode):
+        name, status = path.relative_to(directory).as_posix(), path.lstat()
+        if stat.S_ISDIR(status.st_mode):
             folders.append(name)
-        elif stat.S_ISREG(found.st_mode) and name != LEDGER:
+        elif stat.S_ISREG(status.st_mode) and name != LEDGER:
             digest, size = known.get(name, ("", -1))
-            files[name] = digest if found.st_size == size else hash_once(path)
+            files[name] = digest if status.st_size == size else hash_once(path)
     _write(directory, Listing.of(files, folders))
 
 
@@ -120,8 +121,8 @@ def prune(directory: Path, *, changed: bool = False) -> bool:
     entries = [] if listing is None else list(walk(directory, listing))
     if not changed and any(entry.foreign for entry in entries):
         return False
-    files = [each.name for each in entries if not each.folder and each.foreign in ("", CHANGED)]
-    for name in sorted(files, key=lambda each: (each in (MANIFEST, LEDGER), each == LEDGER)):
+    files = [entry.name for entry in entries if not entry.folder and entry.foreign in ("", CHANGED)]
+    for name in sorted(files, key=lambda file: (file in (MANIFEST, LEDGER), file == LEDGER)):
         with contextlib.suppress(OSError):
             os.unlink(directory / name)
     for entry in entries:
@@ -137,8 +138,8 @@ def walk(directory: Path, listing: Listing, below: str = "") -> Iterator[Entry]:
     """Yield every file and folder below a directory, a folder after what it holds; what is foreign is not entered."""
     device = os.lstat(directory).st_dev
     try:
-        with os.scandir(directory / below) as found:
-            entries = sorted(found, key=lambda entry: entry.name)
+        with os.scandir(directory / below) as scanned:
+            entries = sorted(scanned, key=lambda entry: entry.name)
     except OSError as error:
         yield Entry(below or ".", True, f"cannot be read ({error.strerror})")
         return
@@ -157,7 +158,7 @@ def walk(directory: Path, listing: Listing, below: str = "") -> Iterator[Entry]:
 def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
     """Say why a file is none that vlatool wrote, empty when it is."""
     if not stat.S_ISREG(mode):
-        return "is a link" if stat.S_ISLNK(mode) else "is no regular file"
+        return "is a link" if stat.S_ISLNK(mode) else "is not a regular file"
     if name == LEDGER:
         return "" if _read_ledger(path.parent) == listing else CHANGED
     if name not in listing.files:
@@ -177,12 +178,10 @@ def hash_once(path: Path) -> str:
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:
         seen = _seen(os.fstat(stream.fileno()))
         if seen not in _HASHES:
-            digest = hashlib.sha256()
-            while block := stream.read(1 << 20):
-                digest.update(block)
+            digest = hash_handle(stream.fileno())
             if seen != _seen(os.fstat(stream.fileno())):
-                return digest.hexdigest()
-            _HASHES[seen] = digest.hexdigest()
+                return digest
+            _HASHES[seen] = digest
         return _HASHES[seen]
 
 
@@ -205,7 +204,7 @@ def _read_ledger(directory: Path) -> Listing | None:
     files, folders = data.get("files"), data.get("folders", [])
     if data.get("schema") != SCHEMA or not isinstance(files, dict) or not isinstance(folders, list):
         return None
-    if not all(isinstance(each, str) for each in (*files.values(), *folders)):
+    if not all(isinstance(value, str) for value in (*files.values(), *folders)):
         return None
     listing = Listing.of(files, folders)
     return listing if content == _told(listing) else None
@@ -236,14 +235,14 @@ def _recorded(directory: Path) -> dict[str, tuple[str, int]]:
 
 def _records(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
     files = manifest.get("files")
-    found = {}
+    records = {}
     for name, record in files.items() if isinstance(files, dict) else ():
         match record:
             case {"sha256": str(digest), "bytes": int(size)}:
-                found[name] = (digest, size)
+                records[name] = (digest, size)
             case _:
                 return {}
-    return found
+    return records
 
 
 def _read_json(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -259,14 +258,14 @@ def _read_json(path: Path) -> tuple[dict[str, Any], bytes]:
 
 def _told(listing: Listing) -> bytes:
     """Return the one way in which a list is written."""
-    told = {
+    described = {
         "vlatool": "The files that vlatool wrote here, by SHA-256. --force replaces this directory only while it holds "
         "no other file and no file that was changed.",
         "schema": SCHEMA,
         "files": listing.files,
         "folders": sorted(listing.folders),
     }
-    return (json.dumps(told, indent=1) + "\n").encode()
+    return (json.dumps(described, indent=1) + "\n").encode()
 
 
 def _write(directory: Path, listing: Listing) -> None:

@@ -52,12 +52,7 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
 
 
 def read_mapping(path: Path, what: str, raised: type[InputError]) -> dict[str, Any]:
-    """Return the mapping of a YAML file.
-
-    Args:
-        path: The file.
-        what: What it is, as the subject of a sentence.
-        raised: Class of the errors.
+    """Return the mapping of a YAML file, as ``read_yaml`` does.
 
     Raises:
         InputError: of the class ``raised``, when ``read_yaml`` raises, or the file holds something else.
@@ -74,10 +69,10 @@ def read_mapping(path: Path, what: str, raised: type[InputError]) -> dict[str, A
 def _text(path: Path, what: str, raised: type[InputError]) -> str:
     """Read a regular file that is not too large; a pipe would never end."""
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as stream:
-        found = os.fstat(stream.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise raised(f"{what} cannot be read: it is no regular file.")
-        check("yaml_bytes", found.st_size, what, raised)
+        status = os.fstat(stream.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise raised(f"{what} cannot be read: it is not a regular file.")
+        check("yaml_bytes", status.st_size, what, raised)
         return stream.read(limit("yaml_bytes") + 1).decode("utf-8")
 
 

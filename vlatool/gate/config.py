@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic import AliasChoices, ConfigDict, Field, ValidationError, model_validator
 
 from vlatool.errors import RecipeError, require
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
 from vlatool.stats.percentiles import PERCENTILES
-from vlatool.stats.sequential import ALPHA, LOOKS
+from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES
 from vlatool.stats.signed_rank import fewest
 
 
@@ -23,7 +23,11 @@ class LatencyClaim(_Claim):
     """The candidate is not slower than the baseline by more than a margin; both run side by side in fresh processes."""
 
     margin: float = Field(0.05, ge=0, le=10, description="largest slowdown of median and mean, a share (0.05 = 5 %)")
-    looks: tuple[int, ...] = Field(LOOKS, description="processes after which it is judged; the last one ends it")
+    interim_analyses: tuple[int, ...] = Field(
+        INTERIM_ANALYSES,
+        validation_alias=AliasChoices("interim_analyses", "looks"),
+        description="processes after which it is judged; the last one ends it (looks in older files)",
+    )
     pairs: int = Field(150, ge=30, description="calls of each bundle in a process")
     warmup: int = Field(20, ge=1, description="calls of each bundle before the first that counts")
     seconds: float = Field(10.0, gt=0, description="after which a process begins no further pair (at least 30 of them)")
@@ -36,10 +40,11 @@ class LatencyClaim(_Claim):
     timeout: float = Field(1800.0, gt=0, description="seconds after which a process that hangs ends, and the gate so")
 
     @model_validator(mode="after")
-    def _looks_can_decide(self) -> LatencyClaim:
-        least = fewest(ALPHA / 2 / len(self.looks)) if self.looks else 1  # the median and the mean share it
-        if not self.looks or list(self.looks) != sorted(set(self.looks)) or self.looks[0] < least:
-            raise ValueError(f"looks must ascend and begin at {least} or later, or none of them can decide")
+    def _an_analysis_can_decide(self) -> LatencyClaim:
+        after = self.interim_analyses
+        least = fewest(ALPHA / 2 / len(after)) if after else 1  # the median and the mean share it
+        if not after or list(after) != sorted(set(after)) or after[0] < least:
+            raise ValueError(f"interim_analyses must ascend and begin at {least} or later, or none of them can decide")
         return self
 
 
@@ -72,12 +77,14 @@ class DeadlineClaim(_Claim):
     """A percentile of the candidate's latency is below a deadline, with confidence; on this machine."""
 
     ms: float = Field(gt=0, description="the deadline")
-    percent: float = Field(99.0, description=f"which percentile: {', '.join(f'{each:g}' for each in PERCENTILES)}")
+    percent: float = Field(
+        99.0, description=f"which percentile: {', '.join(f'{percent:g}' for percent in PERCENTILES)}"
+    )
 
     @model_validator(mode="after")
     def _percentile_is_one(self) -> DeadlineClaim:
         if self.percent not in PERCENTILES:
-            raise ValueError(f"percent must be one of {', '.join(f'{each:g}' for each in PERCENTILES)}")
+            raise ValueError(f"percent must be one of {', '.join(f'{percent:g}' for percent in PERCENTILES)}")
         return self
 
 

@@ -16,7 +16,7 @@ baseline: {baseline}    # a bundle, kept in the repository or fetched before the
 latency:
   margin: 0.05         # median and mean may be 5 % slower, no more
   worst: 0.5           # and no single observation by more than 50 %
-  looks: [10, 20, 40]  # processes after which it is judged; most changes are decided at the first
+  interim_analyses: [10, 20, 40]  # processes after which it is judged; most changes are decided at the first
   pairs: 150           # calls of each bundle in a process
   threads: 1           # those that the robot runs with
   # also_threads: [4]  # the same is claimed of the latency with so many threads

@@ -44,9 +44,9 @@ class Inputs:
         """
         spec = self.baseline.manifest.spec
         own = self.baseline.path / EVALUATION if EVALUATION in self.baseline.manifest.files else None
-        found = [read_recording(path, spec) for path in (self.data, own) if path is not None]
+        recordings = [read_recording(path, spec) for path in (self.data, own) if path is not None]
         calibration = calibration_recording(self.baseline)
-        return (*found, *([calibration] if calibration is not None else []))
+        return (*recordings, *([calibration] if calibration is not None else []))
 
     @cached_property
     def _drawer(self) -> Drawer:
@@ -56,8 +56,8 @@ class Inputs:
         """Return observations for a process; the same for the same seed, purpose and number."""
         random = np.random.default_rng([self.seed, purpose, number])
         first = self._drawer.draw(min(count, LEAST), random)
-        each = max(1, *(sum(np.asarray(value).nbytes for value in one.observation.values()) for one in first))
-        return first + self._drawer.draw(max(0, min(count, LARGEST // each) - len(first)), random)
+        size = max(1, *(sum(np.asarray(value).nbytes for value in one.observation.values()) for one in first))
+        return first + self._drawer.draw(max(0, min(count, LARGEST // size) - len(first)), random)
 
     @contextlib.contextmanager
     def file(self, count: int, purpose: int, number: int = 0) -> Iterator[Path]:

@@ -12,13 +12,13 @@ from vlatool.accuracy.credibility import FAILS
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.gate.claims import accuracy, answers, deadline, growth, latency
 from vlatool.gate.config import Gate, LatencyClaim
-from vlatool.gate.found import Found, worst
 from vlatool.gate.inputs import AGREEMENT, Inputs
+from vlatool.gate.result import ClaimResult, worst
 from vlatool.gate.same import check
 from vlatool.gate.timed import Timed
 from vlatool.machine.host import before_run
 from vlatool.measurement.agreement import Agreement, measure_agreement
-from vlatool.measurement.pairs import Job
+from vlatool.measurement.pairs import PairJob
 from vlatool.measurement.validity import busy, throttled, validity
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import refuse_findings
@@ -52,32 +52,31 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     how = gate.latency or LatencyClaim()
     seed = secrets.randbits(32) if seed is None else seed
     inputs = Inputs(baseline, gate.accuracy.data if gate.accuracy else None, seed)
-    job = Job(
-        str(baseline.path), str(candidate.path), how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed
-    )
+    paths = str(baseline.path), str(candidate.path)
+    job = PairJob(*paths, how.engine, how.threads, how.warmup, how.pairs, how.seconds, seed)
     timed = Timed(job, context, how.timeout, inputs)
     agreement = _agreement(timed, gate, inputs)
-    found: list[Found] = []
+    results: list[ClaimResult] = []
     if gate.size:
-        found.append(growth.examine_size(candidate, baseline, gate.size))
+        results.append(growth.examine_size(candidate, baseline, gate.size))
     if gate.memory:
-        found.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
+        results.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
     if gate.accuracy:
-        found.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine))
+        results.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine))
     with Recorder(open_all(), PERIOD_S) as board:
         if gate.latency:
-            found += latency.examine_all(timed, gate.latency)
+            results += latency.examine_all(timed, gate.latency)
         if gate.deadline:
-            found.append(deadline.examine(timed, gate.deadline))
+            results.append(deadline.examine(timed, gate.deadline))
     if gate.answers:
-        found.append(answers.examine(agreement, timed, gate.answers))
-    seen = (*throttled(board.recorded.throttling), *(replace(each, effect="note") for each in busy(host)))
+        results.append(answers.examine(agreement, timed, gate.answers))
+    seen = (*throttled(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
     name = candidate.manifest.name
-    row = _row("candidate", candidate, timed, found)
+    row = _row("candidate", candidate, timed, results)
     row = replace(row, details={**row.details, "measured with": _measured_with(gate, inputs, agreement)})
-    rows = (_row("baseline", baseline, timed, found), row)
-    return Report(KIND, f"Gate of {name}", worst(each.verdict for each in found),
-                  (*_summary(name, found), f"{inputs.told()}."), rows,
+    rows = (_row("baseline", baseline, timed, results), row)
+    return Report(KIND, f"Gate of {name}", worst(result.verdict for result in results),
+                  (*_summary(name, results), f"{inputs.told()}."), rows,
                   command=context.command, environment=host, validity=validity(seen), findings=seen)  # fmt: skip
 
 
@@ -95,44 +94,44 @@ def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:
 def _measured_with(gate: Gate, inputs: Inputs, agreement: Agreement) -> list[dict[str, Any]]:
     """Return what a reader needs to judge, or repeat, the gate: a row for each thing."""
     how = gate.latency or LatencyClaim()
-    found: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
-    found |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
-    found |= {
-        f"recording {path.path.name}": f"sha256:{hash_file(path.path)}"
-        for path in inputs.recordings
-        if path.path.is_file()
+    table: dict[str, Any] = {"seed": inputs.seed, "threads": ", ".join(map(str, (how.threads, *how.also_threads)))}
+    table |= dict(zip(("engine of the baseline", "engine of the candidate"), agreement.engines, strict=True))
+    table |= {
+        f"recording {recording.path.name}": f"sha256:{hash_file(recording.path)}"
+        for recording in inputs.recordings
+        if recording.path.is_file()
     }
     if gate.accuracy and (data := accuracy.data_of(inputs.baseline, gate.accuracy)) is not None and data.is_file():
-        found["evaluation data"] = f"sha256:{hash_file(data)}"
-    return [{"what": what, "value": value} for what, value in found.items()]
+        table["evaluation data"] = f"sha256:{hash_file(data)}"
+    return [{"what": what, "value": value} for what, value in table.items()]
 
 
-def _row(name: str, bundle: Bundle, timed: Timed, found: Sequence[Found]) -> Row:
+def _row(name: str, bundle: Bundle, timed: Timed, results: Sequence[ClaimResult]) -> Row:
     calls = timed.calls(name)
     measured = [Measurement("latency_p50", median(calls), "ms", samples=len(calls))] if calls else []
     raw = {"latency_ms": calls} if calls else {}
     reason = f"{bundle.manifest.name}, {bundle.hash[:19]}"
     if name == "baseline":
-        measured += [each for claim in found for each in claim.baseline]
+        measured += [number for result in results for number in result.baseline]
         return Row(name, "baseline", reason, tuple(measured), raw)
-    measured += [each for claim in found for each in claim.measurements]
+    measured += [number for result in results for number in result.measurements]
     if calls:
         raw["log_ratio"] = [pairs.log_ratio for pairs in timed.pairs]
         raw["log_mean_ratio"] = [pairs.mean_log_ratio for pairs in timed.pairs]
-    claims = [{"claim": each.claim, "verdict": each.verdict, "found": each.sentence} for each in found]
+    claims = [{"claim": result.claim, "verdict": result.verdict, "found": result.sentence} for result in results]
     return Row(name, "subject", reason, tuple(measured), raw, {"claims": claims})
 
 
-def _summary(name: str, found: Sequence[Found]) -> tuple[str, ...]:
+def _summary(name: str, results: Sequence[ClaimResult]) -> tuple[str, ...]:
     """Return the result, then every claim in a sentence, those that failed first."""
     order = ("fail", "inconclusive", "pass")
-    named = {verdict: ", ".join(each.claim for each in found if each.verdict == verdict) for verdict in order}
+    named = {verdict: ", ".join(result.claim for result in results if result.verdict == verdict) for verdict in order}
     first = {
         "pass": f"{name} keeps to every claim: {named['pass']}.",
         "fail": f"{name} does not keep to: {named['fail']}.",
         "inconclusive": f"The samples cannot decide about {named['inconclusive']} of {name}.",
-    }[worst(each.verdict for each in found)]
-    if any(each.sentence.startswith(FAILS) for each in found) and not named["fail"]:
+    }[worst(result.verdict for result in results)]
+    if any(result.sentence.startswith(FAILS) for result in results) and not named["fail"]:
         first = f"Nothing is said about {name}, for the baseline is no reference: it does not do its task."
-    said = sorted(found, key=lambda each: order.index(each.verdict))
-    return (first, *(f"{each.claim}: {each.verdict}: {each.sentence}." for each in said))
+    ordered = sorted(results, key=lambda result: order.index(result.verdict))
+    return (first, *(f"{result.claim}: {result.verdict}: {result.sentence}." for result in ordered))

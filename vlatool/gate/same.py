@@ -42,7 +42,7 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
 
 def _tensors(mine: Manifest, theirs: Manifest) -> str:
     for kind in ("inputs", "outputs"):
-        one, two = ({each.name: each for each in getattr(each.spec, kind)} for each in (mine, theirs))
+        one, two = ({tensor.name: tensor for tensor in getattr(manifest.spec, kind)} for manifest in (mine, theirs))
         for name in {**two, **one}:
             if differs := _differs(one.get(name), two.get(name)):
                 return f"{kind[:-1]} {name}: {differs}"
@@ -54,12 +54,12 @@ def _differs(mine: TensorSpec | None, theirs: TensorSpec | None) -> str:
     if mine is None or theirs is None:
         return f"it is in the {'baseline' if mine is None else 'candidate'} alone"
     pairs = [(name, getattr(mine, name), getattr(theirs, name)) for name in MEANING]
-    return "; ".join(said for name, one, two in pairs if (said := _told(name, one, two)))
+    return "; ".join(text for name, one, two in pairs if (text := _told(name, one, two)))
 
 
 def _rates(mine: Manifest, theirs: Manifest) -> str:
     pairs = [(name, getattr(mine.spec, name), getattr(theirs.spec, name)) for name in RATE]
-    return "; ".join(said for name, one, two in pairs if (said := _told(name, one, two)))
+    return "; ".join(text for name, one, two in pairs if (text := _told(name, one, two)))
 
 
 def _program(mine: Manifest, theirs: Manifest) -> str:
@@ -70,9 +70,9 @@ def _program(mine: Manifest, theirs: Manifest) -> str:
     parts: list[tuple[str, Any, Any]] = [
         (word, _of_all(mine, word), _of_all(theirs, word)) for word in ("keep", "noise", "schedule")
     ]
-    one, two = (max(step.repeat for step in each.program) for each in (mine, theirs))
+    one, two = (max(step.repeat for step in manifest.program) for manifest in (mine, theirs))
     parts.append(("repeat", one, two))
-    return "; ".join(said for word, one, two in parts if (said := _told(f"the program's {word}", one, two)))
+    return "; ".join(text for word, one, two in parts if (text := _told(f"the program's {word}", one, two)))
 
 
 def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:
@@ -82,5 +82,5 @@ def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:
 def _told(name: str, mine: Any, theirs: Any) -> str:
     if mine == theirs:
         return ""
-    one, two = (list(each) if isinstance(each, tuple) else each for each in (mine, theirs))
+    one, two = (list(value) if isinstance(value, tuple) else value for value in (mine, theirs))
     return f"{name} {one!r} in the candidate, {two!r} in the baseline"

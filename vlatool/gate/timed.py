@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from vlatool.gate.inputs import TIMING, Inputs
-from vlatool.measurement.pairs import Job, Pairs, measure_pairs
+from vlatool.measurement.pairs import PairJob, Pairs, measure_pairs
 from vlatool.measurement.turns import wanted
 from vlatool.stage.base import Context
 
@@ -21,15 +21,11 @@ class Timed:
         inputs: What the bundles are called with; drawn by each process from the baseline's spec when None.
     """
 
-    job: Job
+    job: PairJob
     context: Context
     timeout: float | None = None
     inputs: Inputs | None = None
     pairs: list[Pairs] = field(default_factory=list)
-
-    def log_ratio(self, number: int) -> float:
-        """Return the log ratio of a process, candidate over baseline; measures it when it is the next one."""
-        return self.process(number).log_ratio
 
     def process(self, number: int) -> Pairs:
         """Return what a process found; measures it when it is the next one.
@@ -42,7 +38,7 @@ class Timed:
             self.pairs.append(self._measure(replace(self.job, seed=self.job.seed + number), number))
         return self.pairs[number]
 
-    def _measure(self, job: Job, number: int) -> Pairs:
+    def _measure(self, job: PairJob, number: int) -> Pairs:
         if self.inputs is None:
             return measure_pairs(job, self.timeout)
         with self.inputs.file(wanted(job.pairs), TIMING, number) as path:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import GraphError
-from vlatool.graph.shapes import nodes_inside
+from vlatool.graph.nodes import nodes_inside
 
 DRAWING = {
     "RandomNormal": "normal", "RandomNormalLike": "normal", "RandomUniform": "uniform", "RandomUniformLike": "uniform",
@@ -28,21 +28,21 @@ def refuse_draws(model: Any, graph: str) -> None:
     Raises:
         GraphError: saying how often and where it draws, and how to declare the noise instead.
     """
-    found = [node for node in model.graph.all_nodes() if node.op_type in DRAWING]
-    if not found:
+    draws = [node for node in model.graph.all_nodes() if node.op_type in DRAWING]
+    if not draws:
         return
-    scopes = dict.fromkeys(scope for node in found if (scope := _scope(node)))
+    scopes = dict.fromkeys(scope for node in draws if (scope := _scope(node)))
     where = f" in {', '.join(list(scopes)[:3])}" if scopes else ""
     drawn = [
         tuple(axis for axis in node.outputs[0].shape if isinstance(axis, int)) if node.outputs[0].shape else ()
-        for node in found
+        for node in draws
     ]
-    index = "; forward() takes noise[i] in turn i" if len(found) > 1 else ""
+    index = "; forward() takes noise[i] in turn i" if len(draws) > 1 else ""
     raise GraphError(
-        f"forward() of '{graph}' draws random numbers, {_times(found)} an inference{where}: a graph that draws its own "
+        f"forward() of '{graph}' draws random numbers, {_times(draws)} an inference{where}: a graph that draws its own "
         "can neither be compared with torch nor repeated from a seed.",
         "let forward() take them as an input, and declare that in the program of policy.yaml: "
-        f"{_declared(found, drawn)}{index}; {GUIDE}",
+        f"{_declared(draws, drawn)}{index}; {GUIDE}",
     )
 
 
@@ -56,19 +56,19 @@ def refuse_drawing_file(model: Any, path: Path) -> None:
     Raises:
         GraphError: naming the operators, and how to declare the noise instead.
     """
-    shapes = {each.name: _static(each) for each in (*model.graph.value_info, *model.graph.output)}
-    nodes = [*_nodes(model.graph.node), *(node for each in model.functions for node in _nodes(each.node))]
-    found = [node for node in nodes if node.op_type in DRAWING and node.domain in ("", "ai.onnx")]
-    if not found:
+    shapes = {value.name: _static(value) for value in (*model.graph.value_info, *model.graph.output)}
+    nodes = [*_nodes(model.graph.node), *(node for value in model.functions for node in _nodes(value.node))]
+    draws = [node for node in nodes if node.op_type in DRAWING and node.domain in ("", "ai.onnx")]
+    if not draws:
         return
-    operators = ", ".join(dict.fromkeys(node.op_type for node in found))
-    index = "; each of them takes its part of the noise" if len(found) > 1 else ""
+    operators = ", ".join(dict.fromkeys(node.op_type for node in draws))
+    index = "; each of them takes its part of the noise" if len(draws) > 1 else ""
     raise GraphError(
-        f"{path} draws random numbers, {_times(found)} an inference ({operators}): a graph that draws its own can "
+        f"{path} draws random numbers, {_times(draws)} an inference ({operators}): a graph that draws its own can "
         "neither be repeated from a seed nor be verified on another machine.",
         "export the file with an input in the place of the draws, and declare that in the policy.yaml beside it: "
         "program: [{graph: main, gives: {...}, "
-        f"{_declared(found, [shapes.get(node.output[0], ()) for node in found])}}}]{index}; {GUIDE}",
+        f"{_declared(draws, [shapes.get(node.output[0], ()) for node in draws])}}}]{index}; {GUIDE}",
     )
 
 
@@ -105,5 +105,5 @@ def _shape(shapes: Sequence[tuple[int, ...]]) -> str:
 def _scope(node: Any) -> str:
     """Return the torch module that a node comes from; empty for the policy itself."""
     scopes = node.metadata_props.get("pkg.torch.onnx.name_scopes", "")
-    found = ast.literal_eval(scopes) if scopes.startswith("[") else []
-    return str(found[-2]) if len(found) > 1 else ""
+    modules = ast.literal_eval(scopes) if scopes.startswith("[") else []
+    return str(modules[-2]) if len(modules) > 1 else ""

@@ -37,16 +37,16 @@ def part_phases(
     save(model, path)
     save(cut.model, path.parent / f"{other}.onnx")
     values = {value: f"{other}.{value}" for value in cut.values}
-    found: list[ProgramStep] = []
+    steps_after: list[ProgramStep] = []
     for step in program:
         if step.graph != name:
-            found.append(step)
+            steps_after.append(step)
             continue
         before = {key: getattr(step, key) for key in ("schedule", "noise", "keep")}
         feeds = {key: step.feeds[key] for key in cut.kept}
-        found.append(ProgramStep(other, {key: step.feeds[key] for key in cut.inputs}, values, **before))
-        found.append(replace(step, feeds={**feeds, **values}, schedule={}, noise={}, keep={}))
-    return tuple(found), {other: Graph(file, {}, 0)}
+        steps_after.append(ProgramStep(other, {key: step.feeds[key] for key in cut.inputs}, values, **before))
+        steps_after.append(replace(step, feeds={**feeds, **values}, schedule={}, noise={}, keep={}))
+    return tuple(steps_after), {other: Graph(file, {}, 0)}
 
 
 def load(path: Path) -> Any:
@@ -61,7 +61,7 @@ def load(path: Path) -> Any:
 
 
 def read(path: Path, *, weights: bool = True) -> Any:
-    """Read an ONNX model, with a name of its own for every node; what it gives is no constant but read from one.
+    """Read an ONNX model, with a name of its own for every node; no output is itself a constant.
 
     Raises:
         GraphError: when a file with its weights is missing.

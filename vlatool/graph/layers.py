@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from vlatool.errors import GraphError, require
-from vlatool.graph.nodes import reads, varying
-from vlatool.graph.shapes import nodes_inside
-from vlatool.graph.types import FLOAT, float_names
+from vlatool.errors import GraphError
+from vlatool.graph.nodes import nodes_inside, varying
+from vlatool.graph.onnx_graph import FLOAT, OnnxGraph
 
 LOWEST_OPSET = 13
 """Per-channel scales came with opset 13."""
@@ -78,31 +77,29 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
 
     Args:
         model: An ``onnx.ModelProto``.
-        ops: ``MatMul``, ``Gemm``, ``Conv``: operators with constant weights that are wanted.
+        ops: ``MatMul``, ``Gemm``, ``Conv``: operators whose layers with constant weights are returned.
         attention: Also products of two activations.
         elementwise: Also sums of two activations (residual connections).
 
     Raises:
         GraphError: when the opset is too old.
     """
-    for entry in model.opset_import:
-        if entry.domain in ("", "ai.onnx") and entry.version < LOWEST_OPSET:
-            raise GraphError(f"The graph has opset {entry.version}; int8 needs opset {LOWEST_OPSET} or later.")
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
-    floats = float_names(model) if elementwise else set()
-    readers, live = _readers(model), varying(model)
-    found = []
+    graph, live = OnnxGraph(model), varying(model)
+    if 0 < graph.opset < LOWEST_OPSET:
+        raise GraphError(f"The graph has opset {graph.opset}; int8 needs opset {LOWEST_OPSET} or later.")
+    layers = []
     for node in model.graph.node:
+        layer = None
         if node.op_type in ops or (node.op_type == "MatMul" and attention):
-            layer = _weighted(node, constants, node.op_type in ops, attention)
-        elif node.op_type == "Add" and elementwise:
-            both = all(name in floats and name not in constants for name in node.input)
-            layer = Layer(node.name, "Add", tuple(node.input)) if both else None
-        else:
-            layer = None
+            layer = _product(node, graph, node.op_type in ops, attention)
+        elif node.op_type == "Add" and elementwise and graph.constants.keys().isdisjoint(node.input):
+            floats = all(graph.types.get(name) == FLOAT for name in node.input)
+            layer = Layer(node.name, "Add", tuple(node.input)) if floats else None
         if layer is not None and live.issuperset(layer.activations):
-            found.append(_with_output(layer, node, readers))
-    return found
+            after = graph.readers[node.output[0]]
+            fused = len(after) == 1 and after[0].op_type in FOLLOWS
+            layers.append(replace(layer, output=(after[0] if fused else node).output[0]))
+    return layers
 
 
 def check_weights(model: Any, layers: Iterable[Layer]) -> None:
@@ -111,43 +108,31 @@ def check_weights(model: Any, layers: Iterable[Layer]) -> None:
     Raises:
         GraphError: when one holds NaN or infinity; names it and its layer.
     """
-    onnx = require("onnx", "build")
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
-    nodes = {node.name: node for node in model.graph.node}
-    for layer in layers:
-        for name in nodes[layer.name].input:
-            if name in constants and constants[name].data_type == FLOAT:
-                values = onnx.numpy_helper.to_array(constants[name])
-                bad = int(values.size - np.isfinite(values).sum())
-                if bad:
-                    raise GraphError(
-                        f"The weight '{name}' of the layer '{layer.name}' holds NaN or infinity ({bad} of "
-                        f"{values.size} values); allowed: finite ones.",
-                        "look at the checkpoint, or leave the layer in float32 with --exclude",
-                    )
+    graph, names = OnnxGraph(model), {layer.name for layer in layers}
+    for node in (node for node in model.graph.node if node.name in names):
+        for name in filter(graph.is_weight, node.input):
+            values = graph.array(name)
+            bad = int(values.size - np.isfinite(values).sum())
+            if bad:
+                raise GraphError(
+                    f"The weight '{name}' of the layer '{node.name}' holds NaN or infinity ({bad} of "
+                    f"{values.size} values); allowed: finite ones.",
+                    "look at the checkpoint, or leave the layer in float32 with --exclude",
+                )
 
 
-def _weighted(node: Any, constants: Mapping[str, Any], weighted: bool, attention: bool) -> Layer | None:
-    attributes = {item.name: item.i for item in node.attribute}
-    weight = constants.get(node.input[1])
-    if weight is None or weight.data_type != FLOAT or len(weight.dims) < 2:
-        plain = node.op_type == "MatMul" and attention and weight is None and node.input[0] not in constants
+def _product(node: Any, graph: OnnxGraph, weighted: bool, attention: bool) -> Layer | None:
+    options, (first, second) = graph.attributes(node), node.input[:2]
+    if not graph.is_weight(second) or len(graph.constants[second].dims) < 2:
+        activations = first not in graph.constants and second not in graph.constants
+        plain = node.op_type == "MatMul" and attention and activations
         return Layer(node.name, "MatMul", tuple(node.input)) if plain else None
-    if not weighted or node.input[0] in constants or attributes.get("transA"):
+    if not weighted or first in graph.constants or options.get("transA"):
         return None
-    axis = len(weight.dims) - 1
-    if node.op_type == "Conv" or (node.op_type == "Gemm" and attributes.get("transB")):
-        axis = 0
+    outputs_first = node.op_type == "Conv" or (node.op_type == "Gemm" and options.get("transB"))
+    axis = 0 if outputs_first else len(graph.constants[second].dims) - 1
     bias = node.input[2] if node.op_type == "Conv" and len(node.input) > 2 else ""
-    return Layer(node.name, node.op_type, (node.input[0],), node.input[1], axis, bias)
-
-
-def _with_output(layer: Layer, node: Any, readers: Mapping[str, list[Any]]) -> Layer:
-    output = node.output[0]
-    after = readers.get(output, [])
-    if len(after) == 1 and after[0].op_type in FOLLOWS:
-        output = after[0].output[0]
-    return Layer(layer.name, layer.kind, layer.activations, layer.weight, layer.axis, layer.bias, output)
+    return Layer(node.name, node.op_type, (first,), second, axis, bias)
 
 
 def hoisted(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]:
@@ -158,36 +143,28 @@ def hoisted(model: Any, layers: Iterable[Layer], style: Style) -> dict[str, str]
     """
     if not style.hoist:
         return {}
-    wanted = {(layer.name, name) for layer in layers for name in layer.activations}
-    producers = {name: node for node in model.graph.node for name in node.output}
-    readers = _readers(model)
-    constants = {tensor.name for tensor in model.graph.initializer}
-    outputs = {value.name for value in model.graph.output}
-    found: dict[str, str] = {}
-    for name in sorted({name for _, name in wanted}):
-        value, moved = name, False
-        while True:
-            before = producers.get(value)
-            if before is None or before.op_type not in SHAPES or before.input[0] in constants or value in outputs:
+    graph, read = OnnxGraph(model), {(layer.name, name) for layer in layers for name in layer.activations}
+    roots: dict[str, str] = {}
+    for name in sorted({name for _, name in read}):
+        value = name
+        while (mover := graph.producers.get(value)) is not None:
+            if mover.op_type not in SHAPES or mover.input[0] in graph.constants or value in graph.outputs:
                 break
-            whole = all((reader.name, value) in wanted for reader in readers[value]) if not moved else (
-                len(readers[value]) == 1)  # fmt: skip
-            if not whole:
+            readers = graph.readers[value]
+            if not (len(readers) == 1 if value != name else all((reader.name, value) in read for reader in readers)):
                 break
-            value, moved = before.input[0], True
-        if moved:
-            found[name] = value
-    return found
+            roots[name] = value = mover.input[0]
+    return roots
 
 
-def wanted_values(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> list[str]:
+def calibrated_values(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> list[str]:
     """Return the values whose ranges are needed, each once, in order."""
-    found: dict[str, None] = {}
+    values: dict[str, None] = {}
     for layer in layers:
-        found.update(dict.fromkeys(moved.get(name, name) for name in layer.activations))
+        values.update(dict.fromkeys(moved.get(name, name) for name in layer.activations))
         if style.fused_convolutions and layer.kind == "Conv":
-            found[layer.output] = None
-    return list(found)
+            values[layer.output] = None
+    return list(values)
 
 
 def convolved(layers: Iterable[Layer], style: Style, moved: Mapping[str, str]) -> set[str]:
@@ -214,49 +191,33 @@ def split_gemm(model: Any) -> int:
 
     ONNX Runtime has an integer MatMul with float output, but none for Gemm.
     """
-    onnx = require("onnx", "build")
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
-    nodes, count = [], 0
+    graph = OnnxGraph(model)
+    nodes: list[Any] = []
+    count = 0
     for node in model.graph.node:
-        attributes = {item.name: onnx.helper.get_attribute_value(item) for item in node.attribute}
-        plain = attributes.get("alpha", 1.0) == 1.0 and attributes.get("beta", 1.0) == 1.0
-        weight = constants.get(node.input[1]) if node.op_type == "Gemm" else None
-        if weight is None or not plain or attributes.get("transA"):
+        options = graph.attributes(node)
+        plain = options.get("alpha", 1.0) == options.get("beta", 1.0) == 1.0 and not options.get("transA")
+        if node.op_type != "Gemm" or node.input[1] not in graph.constants or not plain:
             nodes.append(node)
             continue
         count += 1
-        name = node.input[1]
-        if attributes.get("transB"):
-            name = f"{name}.transposed"
-            if name not in constants:
-                turned = np.ascontiguousarray(onnx.numpy_helper.to_array(weight).T)
-                constants[name] = onnx.numpy_helper.from_array(turned, name)
-                model.graph.initializer.append(constants[name])
+        weight, output = node.input[1], node.output[0]
+        if options.get("transB"):
+            weight = graph.add(f"{weight}.transposed", graph.array(weight).T)
         biased = len(node.input) > 2 and node.input[2]
-        product = f"{node.output[0]}.product" if biased else node.output[0]
-        nodes.append(onnx.helper.make_node("MatMul", [node.input[0], name], [product], name=node.name))
+        product = f"{output}.product" if biased else output
+        nodes.append(graph.node("MatMul", [node.input[0], weight], [product], node.name))
         if biased:
-            name = f"{node.name}/bias"
-            nodes.append(onnx.helper.make_node("Add", [product, node.input[2]], [node.output[0]], name=name))
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
+            nodes.append(graph.node("Add", [product, node.input[2]], [output], f"{node.name}/bias"))
+    graph.replace_nodes(nodes)
     return count
 
 
 def part_inner_gemms(model: Any) -> None:
     """Give every Gemm inside an If, Loop or Scan that transposes a weight of the graph a copy of its own, in place."""
-    constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    graph = OnnxGraph(model)
     for number, node in enumerate(inner for outer in model.graph.node for inner in nodes_inside(outer)):
-        turned = node.op_type == "Gemm" and any(item.name == "transB" and item.i for item in node.attribute)
-        if turned and node.input[1] in constants:
-            copy = model.graph.initializer.add()
-            copy.CopyFrom(constants[node.input[1]])
-            copy.name = node.input[1] = f"{copy.name}.{number}"
-
-
-def _readers(model: Any) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = {}
-    for node in model.graph.node:
-        for name in reads(node):
-            found.setdefault(name, []).append(node)
-    return found
+        turned = node.op_type == "Gemm" and graph.attributes(node).get("transB")
+        if turned and node.input[1] in graph.constants:
+            weight = graph.constants[node.input[1]]
+            node.input[1] = graph.add_tensor(weight, f"{weight.name}.{number}")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
+
+from vlatool.errors import require
 
 
 def reads(node: Any) -> Iterator[str]:
@@ -19,6 +21,15 @@ def reads(node: Any) -> Iterator[str]:
             yield from (value.name for value in graph.output if value.name not in inside)
 
 
+def nodes_inside(node: Any) -> Iterator[Any]:
+    """Yield the nodes of the graphs inside of a node (If, Loop, Scan), and of those inside of them."""
+    for item in node.attribute:
+        for graph in (item.g, *item.graphs):
+            for inner in graph.node:
+                yield inner
+                yield from nodes_inside(inner)
+
+
 def read_names(nodes: Iterable[Any]) -> set[str]:
     """Return all values that nodes read."""
     return {name for node in nodes for name in reads(node)}
@@ -26,22 +37,26 @@ def read_names(nodes: Iterable[Any]) -> set[str]:
 
 def varying(model: Any) -> set[str]:
     """Return the values that depend on an input of a graph, or on chance; all others are computed once, or could be."""
-    constants = {tensor.name for tensor in model.graph.initializer}
-    found = {value.name for value in model.graph.input} - constants
+    values = {value.name for value in model.graph.input} - {tensor.name for tensor in model.graph.initializer}
     for node in model.graph.node:
-        if node.op_type.startswith("Random") or any(name in found for name in reads(node)):
-            found.update(name for name in node.output if name)
-    return found
+        if node.op_type.startswith("Random") or not values.isdisjoint(reads(node)):
+            values.update(name for name in node.output if name)
+    return values
 
 
 def name_nodes(model: Any) -> None:
-    """Give every node without a name, or with one that came before, a name of its own, in place.
+    """Give every node of an ``onnx.ModelProto`` without a name, or with one that came before, a name of its own."""
+    name_each(list(model.graph.node))
+
+
+def name_each(nodes: Sequence[Any]) -> None:
+    """Do so with the nodes of a graph, be they protobuf or ``onnx_ir``.
 
     Layers are chosen and rewritten by the names of their nodes; some exporters leave them empty or repeat them.
     """
-    taken = {node.name for node in model.graph.node}
-    seen = {""}
-    for number, node in enumerate(model.graph.node):
+    taken = {node.name for node in nodes}
+    seen = {"", None}
+    for number, node in enumerate(nodes):
         if node.name in seen:
             node.name = free_name(node.name or node.op_type, number, taken)
         seen.add(node.name)
@@ -49,29 +64,20 @@ def name_nodes(model: Any) -> None:
 
 def part_outputs(model: Any) -> None:
     """Put an Identity between a constant and an output of the graph that it is, in place: methods change constants."""
-    outputs = {value.name for value in model.graph.output}
-    given = [tensor for tensor in model.graph.initializer if tensor.name in outputs]
-    taken = {tensor.name for tensor in model.graph.initializer} | {
-        name for node in model.graph.node for name in node.output
-    }
-    for tensor in given:
+    graph, outputs = model.graph, {value.name for value in model.graph.output}
+    taken = {tensor.name for tensor in graph.initializer} | {name for node in graph.node for name in node.output}
+    for tensor in (tensor for tensor in graph.initializer if tensor.name in outputs):
         name, copy = tensor.name, free_name(tensor.name, 0, taken)
-        for node in model.graph.node:
-            for place, read in enumerate(node.input):
-                if read == name:
-                    node.input[place] = copy
+        for node in graph.node:
+            node.input[:] = [copy if read == name else read for read in node.input]
         tensor.name = copy
-        node = model.graph.node.add()
-        node.op_type, node.name = "Identity", f"{copy}/Identity"
-        node.input.append(copy)
-        node.output.append(name)
-        first = model.graph.node.pop()
-        model.graph.node.insert(0, first)
+        identity = require("onnx.helper", "build").make_node("Identity", [copy], [name], f"{copy}/Identity")
+        graph.node.insert(0, identity)
 
 
-def free_name(wanted: str, number: int, taken: set[str]) -> str:
+def free_name(base: str, number: int, taken: set[str]) -> str:
     """Return a name for the node with that place in a graph which is none of those that are taken, and take it."""
-    name = f"{wanted}_{number}"
+    name = f"{base}_{number}"
     while name in taken:
         name += "_"
     taken.add(name)

@@ -6,11 +6,12 @@ so that a phase of 300 radians is off by up to one radian and its sine is noise;
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from vlatool.errors import require
-from vlatool.graph.nodes import read_names, reads
+from vlatool.graph.nodes import read_names, reads, varying
+from vlatool.graph.onnx_graph import OnnxGraph
 
 PERIODIC = ("Sin", "Cos")
 HEAVY = ("MatMul", "Gemm", "Conv", "Einsum", "Attention")
@@ -43,86 +44,55 @@ def cut_phases(model: Any) -> Cut | None:
         The cut, or None when no phase depends on an input, or when one depends on a heavy layer (a phase that the
         network itself computes cannot be cut out cheaply).
     """
-    onnx = require("onnx", "build")
-    graph = model.graph
-    nodes = list(graph.node)
-    chosen = _leading(graph, nodes)
-    early = [nodes[index] for index in sorted(chosen)]
-    if not early or any(node.op_type in HEAVY for node in early):
+    graph = OnnxGraph(model)
+    names = _leading(graph)
+    early = [node for node in model.graph.node if node.output[0] in names]
+    late = [node for node in model.graph.node if node.output[0] not in names]
+    moved, read = [name for node in early for name in node.output], read_names(late)
+    values = [name for name in moved if name in read]
+    heavy = any(node.op_type in HEAVY for node in early)
+    if heavy or not values or graph.outputs.intersection(moved):
         return None
-    late = [node for index, node in enumerate(nodes) if index not in chosen]
-    outputs = {value.name for value in graph.output}
-    read = read_names(late)
-    given = [name for node in early for name in node.output]
-    values = [name for name in given if name in read]
-    if not values or outputs.intersection(given):
-        return None
-    typed = onnx.shape_inference.infer_shapes(_small(onnx, model, early))
-    types = {value.name: value for value in (*typed.graph.value_info, *typed.graph.input)}
+    part = _model_of(early, graph)
+    typed = graph.onnx.shape_inference.infer_shapes(part).graph
+    types = {value.name: value for value in typed.value_info}
     if any(name not in types for name in values):
         return None
-    early_reads = read_names(early)
-    used = tuple(value.name for value in graph.input if value.name in early_reads)
-    part = _part(onnx, model, early, [types[name] for name in used], [types[name] for name in values])
-    kept = _shorten(onnx, model, late, [types[name] for name in values])
-    return Cut(part, used, tuple(values), kept)
+    part.graph.output.extend(types[name] for name in values)
+    graph.replace_nodes(late)
+    graph.drop_unread_constants()
+    inputs = [value for value in model.graph.input if value.name in read]
+    del model.graph.input[:]
+    model.graph.input.extend([*inputs, *(types[name] for name in values)])
+    return Cut(part, _names(part.graph.input), tuple(values), _names(inputs))
 
 
-def _leading(graph: Any, nodes: list[Any]) -> set[int]:
-    """Return the places of the nodes that lead from an input to Sin or Cos, those included."""
-    dependent = {value.name for value in graph.input}
-    producers: dict[str, int] = {}
-    chosen: set[int] = set()
-    for index, node in enumerate(nodes):
-        producers.update(dict.fromkeys(node.output, index))
-        if not dependent.isdisjoint(reads(node)):
-            dependent.update(node.output)
-            if node.op_type in PERIODIC:
-                chosen.add(index)
-    pending = list(chosen)
+def periodic(model: Any) -> list[Any]:
+    """Return the Sin and Cos nodes whose argument depends on an input of the graph."""
+    live = varying(model)
+    return [node for node in model.graph.node if node.op_type in PERIODIC and not live.isdisjoint(node.input)]
+
+
+def _leading(graph: OnnxGraph) -> set[str]:
+    """Return the first output of each node that leads from an input to Sin or Cos, those included."""
+    pending = periodic(graph.model)
+    names: set[str] = set()
     while pending:
-        for name in reads(nodes[pending.pop()]):
-            before = producers.get(name)
-            if before is not None and before not in chosen:
-                chosen.add(before)
-                pending.append(before)
-    return chosen
+        node = pending.pop()
+        if node.output[0] not in names:
+            names.add(node.output[0])
+            pending.extend(graph.producers[name] for name in reads(node) if name in graph.producers)
+    return names
 
 
-def _small(onnx: Any, model: Any, nodes: list[Any]) -> Any:
-    """Return a model of those nodes alone, with every input and the constants that they read."""
-    read = read_names(nodes)
-    graph = onnx.helper.make_graph(
-        nodes, "phases", [value for value in model.graph.input if value.name in read], [],
-        [tensor for tensor in model.graph.initializer if tensor.name in read],
-    )  # fmt: skip
-    return onnx.helper.make_model(graph, opset_imports=list(model.opset_import), ir_version=model.ir_version)
+def _model_of(nodes: list[Any], graph: OnnxGraph) -> Any:
+    """Return a model of those nodes alone, with the inputs and constants that they read."""
+    helper, read = graph.onnx.helper, read_names(nodes)
+    inputs = [value for value in graph.graph.input if value.name in read]
+    constants = [tensor for name, tensor in graph.constants.items() if name in read]
+    part = helper.make_graph(nodes, "phases", inputs, [], constants)
+    return helper.make_model(part, opset_imports=graph.model.opset_import, ir_version=graph.model.ir_version)
 
 
-def _part(onnx: Any, model: Any, nodes: list[Any], inputs: list[Any], outputs: list[Any]) -> Any:
-    made = _small(onnx, model, nodes)
-    del made.graph.input[:]
-    made.graph.input.extend(inputs)
-    made.graph.output.extend(outputs)
-    return made
-
-
-def _shorten(onnx: Any, model: Any, late: list[Any], values: list[Any]) -> tuple[str, ...]:
-    """Keep the late nodes alone; return the inputs that they still read."""
-    graph = model.graph
-    read = read_names(late)
-    nodes = [onnx.NodeProto.FromString(node.SerializeToString()) for node in late]
-    inputs = [value for value in graph.input if value.name in read]
-    constants = [tensor for tensor in graph.initializer if tensor.name in read]
-    kept = tuple(value.name for value in inputs)
-    inputs = [onnx.ValueInfoProto.FromString(value.SerializeToString()) for value in (*inputs, *values)]
-    constants = list(constants)
-    del graph.node[:]
-    graph.node.extend(nodes)
-    del graph.input[:]
-    graph.input.extend(inputs)
-    rest = [tensor.name for tensor in constants]
-    for index in range(len(graph.initializer) - 1, -1, -1):
-        if graph.initializer[index].name not in rest:
-            del graph.initializer[index]
-    return kept
+def _names(values: Iterable[Any]) -> tuple[str, ...]:
+    return tuple(value.name for value in values)

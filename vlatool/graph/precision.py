@@ -9,17 +9,17 @@ from typing import Any
 def precision_shares(path: Path) -> dict[str, float]:
     """Return precision -> share of the multiply-accumulates (rounded to 0.001, the largest first).
 
-    Layers whose weights alone are quantized are told by those, ``int4 weights``, in whatever form they are stored.
+    Layers whose weights alone are quantized count as ``int4 weights`` and the like, in whatever form they are stored.
     """
     from vlatool.graph.workload import graph_workload
 
-    macs = graph_workload(path, told=_told).macs
+    macs = graph_workload(path, count_as=_by_weights).macs
     total = sum(macs.values()) or 1
     shares = {name: round(count / total, 3) for name, count in macs.items() if count}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _told(node: Any, tensors: Any) -> str:
+def _by_weights(node: Any, tensors: Any) -> str:
     from vlatool.graph.macs import precision_of, weights_alone
 
     alone = weights_alone(node, tensors)

@@ -1,128 +1,125 @@
-"""Put QuantizeLinear / DequantizeLinear pairs around the layers of an ONNX graph that shall be computed in int8."""
+"""Put QuantizeLinear / DequantizeLinear pairs around the layers of an ONNX graph that shall be computed in 8 bits."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import GraphError, require
-from vlatool.graph.layers import (
-    Layer,
-    Style,
-    convolved,
-    hoisted,
-    signed,
-)
-from vlatool.graph.nodes import read_names
+from vlatool.errors import GraphError
+from vlatool.graph.layers import Layer, Style, convolved, hoisted, signed
+from vlatool.graph.onnx_graph import OnnxGraph
 
+Array = NDArray[Any]
 Range = tuple[float, float]
 ACTIVATION = {"uint8": (0, 255, np.uint8), "int8": (-127, 127, np.int8), "int7": (-63, 63, np.int8)}
 INT32 = float(2**31 - 1)
+TINY = np.finfo(np.float32).tiny
 
 
 def insert_qdq(model: Any, layers: Iterable[Layer], ranges: Mapping[str, Range], style: Style) -> None:
-    """Quantize layers in place.
+    """Quantize layers to int8 in place.
 
     Args:
         model: An ``onnx.ModelProto``.
         layers: From ``find_layers`` of the same model.
-        ranges: Value name -> (low, high), of every value that ``wanted_values`` names.
+        ranges: Value name -> (low, high), of every value that ``calibrated_values`` names.
         style: How they are written.
 
     Raises:
         GraphError: when a weight holds NaN or infinity.
     """
-    chosen = list(layers)
-    moved = hoisted(model, chosen, style)
-    _Writer(model, {layer.name: layer for layer in chosen}, ranges, style, moved).write()
-    del model.graph.value_info[:]
+    QdqWriter(model, layers, ranges, style).write()
 
 
-@dataclass
-class _Writer:
-    model: Any
-    layers: Mapping[str, Layer]
-    ranges: Mapping[str, Range]
-    style: Style
-    moved: Mapping[str, str]
-    nodes: list[Any] = field(default_factory=list)
-    made: dict[Any, str] = field(default_factory=dict)
+class QdqWriter(OnnxGraph):
+    """A graph that is rebuilt node by node, in int8; a subclass writes another type.
 
-    def __post_init__(self) -> None:
-        self.onnx = require("onnx", "build")
-        self.graph = self.model.graph
-        self.constants = {tensor.name: tensor for tensor in self.graph.initializer}
-        self.outputs = {value.name for value in self.graph.output}
-        self.convolved = convolved(self.layers.values(), self.style, self.moved)
-        self.signed = signed(self.layers.values(), self.style)
+    Args:
+        model: An ``onnx.ModelProto``, changed in place.
+        layers, ranges, style: As ``insert_qdq`` takes them.
+    """
+
+    codes: ClassVar[str] = "int8"
+    """Ending of the names of stored codes."""
+
+    def __init__(self, model: Any, layers: Iterable[Layer], ranges: Mapping[str, Range], style: Style) -> None:
+        super().__init__(model)
+        self.layers = {layer.name: layer for layer in layers}
+        self.ranges, self.style = ranges, style
+        chosen = self.layers.values()
+        self.moved = hoisted(model, chosen, style)
+        self.convolved, self.signed = convolved(chosen, style, self.moved), signed(chosen, style)
+        convolutions = {layer.output for layer in chosen if layer.kind == "Conv" and style.fused_convolutions}
+        self.fused = convolutions - self.outputs
+        self.nodes: list[Any] = []
+        self.dequantized: dict[Any, str] = {}
 
     def write(self) -> None:
         """Rebuild the list of nodes with the pairs before their first reader."""
+        early: dict[str, str] = {}
         rerouted: dict[str, str] = {}
-        hoisted_to: dict[str, str] = {}
         roots, movers = set(self.moved.values()), self._movers()
-        for name in (value.name for value in self.graph.input if value.name in roots):
-            hoisted_to[name] = self._activation(name)
-        for node in list(self.graph.node):
+        early.update({value.name: self.activation(value.name) for value in self.graph.input if value.name in roots})
+        for node in self.graph.node:
             for index, name in enumerate(node.input):
                 node.input[index] = rerouted.get(name, name)
                 if node.name in movers:
-                    node.input[index] = hoisted_to.get(name, node.input[index])
-            layer = self.layers.get(node.name)
-            if layer is not None:
-                self._quantize(node, layer)
+                    node.input[index] = early.get(name, node.input[index])
+            if node.name in self.layers:
+                self._quantize(node, self.layers[node.name])
             self.nodes.append(node)
-            for name in (name for name in node.output if name in roots):
-                hoisted_to[name] = self._activation(name)
-            conv = self._fused_by(node)
-            if conv is not None:
-                rerouted[conv.output] = self._activation(conv.output)
-        del self.graph.node[:]
-        self.graph.node.extend(self.nodes)
-        used = read_names(self.nodes) | self.outputs
-        kept = [tensor for tensor in self.graph.initializer if tensor.name in used]
-        del self.graph.initializer[:]
-        self.graph.initializer.extend(kept)
+            early.update({name: self.activation(name) for name in node.output if name in roots})
+            if node.output[0] in self.fused:
+                rerouted[node.output[0]] = self.activation(node.output[0])
+        self.replace_nodes(self.nodes)
+        self.drop_unread_constants()
+        del self.graph.value_info[:]
 
     def _movers(self) -> set[str]:
         """Return the nodes between what is quantized early and the layers; other readers keep their float values."""
-        producers = {name: node for node in self.graph.node for name in node.output}
-        found: set[str] = set()
+        movers: set[str] = set()
         for name, root in self.moved.items():
             while name != root:
-                found.add(producers[name].name)
-                name = producers[name].input[0]
-        return found
-
-    def _fused_by(self, node: Any) -> Layer | None:
-        """Return the convolution whose output this node gives, when outputs are quantized."""
-        if not self.style.fused_convolutions:
-            return None
-        for layer in self.layers.values():
-            if layer.kind == "Conv" and layer.output == node.output[0] and layer.output not in self.outputs:
-                return layer
-        return None
+                movers.add(self.producers[name].name)
+                name = self.producers[name].input[0]
+        return movers
 
     def _quantize(self, node: Any, layer: Layer) -> None:
         for index, name in enumerate(node.input):
             if name in layer.activations and name not in self.moved:
-                node.input[index] = self._activation(name)
+                node.input[index] = self.activation(name)
         if not layer.weight:
             return
-        biased = bool(layer.bias) and self.style.fused_convolutions and layer.bias in self.constants
-        weight, scales = self._weight(layer, self._least_scales(layer) if biased else None)
-        node.input[1] = weight
+        biased = self.style.fused_convolutions and layer.bias in self.constants
+        name, codes, scales = self.weight_codes(layer, self._least_scales(layer) if biased else None)
+        key = (name, scales.tobytes())
+        if key not in self.dequantized:
+            if f"{name}.{self.codes}" in self.constants:  # a convolution with the same weight, but other scales
+                name = f"{name}.{layer.name}"
+            stored = self.add_codes(f"{name}.{self.codes}", codes)
+            axis = {"axis": layer.axis} if scales.ndim else {}
+            self.dequantized[key] = self._dequantize(name, [stored, *self.add_scale(name, scales)], **axis)
+        node.input[1] = self.dequantized[key]
         if biased:
             node.input[2] = self._bias(layer, scales)
 
-    def _activation(self, name: str) -> str:
+    def activation(self, name: str) -> str:
         """Return the dequantized twin of a value, made at its first use."""
-        if name in self.made:
-            return self.made[name]
+        if name not in self.dequantized:
+            scale = self.activation_scale(name)
+            self.nodes.append(self.node("QuantizeLinear", [name, *scale], [f"{name}.q"], f"{name}/quantize"))
+            self.dequantized[name] = self._dequantize(name, [f"{name}.q", *scale])
+        return self.dequantized[name]
+
+    def _dequantize(self, name: str, inputs: list[str], **axis: int) -> str:
+        self.nodes.append(self.node("DequantizeLinear", inputs, [f"{name}.dq"], f"{name}/dequantize", **axis))
+        return f"{name}.dq"
+
+    def activation_scale(self, name: str) -> list[str]:
+        """Add the scale and the zero point of an activation; return their names."""
         low, high = self.ranges[name]
         kind: str = self.style.activations
         if kind == "symmetric":
@@ -137,87 +134,51 @@ class _Writer:
         scale = (high - low) / (highest - lowest) if high > low else 1.0
         scale = float(np.float32(scale)) or 1.0
         zero = 0 if kind != "uint8" else int(np.clip(round(-low / scale), lowest, highest))
-        parts = [
-            self._constant(f"{name}.scale", np.array(scale, np.float32)),
-            self._constant(f"{name}.zero", np.array(zero, dtype)),
-        ]
-        made = self.onnx.helper.make_node
-        self.nodes.append(made("QuantizeLinear", [name, *parts], [f"{name}.q"], name=f"{name}/quantize"))
-        self.nodes.append(made("DequantizeLinear", [f"{name}.q", *parts], [f"{name}.dq"], name=f"{name}/dequantize"))
-        self.made[name] = f"{name}.dq"
-        return self.made[name]
+        return [self.add(f"{name}.scale", scale, np.float32), self.add(f"{name}.zero", zero, dtype)]
 
-    def _weight(self, layer: Layer, least: NDArray[np.float32] | None) -> tuple[str, NDArray[np.float32]]:
-        """Return the dequantized twin of a weight and its scales (one, or one for each entry of the axis)."""
-        values = self.onnx.numpy_helper.to_array(self.constants[layer.weight])
-        quantized, scales = quantize_weight(values, layer.axis if self._channels(values) else None,
-                                            63 if self.style.reduce_range else 127, layer.weight, least)  # fmt: skip
-        key = (layer.weight, layer.axis, scales.tobytes())
-        if key in self.made:
-            return self.made[key], scales
-        name = f"{layer.weight}.{layer.axis}"
-        if f"{name}.int8" in self.constants:  # a convolution with the same weight, but other scales for its bias
-            name = f"{name}.{layer.name}"
-        inputs = [
-            self._constant(f"{name}.int8", quantized),
-            self._constant(f"{name}.scale", scales),
-            self._constant(f"{name}.zero", np.zeros(scales.shape, np.int8)),
-        ]
-        axis = {"axis": layer.axis} if scales.ndim else {}
-        self.nodes.append(
-            self.onnx.helper.make_node("DequantizeLinear", inputs, [f"{name}.dq"], name=f"{name}/dequantize", **axis)
-        )
-        self.made[key] = f"{name}.dq"
-        return self.made[key], scales
+    def weight_codes(self, layer: Layer, least: Array | None) -> tuple[str, Array, Array]:
+        """Return the name of a quantized weight, its codes, and its scales: one, or one for each entry of the axis."""
+        values, highest = self.array(layer.weight), 63 if self.style.reduce_range else 127
+        axis = layer.axis if self.style.per_channel and 2 <= values.ndim <= 5 else None
+        return f"{layer.weight}.{layer.axis}", *quantize_weight(values, axis, highest, layer.weight, least)
 
-    def _channels(self, values: NDArray[Any]) -> bool:
-        return self.style.per_channel and (values.ndim == 2 or values.ndim in (3, 4, 5))
+    def add_codes(self, name: str, codes: Array) -> str:
+        """Add a constant of the type that weights are stored in; return its name."""
+        return self.add(name, codes)
 
-    def _bias(self, layer: Layer, scales: NDArray[np.float32]) -> str:
+    def add_scale(self, name: str, scales: Array) -> list[str]:
+        """Add scales and zero points of 0; return their names."""
+        return [self.add(f"{name}.scale", scales), self.add_codes(f"{name}.zero", np.zeros(scales.shape, np.int8))]
+
+    def _bias(self, layer: Layer, scales: Array) -> str:
         """Return the dequantized twin of a bias: int32 with the scale of the products."""
-        key = (layer.bias, layer.name)
-        values = self.onnx.numpy_helper.to_array(self.constants[layer.bias])
-        step = self.onnx.numpy_helper.to_array(self._tensor(f"{layer.activations[0]}.scale"))
-        product = np.broadcast_to((scales * step).astype(np.float32), values.shape).copy()
-        product = np.maximum(product, np.finfo(np.float32).tiny)
-        quantized = np.clip(np.rint(values.astype(np.float64) / product), -INT32, INT32).astype(np.int32)
+        values = self.array(layer.bias)
+        step = np.broadcast_to((scales * self._step(layer)).astype(np.float32), values.shape)
+        step = np.maximum(step, TINY)
+        quantized = np.clip(np.rint(values.astype(np.float64) / step), -INT32, INT32).astype(np.int32)
         name = f"{layer.bias}.{layer.name}"
-        inputs = [
-            self._constant(f"{name}.int32", quantized),
-            self._constant(f"{name}.scale", product),
-            self._constant(f"{name}.zero", np.zeros(product.shape, np.int32)),
-        ]
-        self.nodes.append(
-            self.onnx.helper.make_node("DequantizeLinear", inputs, [f"{name}.dq"], name=f"{name}/dequantize", axis=0)
-        )
-        self.made[key] = f"{name}.dq"
-        return self.made[key]
+        zero = np.zeros(step.shape, np.int32)
+        inputs = [self.add(f"{name}.int32", quantized), self.add(f"{name}.scale", step), self.add(f"{name}.zero", zero)]
+        return self._dequantize(name, inputs, axis=0)
 
-    def _least_scales(self, layer: Layer) -> NDArray[np.float32]:
+    def _least_scales(self, layer: Layer) -> Array:
         """Return the smallest scale of each channel's weights with which its bias still fits into int32.
 
         A bias has the scale of weight times activation. A channel with next to no weights (a dead one whose
         normalisation was folded in) would push its bias out of int32, and the bias is all that such a channel gives.
         """
-        bias = np.abs(self.onnx.numpy_helper.to_array(self.constants[layer.bias]).astype(np.float64))
-        step = float(self.onnx.numpy_helper.to_array(self._tensor(f"{layer.activations[0]}.scale")))
-        least: NDArray[np.float32] = np.minimum(bias / (step * INT32 / 2), np.finfo(np.float32).max).astype(np.float32)
-        return least
+        bias = np.abs(self.array(layer.bias).astype(np.float64))
+        least = np.minimum(bias / (float(self._step(layer)) * INT32 / 2), np.finfo(np.float32).max)
+        return least.astype(np.float32)
 
-    def _constant(self, name: str, values: NDArray[Any]) -> str:
-        if name not in self.constants:
-            tensor = self.onnx.numpy_helper.from_array(values, name)
-            self.constants[name] = tensor
-            self.graph.initializer.append(tensor)
-        return name
-
-    def _tensor(self, name: str) -> Any:
-        return self.constants[name]
+    def _step(self, layer: Layer) -> Array:
+        """Return the scale of what a layer reads, float32 ()."""
+        return self.array(f"{layer.activations[0]}.scale")
 
 
 def quantize_weight(
-    values: NDArray[Any], axis: int | None, highest: int, name: str, least: NDArray[np.float32] | None = None
-) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
+    values: Array, axis: int | None, highest: int, name: str, least: Array | None = None
+) -> tuple[Array, Array]:
     """Quantize a weight symmetrically to int8.
 
     Args:
@@ -233,17 +194,23 @@ def quantize_weight(
     Raises:
         GraphError: when the weight holds NaN or infinity.
     """
-    if not np.isfinite(values).all():
-        raise GraphError(f"The weight '{name}' holds NaN or infinity.", "look at the checkpoint")
-    others = tuple(index for index in range(values.ndim) if index != axis) if axis is not None else None
-    largest = np.abs(values).max(axis=others) if values.size else np.zeros((), np.float32)
+    largest, shape = channel_peaks(values, axis, name)
     scales = np.where(largest > 0, largest / highest, 1.0).astype(np.float32)
-    scales = np.where(scales > 0, scales, np.finfo(np.float32).tiny).astype(np.float32)
+    scales = np.where(scales > 0, scales, TINY).astype(np.float32)
     if least is not None:
         lowest = least if axis is not None else least.max(initial=0.0)
         scales = np.where((largest == 0) & (lowest > 0), lowest, np.maximum(scales, lowest)).astype(np.float32)
-    shape = [1] * values.ndim
-    if axis is not None:
-        shape[axis] = -1
-    quantized = np.clip(np.rint(values / scales.reshape(shape)), -highest, highest).astype(np.int8)
-    return quantized, scales
+    return np.clip(np.rint(values / scales.reshape(shape)), -highest, highest).astype(np.int8), scales
+
+
+def channel_peaks(values: Array, axis: int | None, name: str) -> tuple[Array, list[int]]:
+    """Return the largest magnitude for each entry of an axis, or of all, and the shape in which it meets the values.
+
+    Raises:
+        GraphError: when the weight of that name holds NaN or infinity.
+    """
+    if not np.isfinite(values).all():
+        raise GraphError(f"The weight '{name}' holds NaN or infinity.", "look at the checkpoint")
+    others = None if axis is None else tuple(index for index in range(values.ndim) if index != axis)
+    largest: Array = np.abs(values).max(axis=others) if values.size else np.zeros((), np.float32)
+    return largest, [-1 if index == axis else 1 for index in range(values.ndim)]

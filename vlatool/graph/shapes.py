@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import require
+from vlatool.graph.nodes import nodes_inside
+from vlatool.graph.onnx_graph import LARGE, static_shape
 
 Shape = tuple[int, ...]
 
@@ -21,8 +23,6 @@ SAME_SHAPE_AS = {
 """Contributed operator -> the standard one with the same output shape; ONNX infers shapes of standard ones only."""
 UNCHANGED = {"DequantizeLinear", "QuantizeLinear", "Transpose", "Reshape", "Squeeze", "Unsqueeze", "Cast", "Identity"}
 """Operators whose output holds the numbers of their first input, in another type or order."""
-LARGE = 4096
-"""Bytes from which an initializer is taken for a weight; shapes that nodes read are smaller."""
 
 
 class Tensors:
@@ -40,7 +40,7 @@ class Tensors:
         self._shapes: dict[str, Shape | None] = {}
         for value in (*graph.input, *graph.value_info, *graph.output):
             self._types[value.name] = value.type.tensor_type.elem_type
-            self._shapes[value.name] = _static(value.type.tensor_type)
+            self._shapes[value.name] = static_shape(value.type.tensor_type)
         for item in graph.initializer:
             self._types[item.name], self._shapes[item.name] = item.data_type, tuple(item.dims)
         self._producers = {name: node for node in nodes for name in node.output if name}
@@ -173,22 +173,6 @@ def _standard(onnx: Any, node: Any, graph: Any) -> list[Any]:
     return [replacement]
 
 
-def _static(tensor_type: Any) -> Shape | None:
-    if not tensor_type.HasField("shape"):
-        return None
-    axes = tensor_type.shape.dim
-    return tuple(axis.dim_value for axis in axes) if all(axis.HasField("dim_value") for axis in axes) else None
-
-
 def bits(dtype: str) -> int:
     """Return the bits of one element; 8 for a dtype without a number in its name."""
     return int("".join(character for character in dtype if character.isdigit()) or 8)
-
-
-def nodes_inside(node: Any) -> Iterator[Any]:
-    """Yield the nodes of the graphs inside of a node (If, Loop, Scan), and of those inside of them."""
-    for item in node.attribute:
-        for graph in (item.g, *item.graphs):
-            for inner in graph.node:
-                yield inner
-                yield from nodes_inside(inner)

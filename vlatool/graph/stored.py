@@ -38,22 +38,23 @@ def read_workload(file: Path, of: str = "") -> Workload | None:
         file: The file.
         of: ``digest`` that it must have.
     """
+    data = _content(file)
+    return from_values(data) if data.get("digest", "") == of else None
+
+
+def _content(file: Path) -> dict[str, Any]:
+    """Return what a file of JSON holds; nothing when it is missing, damaged or of something else."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if not isinstance(data, dict) or data.get("digest", "") != of:
-        return None
-    return from_values(data)
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return data if isinstance(data, dict) else {}
 
 
 def is_workload(file: Path) -> bool:
     """Say whether a file is one of this package's, of an earlier layout too, which nobody reads any more."""
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    if not isinstance(data, dict) or not isinstance(data.get("layout"), int):
+    data = _content(file)
+    if not isinstance(data.get("layout"), int):
         return False
     return from_values(data) is not None if data["layout"] >= LAYOUT else isinstance(data.get("graphs"), dict)
 
@@ -70,7 +71,7 @@ def from_values(data: Any) -> Workload | None:
             counts = [fields[key] for key in COUNTS] + list(fields["macs"].values())
             counts += [number for part in fields["parts"].values() for number in part]
             fours = all(len(part) == 4 for part in fields["parts"].values())
-            if not fours or not all(isinstance(each, int) and each >= 0 for each in counts):
+            if not fours or not all(isinstance(count, int) and count >= 0 for count in counts):
                 return None
             graphs[name] = GraphWorkload(**fields)
         return Workload(graphs, {name: int(data["runs"][name]) for name in data["runs"] if name in graphs})
@@ -86,15 +87,11 @@ def refuse_other(file: Path) -> None:
     """
     if not os.path.lexists(file):
         return
-    try:
-        data = {} if file.is_symlink() else json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        data = {}
-    if not isinstance(data, dict) or set(data) != {"layout", "digest", "graphs", "runs"}:
-        raise OutputError(f"{file} is none that vlatool wrote.", "move it away yourself")
+    if file.is_symlink() or set(_content(file)) != {"layout", "digest", "graphs", "runs"}:
+        raise OutputError(f"{file} was not written by vlatool.", "move it away yourself")
 
 
-def write_workload(file: Path, found: Workload, of: str = "") -> None:
+def write_workload(file: Path, work: Workload, of: str = "") -> None:
     """Write a workload as ``read_workload`` reads it.
 
     Raises:
@@ -102,14 +99,14 @@ def write_workload(file: Path, found: Workload, of: str = "") -> None:
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(file) as draft:
-        data = {**to_values(found), "digest": of}
+        data = {**to_values(work), "digest": of}
         draft.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
-def to_values(found: Workload) -> dict[str, Any]:
+def to_values(work: Workload) -> dict[str, Any]:
     """Return a workload as JSON values."""
     graphs: dict[str, Any] = {}
-    for name, graph in found.graphs.items():
+    for name, graph in work.graphs.items():
         fields = dataclasses.asdict(graph)
         graphs[name] = {**fields, "traits": sorted(graph.traits), "macs": dict(graph.macs)}
-    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(found.runs)}
+    return {"layout": LAYOUT, "graphs": graphs, "runs": dict(work.runs)}

@@ -124,14 +124,14 @@ def workload(bundle: Bundle) -> Workload:
 
 
 def graph_workload(
-    path: Path, parts: Mapping[str, Sequence[str]] | None = None, told: Callable[[Any, Tensors], str] = precision_of
+    path: Path, parts: Mapping[str, Sequence[str]] | None = None, count_as: Callable[[Any, Tensors], str] = precision_of
 ) -> GraphWorkload:
     """Count the work of one run of an ONNX file; a free first axis counts as 1.
 
     Args:
         path: The file.
         parts: Part of the policy -> globs of module names, to count each by itself.
-        told: What the multiply-accumulates of a layer are counted as.
+        count_as: What the multiply-accumulates of a layer are counted as.
 
     Raises:
         GraphError: when the file cannot be read.
@@ -143,7 +143,7 @@ def graph_workload(
     except Exception as error:  # the seam: every exception type of onnx and protobuf becomes ours
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
-    return _count(tensors, parts or {}, told)
+    return _count(tensors, parts or {}, count_as)
 
 
 def part_named(name: str, parts: Mapping[str, Sequence[str]]) -> str:
@@ -156,7 +156,9 @@ def _matches(names: Iterable[str], globs: Iterable[str]) -> bool:
     return any(fnmatch.fnmatchcase(name, glob) for name in names for glob in globs)
 
 
-def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]], told: Callable[[Any, Tensors], str]) -> GraphWorkload:
+def _count(
+    tensors: Tensors, parts: Mapping[str, Sequence[str]], count_as: Callable[[Any, Tensors], str]
+) -> GraphWorkload:
     macs: Counter[str] = Counter()
     tally = Tally()
     activation_bytes = 0
@@ -171,7 +173,7 @@ def _count(tensors: Tensors, parts: Mapping[str, Sequence[str]], told: Callable[
             tally.layers += 1
             unknown.append(node.name or node.output[0])
             continue
-        macs[told(node, tensors)] += count
+        macs[count_as(node, tensors)] += count
         activation_bytes += sum(size or 0 for size in written)
         part = part_named(node.name, parts)
         written_numbers = math.prod(tensors.shape(node.output[0]) or ())
@@ -240,9 +242,9 @@ class Tally:
         self._products += macs if not weights else 0
         self._rows += weights if macs <= ONE_ROW * weights else 0
 
-    def concat(self, found: bool) -> None:
+    def concat(self, concatenates: bool) -> None:
         """Take in a node that may be a concatenation."""
-        self._concats += found
+        self._concats += concatenates
 
     def parts(self) -> dict[str, tuple[int, int, int, int]]:
         """Return the sums of each part; nothing when all layers are of none."""

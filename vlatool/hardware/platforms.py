@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from vlatool.errors import ProfileError, nearest
-from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_yaml
-from vlatool.hardware.profile import SUFFIXES, Kind
+from vlatool.hardware.profile import NAME, SUFFIXES, Kind, Strict
 
 
-class Platform(Numeric):
+class Platform(Strict):
     """A kind of robot.
 
     Args:
@@ -23,9 +22,7 @@ class Platform(Numeric):
         sensors: With their rates.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$")
+    name: str = Field(pattern=NAME)
     title: str
     control_hz: float = Field(gt=0)
     compute_watts: float = Field(gt=0)
@@ -51,11 +48,11 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
         >>> load_platform("quadcopter").compute_watts
         15.0
     """
-    wanted = os.fspath(name_or_path)
-    own = wanted.endswith(SUFFIXES) or os.sep in wanted
-    path = Path(wanted) if own else _folder() / f"{wanted}.yaml"
-    if not own and wanted not in platform_names():
-        raise ProfileError(f"Unknown platform '{wanted}'; {nearest(wanted, platform_names())}.")
+    name = os.fspath(name_or_path)
+    own = name.endswith(SUFFIXES) or os.sep in name
+    path = Path(name) if own else _folder() / f"{name}.yaml"
+    if not own and name not in platform_names():
+        raise ProfileError(f"Unknown platform '{name}'; {nearest(name, platform_names())}.")
     try:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:

@@ -35,16 +35,13 @@ COMPUTED = ("float32", "float16", "bfloat16", "float8", "int8", "w8", "w4")
 DTYPES = ("float32", "tf32", "float16", "bfloat16", "float8", "int8", "int4", "float4")
 
 
-def _known_dtype(name: str) -> str:
-    if name not in DTYPES:
-        raise ValueError(f"is not a dtype; {nearest(name, DTYPES)}")
-    return name
+def _one_of(known: tuple[str, ...], what: str) -> AfterValidator:
+    def check(name: str) -> str:
+        if name not in known:
+            raise ValueError(f"is not {what}; {nearest(name, known)}")
+        return name
 
-
-def _known_computed(name: str) -> str:
-    if name not in COMPUTED:
-        raise ValueError(f"is not what an engine computes in; {nearest(name, COMPUTED)}")
-    return name
+    return AfterValidator(check)
 
 
 def _version(text: str) -> str:
@@ -53,16 +50,18 @@ def _version(text: str) -> str:
     return text
 
 
-Dtype = Annotated[str, AfterValidator(_known_dtype)]
-Computed = Annotated[str, AfterValidator(_known_computed)]
+Dtype = Annotated[str, _one_of(DTYPES, "a dtype")]
+Computed = Annotated[str, _one_of(COMPUTED, "what an engine computes in")]
 Version = Annotated[str, AfterValidator(_version)]
 
 
-class _Strict(Numeric):
+class Strict(Numeric):
+    """Base of what a YAML file of a board or robot holds: frozen, and without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Figure(_Strict):
+class Figure(Strict):
     """A number with its source; the unit is in the name of the field that holds it.
 
     Args:
@@ -84,7 +83,7 @@ class Price(Figure):
     year: int = Field(ge=2000)
 
 
-class Unit(_Strict):
+class Unit(Strict):
     """A part of the board that computes: its processor cores or its GPU.
 
     Args:
@@ -107,7 +106,7 @@ class Unit(_Strict):
     absent: tuple[str, ...] = ()
 
 
-class EngineFigures(_Strict):
+class EngineFigures(Strict):
     """An engine that runs on the board.
 
     Args:
@@ -130,7 +129,7 @@ class EngineFigures(_Strict):
     note: str = ""
 
 
-class PowerMode(_Strict):
+class PowerMode(Strict):
     """Caps of a power mode, in absolute numbers for each unit; ``kind`` and ``source`` speak for all of them.
 
     ``power_w`` is None when the mode has no budget.
@@ -145,7 +144,7 @@ class PowerMode(_Strict):
     note: str = ""
 
 
-class Software(_Strict):
+class Software(Strict):
     """What comes with one release of the board's system; ``engines``: engine -> the version that runs on it."""
 
     release: str
@@ -158,7 +157,7 @@ class Software(_Strict):
     source: str
 
 
-class Profile(_Strict):
+class Profile(Strict):
     """A hardware target.
 
     Args:
@@ -231,10 +230,10 @@ class Profile(_Strict):
         Raises:
             ProfileError: when the board has no such mode.
         """
-        wanted = self.default_mode if name is None else name
-        if wanted not in self.modes:
-            raise ProfileError(f"{self.name} has no power mode '{wanted}'; {nearest(wanted, self.modes)}.")
-        return self.modes[wanted]
+        chosen = self.default_mode if name is None else name
+        if chosen not in self.modes:
+            raise ProfileError(f"{self.name} has no power mode '{chosen}'; {nearest(chosen, self.modes)}.")
+        return self.modes[chosen]
 
     def peak_tops(self, unit: str, dtype: str, mode: str | None = None) -> float | None:
         """Return the dense peak in 10^12 operations per second in a power mode; None where it is not known.
@@ -291,7 +290,7 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
     load_profile(like)
     path = _file_of(like)
     if not re.fullmatch(NAME, name):
-        raise ProfileError(f"'{name}' is no name of a profile; allowed: lower-case letters, digits and hyphens.")
+        raise ProfileError(f"'{name}' is not a valid profile name; allowed: lower-case letters, digits and hyphens.")
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
     text = re.sub(r"(?m)^aliases:.*\n(?:[ \t]+.*\n|- .*\n|\]\n)*", "", text, count=1)
     try:
@@ -308,27 +307,27 @@ def _file_of(wanted: str) -> Path:
     """
     if wanted.endswith(SUFFIXES) or os.sep in wanted:
         return Path(wanted)
-    found = _found()
-    if wanted in found:
-        return found[wanted]
+    files = _found()
+    if wanted in files:
+        return files[wanted]
     typed = re.sub(r"[\s_]+", "-", wanted.strip().lower())
-    boards = {**_aliases(found), **{name: name for name in found}}
+    boards = {**_aliases(files), **{name: name for name in files}}
     if typed in boards:
-        return found[boards[typed]]
+        return files[boards[typed]]
     near = difflib.get_close_matches(typed, boards, n=1)
-    listing = f"known: {', '.join(sorted(found))}"
+    listing = f"known: {', '.join(sorted(files))}"
     fix = f"name one of these or a YAML file, or add a directory to {SEARCH_PATH}"
-    told = f"did you mean '{boards[near[0]]}'? {listing}" if near else listing
-    raise ProfileError(f"Unknown profile '{wanted}'; {told}.", fix)
+    hint = f"did you mean '{boards[near[0]]}'? {listing}" if near else listing
+    raise ProfileError(f"Unknown profile '{wanted}'; {hint}.", fix)
 
 
-def _aliases(found: Mapping[str, Path]) -> dict[str, str]:
+def _aliases(files: Mapping[str, Path]) -> dict[str, str]:
     """Return other name -> name of a profile; files that cannot be read have none."""
     known: dict[str, str] = {}
-    for name, path in found.items():
+    for name, path in files.items():
         with contextlib.suppress(ProfileError):
             listed = read_mapping(path, f"The profile {path}", ProfileError).get("aliases")
-            known |= {str(each): name for each in listed if each not in known} if isinstance(listed, list) else {}
+            known |= {str(alias): name for alias in listed if alias not in known} if isinstance(listed, list) else {}
     return known
 
 

@@ -74,8 +74,8 @@ class Place:
 
     def peak(self, precision: str) -> float:
         """Return the peak that a precision computes at: that of float16, or float32, for weights alone in few bits."""
-        wanted = {"w4": "float16", "w8": "float16"}.get(precision, precision)
-        chain = (wanted, ALIKE.get(wanted, wanted), "float16" if wanted in ALIKE else "float32", "float32")
+        computed = {"w4": "float16", "w8": "float16"}.get(precision, precision)
+        chain = (computed, ALIKE.get(computed, computed), "float16" if computed in ALIKE else "float32", "float32")
         return next((self.peaks[name] for name in chain if name in self.peaks), max(self.peaks.values()))
 
 
@@ -129,7 +129,7 @@ def rows_of(questions: Iterable[Question], shares: Shares) -> Rows:
     asked = list(questions)
     keys = [_keys(question) for question in asked]
     return Rows(
-        {name: np.array([each[name] for each in keys], np.int64) for name in KEYS},
+        {name: np.array([row[name] for row in keys], np.int64) for name in KEYS},
         np.array([_model(question.work) for question in asked]).reshape(-1, 4),
         np.array([[trait in question.work.traits for trait in TRAITS] for question in asked], float).reshape(-1, 5),
         np.array([_device(question) for question in asked]).reshape(-1, 4),

@@ -89,9 +89,9 @@ def tune(
             better = False
             for step in (steps[name], -steps[name]):
                 tried = _changed(scales, shares, name, math.exp(step))
-                found = assess(sample, *tried) if tried else math.inf
-                if found < best - 1e-4:
-                    (scales, shares), best, better = tried or (scales, shares), found, True
+                cost = assess(sample, *tried) if tried else math.inf
+                if cost < best - 1e-4:
+                    (scales, shares), best, better = tried or (scales, shares), cost, True
                     steps[name] = step
                     tell(f"{time.monotonic() - begun:.0f} s, {name}: {best:.4f}")
                     break
@@ -114,14 +114,14 @@ def conformal(sample: Sample, scales: Scales, shares: Shares) -> dict[str, dict[
     """
     rows = rows_of(sample.questions, shares)
     folds = Folds(rows, sample, scales)
-    found: dict[str, dict[str, float]] = {}
+    spans: dict[str, dict[str, float]] = {}
     for regime, scores in (
         ("known", Scores.of(sample, *folds.without(sample.models), sample.models, sample.models)),
         ("unseen", Scores.of(sample, *folds.without(sample.devices), sample.devices, rows.keys["pair"])),
         ("calibrated", Scores.calibrated(sample, folds)),
     ):
-        found[regime] = {unit: scores.reach(number) for number, unit in enumerate(UNITS)}
-    return found
+        spans[regime] = {unit: scores.reach(number) for number, unit in enumerate(UNITS)}
+    return spans
 
 
 ALL_COUNT = 4
@@ -159,11 +159,11 @@ class Scores:
         order = np.argsort(sample.figures, kind="stable")
         starts = np.searchsorted(sample.figures[order], np.arange(len(sample.logs) + 1))
         copies = np.diff(starts)[places]  # versions of each row
-        each = np.repeat(np.arange(len(places)), copies)
-        figure = order[np.repeat(starts[places] - np.append(0, np.cumsum(copies)[:-1]), copies) + np.arange(len(each))]
-        at = places[each]
-        values = np.abs(error[each] + sample.logs[at] - sample.published[figure]) / deviation[each]
-        return Scores(values, sample.devices[at], sample.units[at], draws[each])
+        copy = np.repeat(np.arange(len(places)), copies)
+        figure = order[np.repeat(starts[places] - np.append(0, np.cumsum(copies)[:-1]), copies) + np.arange(len(copy))]
+        at = places[copy]
+        values = np.abs(error[copy] + sample.logs[at] - sample.published[figure]) / deviation[copy]
+        return Scores(values, sample.devices[at], sample.units[at], draws[copy])
 
     def reach(self, unit: int, but: int | None = None) -> float:
         """Return the score that ``LEVEL`` do not exceed: this unit's, drawn towards all units' where it has few groups.
@@ -192,17 +192,6 @@ class Scores:
 
 
 PARTS = ("processors", "npu")
-
-
-def fitted(points: Sequence[Point], like: LatencyModel) -> LatencyModel:
-    """Return the model with the scales of another one, given these points."""
-    parts: dict[str, Known] = {}
-    for part, mine in by_part(points).items():
-        if not mine:
-            continue
-        sample = Sample.of(mine)
-        parts[part] = Known(rows_of(sample.questions, like.shares[part]), sample.logs, like.parts[part].scales)
-    return LatencyModel(parts, like.shares, like.conformal, like.about)
 
 
 def by_part(points: Sequence[Point]) -> dict[str, list[Point]]:
@@ -249,10 +238,10 @@ def fit(
         begin = (Scales(), Shares())
         if before is not None and part in before.parts:
             begin = (before.parts[part].scales, before.shares[part])
-        told: list[str] = []
+        progress: list[str] = []
         share = seconds * work[part] / sum(work.values())
-        scales, shares[part] = tune(Sample.of(few[part]), *begin, share, seed, told.append)
-        for line in told[-3:]:
+        scales, shares[part] = tune(Sample.of(few[part]), *begin, share, seed, progress.append)
+        for line in progress[-3:]:
             tell(line)
         bounds[part] = conformal(sample, scales, shares[part])
         parts[part] = Known(rows_of(sample.questions, shares[part]), sample.logs, scales)
@@ -275,7 +264,7 @@ def _refuse_other(out: Path) -> None:
     except (OSError, ValueError, TypeError, RecursionError):
         ours = False
     if not ours:
-        raise OutputError(f"{present[0]} is no model that vlatool wrote.", "name another directory, or move it away")
+        raise OutputError(f"{present[0]} is not a model that vlatool wrote.", "name another directory, or move it away")
 
 
 def fit_files(
@@ -293,13 +282,12 @@ def fit_files(
         OutputError: when other files have the names of the model's.
     """
     _refuse_other(out)
-    _refuse_other(out)
     points = read_points(path)
     shipped = not anew and (DATA / "latency.json").is_file()
     before = read_model(DATA) if shipped else None  # and not the user's own: the search begins at what was shipped
     if not any(point.question for point in points):
         raise DataError(f"{path} has no row to fit on: {next(point.why for point in points)}.")
     out.mkdir(parents=True, exist_ok=True)  # before the search: its minutes are not to be lost
-    found = fit(points, before, seconds, seed, tell)
-    write(found, out)
+    model = fit(points, before, seconds, seed, tell)
+    write(model, out)
     tell(f"written: {out / 'latency.npz'}, {out / 'latency.json'}")

@@ -52,7 +52,7 @@ class Sample:
         row = {point.question: place for place, point in enumerate(known)}
         figures = np.array([row[point.question] for point in asked], np.int64)
         published = np.array([point.log_ms for point in asked])
-        models, devices = (_codes([getattr(each, name) for each in known]) for name in ("model", "group"))
+        models, devices = (_codes([getattr(point, name) for point in known]) for name in ("model", "group"))
         units = np.array([UNITS.index(point.kind) for point in known])
         questions = tuple(point.question for point in known if point.question is not None)
         logs = np.array([point.log_ms for point in known])
@@ -105,18 +105,14 @@ class Folds:
             models = np.unique(self._sample.models[index])
             for model in models[:: max(1, -(-len(models) // most))]:
                 seen = self._sample.models[index] == model
-                rest = ~seen
-                if not rest.any():
-                    continue
-                across = covariance[np.ix_(rest, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
-                told = self._residual[index][seen] - mean[seen]
-                errors.append(mean[rest] + across @ told - self._residual[index][rest])
-                spread = np.diag(covariance)[rest] - np.einsum("ij,ij->i", across, covariance[np.ix_(rest, seen)])
-                deviations.append(np.sqrt(np.maximum(spread, 1e-9)))
-                places.append(index[rest])
+                if not seen.all():
+                    error, deviation = self._given(seen, index, mean, covariance)
+                    errors.append(error)
+                    deviations.append(deviation)
+                    places.append(index[~seen])
         if not errors:  # every device has one model alone
             return np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)
-        draws = np.repeat(np.arange(len(places)), [len(each) for each in places])
+        draws = np.repeat(np.arange(len(places)), [len(part) for part in places])
         return np.concatenate(errors), np.concatenate(deviations), np.concatenate(places), draws
 
     def once(self, groups: Array, random: np.random.Generator) -> tuple[Array, Array, Array]:
@@ -126,19 +122,22 @@ class Folds:
             Error and standard deviation of each row, and which rows were told.
         """
         error, deviation = np.zeros(len(groups)), np.ones(len(groups))
-        told = np.zeros(len(groups), bool)
+        taught = np.zeros(len(groups), bool)
         for index, mean, covariance in self._each(groups):
             models = np.unique(self._sample.models[index])
             seen = self._sample.models[index] == models[random.integers(len(models))]
-            told[index[seen]] = True
-            if seen.all():
-                continue
-            across = covariance[np.ix_(~seen, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
-            known = self._residual[index][seen] - mean[seen]
-            error[index[~seen]] = mean[~seen] + across @ known - self._residual[index][~seen]
-            spread = np.diag(covariance)[~seen] - np.einsum("ij,ij->i", across, covariance[np.ix_(~seen, seen)])
-            deviation[index[~seen]] = np.sqrt(np.maximum(spread, 1e-9))
-        return error, deviation, told
+            taught[index[seen]] = True
+            if not seen.all():
+                error[index[~seen]], deviation[index[~seen]] = self._given(seen, index, mean, covariance)
+        return error, deviation, taught
+
+    def _given(self, seen: Array, index: Array, mean: Array, covariance: Array) -> tuple[Array, Array]:
+        """Return error and standard deviation of a group's other rows, once the process is told those that are seen."""
+        residual, rest = self._residual[index], ~seen
+        across = covariance[np.ix_(rest, seen)] @ np.linalg.inv(covariance[np.ix_(seen, seen)])
+        error = mean[rest] + across @ (residual[seen] - mean[seen]) - residual[rest]
+        spread = np.diag(covariance)[rest] - np.einsum("ij,ij->i", across, covariance[np.ix_(rest, seen)])
+        return error, np.sqrt(np.maximum(spread, 1e-9))
 
     def _each(self, groups: Array) -> Iterator[tuple[Array, Array, Array]]:
         for code in np.unique(groups):

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 Array = NDArray[Any]
 
@@ -105,14 +106,14 @@ def kernel(first: Rows, second: Rows, scales: Scales) -> Array:
     """Return the covariance of two sets of rows without noise, (n, m)."""
     lengths = np.array([scales.length_macs, scales.length_activations, scales.length_weights, scales.length_layers])
     models = [np.hstack([rows.model / lengths, rows.traits / scales.length_traits]) for rows in (first, second)]
-    found = np.empty((len(first), len(second)))
+    covariance = np.empty((len(first), len(second)))
     for begin in range(0, len(first), BLOCK):
         part = slice(begin, begin + BLOCK)
         keys = {name: values[part] for name, values in first.keys.items()}
         smooth, near = _alike(_squares(models[0][part], models[1]))
         places = _squares(first.device[part], second.device)
-        found[part] = _covariance(keys, second.keys, smooth, near, places, scales)
-    return found
+        covariance[part] = _covariance(keys, second.keys, smooth, near, places, scales)
+    return covariance
 
 
 def _alike(squares: Array) -> tuple[Array, Array]:
@@ -126,21 +127,21 @@ def _covariance(
     def same(name: str) -> Array:
         return np.asarray(first[name][:, None] == second[name][None])
 
-    found = scales.constant**2 + scales.all_m**2 * smooth
-    found += same("runtime") * scales.runtime**2
+    covariance = scales.constant**2 + scales.all_m**2 * smooth
+    covariance += same("runtime") * scales.runtime**2
     twins = np.exp(places / (-2 * scales.length_kind**2))
-    found += same("kind") * (scales.kind**2 + scales.kind_m**2 * smooth + scales.kind_d**2 * twins)
+    covariance += same("kind") * (scales.kind**2 + scales.kind_m**2 * smooth + scales.kind_d**2 * twins)
     alike = np.exp(places / (-2 * scales.length_device**2))
-    found += same("unit") * (scales.unit_d**2 * alike + scales.unit_m**2 * smooth)
-    found += same("core") * scales.core**2
-    found += same("made") * (scales.made**2 + scales.made_m**2 * smooth)
-    found += same("device") * scales.device**2
-    found += same("line") * scales.line**2
-    found += same("pair") * (scales.pair**2 + scales.pair_m**2 * smooth)
-    found += same("setting") * (scales.setting**2 + scales.setting_m**2 * near)
-    found += same("model") * scales.model**2
-    found += same("known") * scales.known**2
-    return np.asarray(found)
+    covariance += same("unit") * (scales.unit_d**2 * alike + scales.unit_m**2 * smooth)
+    covariance += same("core") * scales.core**2
+    covariance += same("made") * (scales.made**2 + scales.made_m**2 * smooth)
+    covariance += same("device") * scales.device**2
+    covariance += same("line") * scales.line**2
+    covariance += same("pair") * (scales.pair**2 + scales.pair_m**2 * smooth)
+    covariance += same("setting") * (scales.setting**2 + scales.setting_m**2 * near)
+    covariance += same("model") * scales.model**2
+    covariance += same("known") * scales.known**2
+    return np.asarray(covariance)
 
 
 def _squares(first: Array, second: Array) -> Array:
@@ -164,8 +165,8 @@ class Process:
         self.noise = np.full(len(rows), scales.noise) if noise is None else noise
         covariance = kernel(rows, rows, scales)
         covariance[np.diag_indices(len(rows))] += self.noise**2
-        self._whiten = lower_inverse(np.linalg.cholesky(covariance))
-        self._weights = self._whiten.T @ (self._whiten @ (logs - rows.prior))
+        self._factor = cholesky(covariance, lower=True, overwrite_a=True)
+        self._weights = cho_solve((self._factor, True), logs - rows.prior)
 
     def predict(self, questions: Rows) -> tuple[Array, Array]:
         """Return mean and standard deviation of log(ms) of each question; the noise of a measurement is in it."""
@@ -176,18 +177,5 @@ class Process:
         """Return mean (n,) and covariance (n, n) of log(ms) without noise."""
         across = kernel(self.rows, questions, self.scales)
         mean = questions.prior + across.T @ self._weights
-        half = self._whiten @ across
+        half = solve_triangular(self._factor, across, lower=True)
         return mean, kernel(questions, questions, self.scales) - half.T @ half
-
-
-def lower_inverse(factor: Array) -> Array:
-    """Return the inverse of a lower triangular matrix, by halves: nearly all of it is matrix products."""
-    count = len(factor)
-    if count <= 64:
-        return np.linalg.inv(factor)
-    half = count // 2
-    found = np.zeros_like(factor)
-    found[:half, :half] = lower_inverse(factor[:half, :half])
-    found[half:, half:] = lower_inverse(factor[half:, half:])
-    found[half:, :half] = -found[half:, half:] @ (factor[half:, :half] @ found[:half, :half])
-    return found

@@ -106,12 +106,12 @@ class LatencyModel:
 
     def predict(self, questions: Sequence[Question]) -> list[Predicted]:
         """Answer every question, in order."""
-        found = [Predicted(math.nan, why="the latency model has no figures of such a unit")] * len(questions)
+        answers = [Predicted(math.nan, why="the latency model has no figures of such a unit")] * len(questions)
         for part in self.parts:
             places = [place for place, question in enumerate(questions) if part_of(question) == part]
-            for place, answer in zip(places, self._answers(part, [questions[each] for each in places]), strict=True):
-                found[place] = answer
-        return found
+            for place, answer in zip(places, self._answers(part, [questions[index] for index in places]), strict=True):
+                answers[place] = answer
+        return answers
 
     def conditioned(self, measured: Sequence[tuple[Question, float]]) -> LatencyModel:
         """Return the model that also knows what a user measured: (question, ms)."""
@@ -134,24 +134,24 @@ class LatencyModel:
         rows = rows_of(questions, self.shares[part])
         mean, deviation = self._process(part, rows).predict(rows)
         pairs, runtimes = (set(known.rows.keys[name].tolist()) for name in ("pair", "runtime"))
-        found = []
+        answers = []
         for number, question in enumerate(questions):
             regime = "known" if int(rows.keys["pair"][number]) in pairs else "unseen"
             if int(rows.keys["device"][number]) in self.own:
                 regime = "calibrated"
             if why := no_ground(question, int(rows.keys["runtime"][number]) in runtimes, regime != "unseen"):
-                found.append(Predicted(math.nan, regime=regime, why=why))
+                answers.append(Predicted(math.nan, regime=regime, why=why))
                 continue
             spans = self.conformal[part][regime]
             half = float(spans.get(question.place.unit, max(spans.values())) * deviation[number])
             if half > WIDEST:
                 factor = math.exp(half)
                 reason = f"published figures leave a factor of {factor:.1f} either way; measure it on the board"
-                found.append(Predicted(math.nan, regime=regime, why=reason))
+                answers.append(Predicted(math.nan, regime=regime, why=reason))
                 continue
             ms = math.exp(mean[number])
-            found.append(Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime))
-        return found
+            answers.append(Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime))
+        return answers
 
     def _process(self, part: str, rows: Rows) -> Process:
         """Return the process for some questions.
@@ -203,7 +203,7 @@ def shipped() -> LatencyModel:
     except DAMAGE as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
         fix = f"unset {PLACE}, or make one: vlatool hwselect fit POINTS.csv -o DIR" if own else "install vlatool again"
-        raise DataError(f"There is no latency model in {own or DATA}: {reason}.", fix) from error
+        raise DataError(f"The latency model in {own or DATA} cannot be read: {reason}.", fix) from error
 
 
 DAMAGE = (
@@ -254,7 +254,7 @@ def write(model: LatencyModel, folder: Path) -> None:
             },
         }
     text = json.dumps({"about": dict(model.about), "parts": described}, indent=1)
-    with whole_file(folder / "latency.npz") as stored, whole_file(folder / "latency.json") as told:
+    with whole_file(folder / "latency.npz") as stored, whole_file(folder / "latency.json") as text_file:
         with stored.open("wb") as stream:  # by its name numpy would call it .npz
             np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-        told.write_text(text + "\n", encoding="utf-8")
+        text_file.write_text(text + "\n", encoding="utf-8")

@@ -92,11 +92,11 @@ def read_points(path: Path) -> list[Point]:
             rows = [(reader.line_num, _stripped(row)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
-    found = [_point(row, f"{path}, line {number}") for number, row in rows]
-    if not found:
+    points = [_point(row, f"{path}, line {number}") for number, row in rows]
+    if not points:
         fix = f"give a CSV file with a row for each figure; columns: {', '.join(NEEDED)}"
         raise DataError(f"{path} holds no row.", fix)
-    return found
+    return points
 
 
 def merged(points: Iterable[Point]) -> list[Point]:
@@ -105,7 +105,7 @@ def merged(points: Iterable[Point]) -> list[Point]:
     for point in points:
         if point.question is not None:
             groups.setdefault(point.question, []).append(point)
-    return [replace(same[0], log_ms=sum(each.log_ms for each in same) / len(same)) for same in groups.values()]
+    return [replace(same[0], log_ms=sum(point.log_ms for point in same) / len(same)) for same in groups.values()]
 
 
 def _point(row: Mapping[str, str], where: str) -> Point:
@@ -204,10 +204,10 @@ def place_of(row: Mapping[str, str]) -> Place | None:
     part = CLUSTERS.get(cluster[0], "") if cluster else ""
     other = "gpu" if unit == "igpu" else "igpu"
     places = ((f"{name} {part}", unit), (name, unit), (name, other))
-    found = next((devices[place] for place in places if place in devices), None)
-    if found is None:
+    device = next((devices[place] for place in places if place in devices), None)
+    if device is None:
         return None
-    cores, peaks = found.cores, dict(found.peaks)
+    cores, peaks = device.cores, dict(device.peaks)
     parts = (row.get("power_mode", ""), threads and threads[0], cluster and cluster[0], row.get("batch", ""))
     setting = " ".join(part for part in parts if part)
     if threads and unit == "cpu" and int(threads[1]) < cores:
@@ -215,7 +215,7 @@ def place_of(row: Mapping[str, str]) -> Place | None:
         cores, peaks = float(threads[1]), {dtype: peak * share for dtype, peak in peaks.items()}
     if row.get("power_mode") == "MaxQ":
         peaks = {dtype: peak * MAX_Q for dtype, peak in peaks.items()}
-    return replace(found, device=name, unit=unit, cores=cores, peaks=peaks, setting=setting)
+    return replace(device, device=name, unit=unit, cores=cores, peaks=peaks, setting=setting)
 
 
 PART = re.compile(r" (end-to-end|backbone|action head|data processing)\b.*")
@@ -259,14 +259,14 @@ MAX_Q = 0.5
 @functools.cache
 def known_devices() -> dict[tuple[str, str], Place]:
     """Return (name, unit) -> what is known of each device of ``data/devices.csv``."""
-    found = {}
+    devices = {}
     for row in _table("devices.csv"):
         peaks = {dtype: float(row[dtype]) for dtype in ("float32", "float16", "int8") if row[dtype]}
-        found[row["device"].lower(), row["unit"]] = Place(
+        devices[row["device"].lower(), row["unit"]] = Place(
             row["device"].lower(), row["unit"], float(row["cores"]), float(row["clock_ghz"]), peaks,
             float(row["bandwidth_gb_s"]), isa=row["isa"],
         )  # fmt: skip
-    return found
+    return devices
 
 
 @functools.cache
@@ -297,4 +297,4 @@ def _number(text: str, where: str, column: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise DataError(f"{where}: '{text}' in the column '{column}' is no number.") from None
+        raise DataError(f"{where}: '{text}' in the column '{column}' is not a number.") from None

@@ -45,14 +45,12 @@ def refit_points(
         DataError: when the file is malformed, or nothing of it is left to fit on.
     """
     if held_out not in KINDS:
-        given = "not given" if held_out is None else f"'{held_out}'"
-        raise UsageError(
-            f"--held-out is {given}; with --refit, allowed: models, devices (which tells calibrated, too)."
-        )
+        got = "not given" if held_out is None else f"'{held_out}'"
+        raise UsageError(f"--held-out is {got}; with --refit, allowed: models, devices (which tells calibrated, too).")
     points = read_points(path)
     folds = dealt([point for point in points if point.question], held_out, seed)
     if len(folds) < 2:
-        raise DataError(f"{path} has no two {held_out}: nothing is left to fit on.")
+        raise DataError(f"{path} has fewer than two {held_out}: nothing is left to fit on.")
     answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
     how = {"points": str(path.absolute()), "held_out": held_out, "seed": seed, "seconds": seconds}
     jobs = [{**how, "held": sorted(held)} for held in folds]
@@ -60,17 +58,16 @@ def refit_points(
     parts = spread(f"{__name__}:fold", jobs, processes, tell, "the fit", (__name__,))
     with single_threads(), contextlib.closing(parts):
         for done, part in enumerate(parts, 1):
-            for kind, found in part.items():
-                answered[kind] += [(points[number], Predicted(**told)) for number, told in found]
+            for kind, rows in part.items():
+                answered[kind] += [(points[number], Predicted(**values)) for number, values in rows]
             tell(f"{done} of {len(jobs)} parts left out", done / len(jobs))
     unasked = [point for point in points if not point.question]
-    told = f"all fitted anew without it, {seconds:g} s each"
-    return {
-        kind: summary(
-            [point for point, _ in found] + unasked, [each for _, each in found], f"{told_as(kind, seed)}; {told}"
-        )
-        for kind, found in answered.items()
-    }
+    summaries = {}
+    for kind, pairs in answered.items():
+        predictions = [prediction for _, prediction in pairs]
+        about = f"{told_as(kind, seed)}; all fitted anew without it, {seconds:g} s each"
+        summaries[kind] = summary([point for point, _ in pairs] + unasked, predictions, about)
+    return summaries
 
 
 KINDS = {"models": ("models",), "devices": ("devices", "calibrated")}
@@ -90,8 +87,8 @@ def fold(job: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> 
     """Compute one part in this process: kind -> number of the point and what was predicted for it."""
     points = read_points(Path(job["points"]))
     numbers = {id(point): number for number, point in enumerate(points)}
-    found = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
-    return {kind: [[numbers[id(point)], asdict(told)] for point, told in part] for kind, part in found.items()}
+    answered = one_fold(points, frozenset(job["held"]), job["held_out"], job["seed"], job["seconds"])
+    return {kind: [[numbers[id(point)], asdict(answer)] for point, answer in part] for kind, part in answered.items()}
 
 
 def one_fold(
@@ -104,19 +101,19 @@ def one_fold(
 
     mine = [point for point in points if out(point) and point.question]
     model = fit([point for point in points if not out(point)], None, seconds, seed, lambda _: None)
-    found = {held_out: answers(model, mine)}
+    answered = {held_out: answers(model, mine)}
     if held_out == "devices":
         random = np.random.default_rng(seed)
         names = sorted({point.model for point in mine})
-        found["calibrated"] = []
+        answered["calibrated"] = []
         for _ in range(DRAWS):
             known = names[random.integers(len(names))]
             measured = merged(point for point in mine if point.model == known)
             taught = model.conditioned(
-                [(each.question, float(np.exp(each.log_ms))) for each in measured if each.question]
+                [(point.question, float(np.exp(point.log_ms))) for point in measured if point.question]
             )
-            found["calibrated"] += answers(taught, [point for point in mine if point.model != known])
-    return found
+            answered["calibrated"] += answers(taught, [point for point in mine if point.model != known])
+    return answered
 
 
 def answers(model: LatencyModel, points: Sequence[Point]) -> Answered:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -45,8 +46,8 @@ def score_points(path: Path, held_out: str | None = None, seed: int = 0) -> dict
     own = os.environ.get(PLACE)
     whose = f"the model of {own}" if own else "the shipped model"
     if held_out is None:
-        found = shipped().predict([point.question for point in points if point.question])
-        return summary(points, found, whose)
+        predictions = shipped().predict([point.question for point in points if point.question])
+        return summary(points, predictions, whose)
     if held_out not in SPLITS:
         raise UsageError(f"--held-out is '{held_out}'; allowed: {', '.join(SPLITS)}.")
     shown: list[Point] = []
@@ -79,12 +80,12 @@ def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, 
     rows = rows_of(sample.questions, model.shares[part])
     folds = Folds(rows, sample, model.parts[part].scales)
     random = np.random.default_rng(seed)
-    told = np.zeros(len(sample.logs), bool)
+    taught = np.zeros(len(sample.logs), bool)
     groups = sample.devices
     if held_out == "models":
         groups = (random.permutation(sample.models.max() + 1) % FOLDS)[sample.models]
     if held_out == "calibrated":
-        error, deviation, told = folds.once(groups, random)
+        error, deviation, taught = folds.once(groups, random)
         scores = Scores.calibrated(sample, folds)
     else:
         error, deviation = folds.without(groups)
@@ -92,37 +93,39 @@ def _left_out(sample: Sample, part: str, held_out: str, seed: int) -> dict[Any, 
         scores = Scores.of(sample, error, deviation, groups, draws)
     regime = {"models": "known", "devices": "unseen", "calibrated": "calibrated"}[held_out]
     reach = {pair: scores.reach(pair[1], pair[0]) for pair in set(zip(groups, sample.units, strict=True))}
-    lonely = _lonely(sample, groups, told)
-    found: dict[Any, Predicted] = {}
+    lonely = _lonely(sample, groups, taught)
+    predictions: dict[Any, Predicted] = {}
     for place, question in enumerate(sample.questions):
         half = reach[groups[place], sample.units[place]] * deviation[place]
         why = no_ground(question, not lonely[place], regime != "unseen")
         if not why and half > WIDEST:
             why = "published figures leave too wide an interval"
-        if told[place] or why:
-            found[question] = Predicted(math.nan, regime="told" if told[place] else regime, why=why or "it was told")
+        if taught[place] or why:
+            predictions[question] = Predicted(
+                math.nan, regime="told" if taught[place] else regime, why=why or "it was told"
+            )
         else:
             ms = math.exp(sample.logs[place] + error[place])
-            found[question] = Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime)
-    return found
+            predictions[question] = Predicted(ms, ms * math.exp(-half), ms * math.exp(half), regime)
+    return predictions
 
 
-def _lonely(sample: Sample, groups: Array, told: Array) -> Array:
+def _lonely(sample: Sample, groups: Array, taught: Array) -> Array:
     """Say of each row whether its runtime occurs in no other group and was not told: then nothing is known of it."""
     runtimes = np.array([question.runtime for question in sample.questions])
-    found = np.zeros(len(runtimes), bool)
+    lonely = np.zeros(len(runtimes), bool)
     for runtime in np.unique(runtimes):
         rows = runtimes == runtime
-        found[rows] = len(np.unique(groups[rows])) < 2 and not told[rows].any()
-    return found
+        lonely[rows] = len(np.unique(groups[rows])) < 2 and not taught[rows].any()
+    return lonely
 
 
 def summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> dict[str, Any]:
     """Return how far predictions are from figures, as JSON values."""
     asked = [point for point in points if point.question]
-    why: dict[str, int] = {}
-    for reason in [point.why for point in points if not point.question] + [each.why for each in answers if each.why]:
-        why[reason] = why.get(reason, 0) + 1
+    why: Counter[str] = Counter()
+    why.update(point.why for point in points if not point.question)
+    why.update(answer.why for answer in answers if answer.why)
     known = [(point, answer) for point, answer in zip(asked, answers, strict=True) if answer.known]
     groups = {"all but npu": [pair for pair in known if pair[0].kind != "npu"]}
     groups |= {unit: [pair for pair in known if pair[0].kind == unit] for unit in UNITS}
@@ -135,8 +138,8 @@ def summary(points: Sequence[Point], answers: Sequence[Predicted], how: str) -> 
 
 def _errors(pairs: Sequence[tuple[Point, Predicted]]) -> dict[str, float]:
     measured = np.exp([point.log_ms for point, _ in pairs])
-    found, low, high = (np.array([getattr(answer, name) for _, answer in pairs]) for name in ("ms", "low", "high"))
-    off = np.abs(found / measured - 1)
+    predicted, low, high = (np.array([getattr(answer, name) for _, answer in pairs]) for name in ("ms", "low", "high"))
+    off = np.abs(predicted / measured - 1)
     inside = (low <= measured) & (measured <= high)
     return {
         "rows": len(pairs), "median": float(np.median(off)), "p90": float(np.quantile(off, 0.9)),
@@ -144,16 +147,16 @@ def _errors(pairs: Sequence[tuple[Point, Predicted]]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def lines(found: Mapping[str, Any]) -> Iterator[str]:
+def lines(scored: Mapping[str, Any]) -> Iterator[str]:
     """Return what a person reads."""
-    yield f"{found['how']}"
-    yield f"{found['predicted']} of {found['rows']} rows predicted; relative error |predicted - measured| / measured"
+    yield f"{scored['how']}"
+    yield f"{scored['predicted']} of {scored['rows']} rows predicted; relative error |predicted - measured| / measured"
     yield f"{'':14}{'rows':>6}{'median':>9}{'90th pct':>10}{'in interval':>13}{'interval':>10}"
-    for name, each in found["groups"].items():
+    for name, figures in scored["groups"].items():
         yield (
-            f"{name:14}{each['rows']:>6}{each['median']:>9.1%}{each['p90']:>10.1%}{each['coverage']:>13.1%}"
-            f"{'x/÷ ' + format(each['factor'], '.2f'):>10}"
+            f"{name:14}{figures['rows']:>6}{figures['median']:>9.1%}{figures['p90']:>10.1%}{figures['coverage']:>13.1%}"
+            f"{'x/÷ ' + format(figures['factor'], '.2f'):>10}"
         )
-    yield f"The interval is meant to hold {found['level']:.0%}."
-    for reason, count in list(found["unknown"].items())[:12]:
+    yield f"The interval is meant to hold {scored['level']:.0%}."
+    for reason, count in list(scored["unknown"].items())[:12]:
         yield f"  unknown, {count}: {reason}"

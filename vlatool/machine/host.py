@@ -91,10 +91,10 @@ def fingerprint(root: Path = ROOT) -> dict[str, Any]:
     }
 
 
-def matches(model_strings: Iterable[str], found: Mapping[str, Any]) -> bool:
+def matches(model_strings: Iterable[str], machine: Mapping[str, Any]) -> bool:
     """Say whether a fingerprint is that of a board that goes by one of these strings (board or processor model)."""
-    said = " | ".join(str(found.get(key) or "") for key in ("board", "cpu")).lower()
-    return any(wanted.lower() in said for wanted in model_strings)
+    names = " | ".join(str(machine.get(key) or "") for key in ("board", "cpu")).lower()
+    return any(model.lower() in names for model in model_strings)
 
 
 def read_text(root: Path, path: str) -> str | None:
@@ -115,8 +115,8 @@ def read_number(root: Path, path: str) -> int | None:
 def cpu_model(root: Path = ROOT) -> str | None:
     """Model of the processor; on ARM its kinds of cores with their number."""
     text = read_text(root, "proc/cpuinfo") or ""
-    if found := re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE):
-        return " ".join(found[1].split())
+    if match := re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE):
+        return " ".join(match[1].split())
     parts = re.findall(r"^CPU implementer\s*:\s*(\S+)[\s\S]*?^CPU part\s*:\s*(\S+)", text, re.MULTILINE)
     kinds = [ARM_CORES.get((maker, part), f"ARM {maker}/{part}") for maker, part in parts]
     return " + ".join(f"{kinds.count(kind)}x {kind}" for kind in dict.fromkeys(kinds)) or None
@@ -124,8 +124,8 @@ def cpu_model(root: Path = ROOT) -> str | None:
 
 def architecture(root: Path = ROOT) -> str | None:
     """``x86_64``, ``aarch64`` or what the kernel says."""
-    if said := read_text(root, "proc/sys/kernel/arch"):
-        return said
+    if kernel := read_text(root, "proc/sys/kernel/arch"):
+        return kernel
     text = read_text(root, "proc/cpuinfo") or ""
     if re.search(r"^flags\s*:.*\blm\b", text, re.MULTILINE):
         return "x86_64"
@@ -151,10 +151,10 @@ def onednn_max_cpu_isa(variables: Mapping[str, str] = os.environ) -> str | None:
     ``DEFAULT`` confine it to nothing. What is no name of an instruction set is told as ``?``: it may be anything, and
     reports are shared.
     """
-    said = (variables.get(MAX_CPU_ISA) or variables.get(OLDER_MAX_CPU_ISA, "")).upper()
-    if said in ("", "ALL", "DEFAULT"):
+    value = (variables.get(MAX_CPU_ISA) or variables.get(OLDER_MAX_CPU_ISA, "")).upper()
+    if value in ("", "ALL", "DEFAULT"):
         return None
-    return said if re.fullmatch(r"[A-Z0-9_]{1,32}", said) else "?"
+    return value if re.fullmatch(r"[A-Z0-9_]{1,32}", value) else "?"
 
 
 def board(root: Path = ROOT) -> str | None:
@@ -172,8 +172,8 @@ def online_cores(root: Path = ROOT) -> int | None:
 
 def usable_cores(root: Path = ROOT) -> int | None:
     """Logical cores that this process may run on (its affinity, not the container's quota)."""
-    found = re.search(r"^Cpus_allowed_list:\s*(\S+)$", read_text(root, "proc/self/status") or "", re.MULTILINE)
-    return _count(found[1]) if found else online_cores(root)
+    match = re.search(r"^Cpus_allowed_list:\s*(\S+)$", read_text(root, "proc/self/status") or "", re.MULTILINE)
+    return _count(match[1]) if match else online_cores(root)
 
 
 def _count(ranges: str | None) -> int | None:
@@ -186,16 +186,16 @@ def _count(ranges: str | None) -> int | None:
 
 def cpu_quota(root: Path = ROOT) -> float | None:
     """The smallest limit in cores that a control group of this process has; None when there is none."""
-    found = []
+    limits = []
     for place in _groups(root, "cpu"):
         text = read_text(root, f"{place}/cpu.max")
         if text and (limit := re.fullmatch(r"(\d+) (\d+)", text)):
-            found.append(int(limit[1]) / int(limit[2]))
+            limits.append(int(limit[1]) / int(limit[2]))
         quota = read_number(root, f"{place}/cpu.cfs_quota_us")
         period = read_number(root, f"{place}/cpu.cfs_period_us")
         if quota is not None and quota > 0 and period:
-            found.append(quota / period)
-    return round(min(found), 3) if found else None
+            limits.append(quota / period)
+    return round(min(limits), 3) if limits else None
 
 
 def memory(root: Path = ROOT) -> dict[str, float | None]:
@@ -241,7 +241,7 @@ def frequency(root: Path = ROOT) -> dict[str, Any]:
     policies = [
         path.relative_to(root).as_posix() for path in sorted((root / "sys/devices/system/cpu/cpufreq").glob("policy*"))
     ]
-    governors = [found for place in policies if (found := read_text(root, f"{place}/scaling_governor"))]
+    governors = [governor for place in policies if (governor := read_text(root, f"{place}/scaling_governor"))]
     clocks: dict[str, list[float] | None] = {}
     for key, name in (("min", "scaling_min_freq"), ("max", "scaling_max_freq"), ("now", "scaling_cur_freq")):
         values = [khz / 1000 for place in policies if (khz := read_number(root, f"{place}/{name}")) is not None]
@@ -273,8 +273,8 @@ def busy_processors(root: Path = ROOT, seconds: float = 0.3) -> float | None:
 
 def _processor_time(root: Path) -> tuple[int, int] | None:
     """Return the ticks that all processors were busy, and all their ticks (``/proc/stat``, proc.rst of Linux)."""
-    found = re.search(r"^cpu +([\d ]+)", read_text(root, "proc/stat") or "", re.MULTILINE)
-    ticks = [int(part) for part in found[1].split()][:8] if found else []
+    match = re.search(r"^cpu +([\d ]+)", read_text(root, "proc/stat") or "", re.MULTILINE)
+    ticks = [int(part) for part in match[1].split()][:8] if match else []
     if len(ticks) < 8:
         return None
     return sum(ticks) - ticks[3] - ticks[4], sum(ticks)
@@ -295,8 +295,8 @@ def container(root: Path = ROOT) -> str | None:
         return "docker"
     if (root / "run/.containerenv").exists():
         return "podman"
-    found = re.search(r"docker|kubepods|containerd|libpod|lxc", read_text(root, "proc/1/cgroup") or "")
-    return found[0] if found else None
+    match = re.search(r"docker|kubepods|containerd|libpod|lxc", read_text(root, "proc/1/cgroup") or "")
+    return match[0] if match else None
 
 
 def virtual_machine(root: Path = ROOT) -> bool | None:
@@ -309,13 +309,13 @@ def virtual_machine(root: Path = ROOT) -> bool | None:
 
 def versions(distributions: Iterable[str] = DISTRIBUTIONS) -> dict[str, str]:
     """Versions of the packages that are installed, without importing any."""
-    found = {}
+    installed = {}
     for name in distributions:
         try:
-            found[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 def cache_directory() -> Path:

@@ -110,8 +110,8 @@ class BoardSet:
     def about_errors(self) -> tuple[str, ...]:
         """Say what errors alone are those of, where OpenVINO is or can be confined to the board's set."""
         if self.confined or self.to_set:
-            told = f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}"
-            return (f"{told}: its answers are of that set.",)
+            sentence = f"OpenVINO was confined to {self.wanted}, the instruction set of {self.board}"
+            return (f"{sentence}: its answers are of that set.",)
         return (f"This host has the instruction set of {self.board} ({self.wanted}).",) if self.alike else ()
 
     def warnings(self) -> tuple[str, ...]:

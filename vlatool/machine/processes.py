@@ -52,14 +52,14 @@ def import_path() -> list[str]:
     """
     own = {os.path.realpath(entry) for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry}
     here = os.path.realpath(os.curdir)
-    wanted = [os.path.abspath(entry) for entry in sys.path if entry]
-    found = [entry for entry in dict.fromkeys(wanted) if os.path.realpath(entry) != here or here in own]
+    absolute = [os.path.abspath(entry) for entry in sys.path if entry]
+    entries = [entry for entry in dict.fromkeys(absolute) if os.path.realpath(entry) != here or here in own]
     package = str(Path(__file__).resolve().parents[2])
-    if package in found:
-        return found
-    installed = (number for number, entry in enumerate(found) if Path(entry).name in ("site-packages", "dist-packages"))
-    found.insert(next(installed, len(found)), package)
-    return found
+    if package in entries:
+        return entries
+    installed = (at for at, entry in enumerate(entries) if Path(entry).name in ("site-packages", "dist-packages"))
+    entries.insert(next(installed, len(entries)), package)
+    return entries
 
 
 def die_with_parent() -> None:

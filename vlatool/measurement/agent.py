@@ -1,9 +1,9 @@
 """What runs a benchmark on a machine, this one or another: ``python -m vlatool.measurement.agent``.
 
 It starts the fresh processes of the cold starts and the worker that calls the policies, records the board while the
-worker runs (in this process, so that no reader shares the worker's interpreter), and says what it found: one line of
-JSON in (the job), lines of JSON out (``progress``, in the end ``result`` or what was raised). It needs the standard
-library, numpy and an engine.
+worker runs (in this process, so that no reader shares the worker's interpreter), and says what it found: a
+``LatencyJob`` in; ``Progress`` out, in the end ``Measured`` or what was raised. It needs the standard library, numpy
+and an engine.
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ from __future__ import annotations
 import contextlib
 import json
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, cast
 
 from vlatool.errors import VlatoolError
+from vlatool.files.messages import to_json
 from vlatool.machine.host import before_run
-from vlatool.measurement.child import answer, ended, message, raise_said, too_large
+from vlatool.measurement import child
 from vlatool.measurement.cold_start import cold_start
 from vlatool.measurement.interleaved import Tell
-from vlatool.measurement.job import Job, Limits
+from vlatool.measurement.jobs import LatencyJob, Limits, WorkerJob
 from vlatool.measurement.limited import chosen, command, grouped
-from vlatool.telemetry import Absent, Recorder, open_all
+from vlatool.measurement.measured import Measured, PolicyRun
+from vlatool.telemetry import Absent, Reader, Recorder, open_all
 from vlatool.telemetry.process import ProcessReader
 from vlatool.user_code import trust
 
@@ -34,13 +35,8 @@ LOG_CHARACTERS = 4000
 WORKER = "vlatool.measurement.worker"
 
 
-def measure(job: Job, tell: Tell) -> dict[str, Any]:
+def measure(job: LatencyJob, tell: Tell) -> Measured:
     """Measure on this machine.
-
-    Returns:
-        JSON values: ``job``, ``host`` (with ``processors_busy`` before the run), ``begun_s``, ``ended_s``,
-        ``canary_ms``, ``cpu_s``, ``wall_s``, ``switches``, ``policies`` (one for each bundle), ``telemetry`` and
-        ``log``, the end of what the worker wrote to standard error.
 
     Raises:
         VlatoolError: what a bundle raises; GraphError when a process ends; GateFailed when it needs more memory than
@@ -52,22 +48,29 @@ def measure(job: Job, tell: Tell) -> dict[str, Any]:
         with grouped(limits) as limited:
             for path in job.bundles:
                 start = cold_start(Path(path), job.engine, job.threads, limited)
-                if start["peak_rss_mb"] > limited.memory_mb:  # pages of files that others have read count for no group
-                    raise too_large(limited, f": {start['peak_rss_mb']:,.0f} MB")
+                if start.peak_rss_mb > limited.memory_mb:  # pages of files that others have read count for no group
+                    raise child.too_large(limited, f": {start.peak_rss_mb:,.0f} MB")
     host = before_run()
     free = replace(limits, memory_mb=0.0)  # the worker also holds observations and every sample
-    found = _run_worker(job, free, tell)
-    for number, (path, policy) in enumerate(zip(job.bundles, found["policies"], strict=True)):
-        if job.cold and policy["engines"]:
+    measured = _run_worker(job, free, tell)
+    policies = []
+    for number, (path, policy) in enumerate(zip(job.bundles, measured.policies, strict=True)):
+        if job.cold and policy.engines:
             tell("cold start of each in a fresh process", number / len(job.bundles))
-            try:
-                policy["cold"] = [cold_start(Path(path), job.engine, job.threads, free) for _ in range(job.cold)]
-            except VlatoolError as error:  # the latencies are measured, and stay
-                policy["cold_error"] = error.message
-    return {"job": {**job.to_dict(), "bundles": len(job.bundles)}, "host": host, **found}
+            policy = _with_cold_starts(policy, Path(path), job, free)
+        policies.append(policy)
+    return replace(measured, host=host, policies=tuple(policies))
 
 
-def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
+def _with_cold_starts(policy: PolicyRun, bundle: Path, job: LatencyJob, limits: Limits) -> PolicyRun:
+    try:
+        starts = tuple(cold_start(bundle, job.engine, job.threads, limits) for _ in range(job.cold))
+    except VlatoolError as error:  # the latencies are measured, and stay
+        return replace(policy, cold_error=error.message)
+    return replace(policy, cold=starts)
+
+
+def _run_worker(job: LatencyJob, limits: Limits, tell: Tell) -> Measured:
     about = ", ".join(job.bundles)
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log,
@@ -75,25 +78,24 @@ def _run_worker(job: Job, limits: Limits, tell: Tell) -> dict[str, Any]:
         contextlib.ExitStack() as recording,
     ):
         recorder: Recorder | None = None
-        _answer(worker, json.dumps({**job.to_dict(), "named": trust.named_so_far()}))
-        for text in cast(IO[str], worker.stdout):
-            line = message(text)
-            if "progress" in line:
-                tell(*line["progress"])
-            elif "ready" in line:
-                recorder = recording.enter_context(Recorder(_readers(int(line["ready"])), PERIOD_S))
-                _answer(worker)
-            elif "timed" in line:
-                recording.close()
-                _answer(worker)
-            elif "result" in line:
-                found: dict[str, Any] = line["result"]
-                told = recorder.recorded.to_dict() if recorder else None
-                return {**found, "telemetry": told, "log": _end_of(log)}
-            else:
-                raise_said(line, limits)
-        code = worker.wait()
-        raise ended(about, code, _end_of(log), limits, "while it was measured")
+        _send(worker, json.dumps(to_json(WorkerJob(job, tuple(map(tuple, trust.named_so_far()))))))
+        for line in cast(IO[str], worker.stdout):
+            match child.read_line(line):
+                case child.Progress(what, share):
+                    tell(what, share)
+                case child.Ready(process):
+                    recorder = recording.enter_context(Recorder(_readers(process), PERIOD_S))
+                    _send(worker)
+                case child.Timed():
+                    recording.close()
+                    _send(worker)
+                case child.Result() as result:
+                    measured = child.result_of(result, Measured, about)
+                    telemetry = recorder.recorded if recorder else None
+                    return replace(measured, telemetry=telemetry, log=_end_of(log))
+                case child.Raised() as raised:
+                    raise child.error_of(raised, limits)
+        raise child.ended(about, worker.wait(), _end_of(log), limits, "while it was measured")
 
 
 def _end_of(log: IO[str]) -> str:
@@ -102,7 +104,7 @@ def _end_of(log: IO[str]) -> str:
     return log.read()[-LOG_CHARACTERS:]
 
 
-def _answer(worker: subprocess.Popen[str], line: str = "") -> None:
+def _send(worker: subprocess.Popen[str], line: str = "") -> None:
     """Send a line to the worker; one that has ended says so with its output."""
     stdin = cast(IO[str], worker.stdin)
     with contextlib.suppress(BrokenPipeError):
@@ -121,26 +123,20 @@ def _started(words: list[str], log: IO[str]) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def _readers(worker: int) -> list[Any]:
+def _readers(worker: int) -> list[Reader | Absent]:
     """Return the readers of the board, and one of the worker in the place of that of this process."""
-    found = [each for each in open_all() if _name(each) != ProcessReader.name]
-    return [*found, ProcessReader.open(number=worker)]
+    readers = [reader for reader in open_all() if _name(reader) != ProcessReader.name]
+    return [*readers, ProcessReader.open(number=worker)]
 
 
-def _name(each: Any) -> str:
-    return str(each.reader if isinstance(each, Absent) else each.name)
+def _name(reader: Reader | Absent) -> str:
+    return reader.reader if isinstance(reader, Absent) else reader.name
 
 
-def main() -> dict[str, Any]:
+def main() -> Measured:
     """Run the job that standard input names."""
-    job = Job.from_dict(json.loads(sys.stdin.readline()))
-
-    def tell(what: str, share: float | None) -> None:
-        sys.stdout.write(json.dumps({"progress": [what, share]}) + "\n")
-        sys.stdout.flush()
-
-    return {"result": measure(job, tell)}
+    return measure(child.asked(LatencyJob), lambda what, share: child.say(child.Progress(what, share)))
 
 
 if __name__ == "__main__":
-    answer(main)
+    child.answer(main)

@@ -1,17 +1,14 @@
 """What two bundles answer to observations that neither was made for: whether the one still follows the other.
 
-``python -m vlatool.measurement.agreement`` reads one line of JSON (the fields of ``_pairs.Job``) and prints one (those
-of ``Agreement``). Both are loaded as a robot loads them: every file is hashed, and the golden action must be computed.
-Each observation is answered twice, once right after ``reset`` and once in another order without it; where values are
-kept by design, the second time is a row of inferences in which both answer the same.
+``python -m vlatool.measurement.agreement`` reads a ``PairJob`` and answers with an ``Agreement``. Both are loaded as a
+robot loads them: every file is hashed, and the golden action must be computed. Each observation is answered twice, once
+right after ``reset`` and once in another order without it; where values are kept by design, the second time is a row of
+inferences in which both answer the same.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import random
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.machine.processes import die_with_parent
-from vlatool.measurement.child import answer, ask
-from vlatool.measurement.pairs import Job
+from vlatool.measurement.child import ask, serve
+from vlatool.measurement.pairs import PairJob
 
 Array = NDArray[Any]
 FEWEST = 24
@@ -76,21 +72,17 @@ class Agreement:
     engines: tuple[str, ...] = ("", "")
 
 
-def measure_agreement(job: Job, timeout: float | None = None) -> Agreement:
+def measure_agreement(job: PairJob, timeout: float | None = None) -> Agreement:
     """Measure in a fresh process.
 
     Raises:
         VlatoolError: what a bundle raises when it is loaded or run; GraphError when the process ends or takes longer
             than ``timeout`` seconds.
     """
-    about = f"{job.candidate} beside {job.baseline}"
-    found = ask("vlatool.measurement.agreement", (), json.dumps(dataclasses.asdict(job)), about, timeout)
-    found["followed"] = tuple(Followed(**each) for each in found["followed"])
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
-    return Agreement(**values)
+    return ask("vlatool.measurement.agreement", job, Agreement, job.about, timeout)
 
 
-def run_agreement(job: Job) -> Agreement:
+def run_agreement(job: PairJob) -> Agreement:
     """Measure in this process; ``job.seconds`` ends it early, once ``FEWEST`` observations are answered."""
     from vlatool.bundle.bundle import Bundle
     from vlatool.measurement.turns import loaded, pool_of
@@ -98,15 +90,15 @@ def run_agreement(job: Job) -> Agreement:
     baseline = Bundle.open(job.baseline)
     policies = [loaded(path, job) for path in (job.baseline, job.candidate)]
     pool = pool_of(job, baseline) if job.pairs else []
-    asked, skipped = _asked(policies, pool, job)
+    calls, skipped = _asked(policies, pool, job)
     if any(step.keep for step in baseline.manifest.program):
         for policy in policies:
             policy.reset()
-        asked += _asked(policies, [replace(each, kind=SEQUENCE) for each in pool], job, afresh=False)[0]
-    strays = [_strays(policy, asked, which, job.seed) for which, policy in enumerate(policies)]
-    kinds = dict.fromkeys(each.kind for each in asked)
-    followed = [one for kind in kinds for one in _followed(policies, [each for each in asked if each.kind == kind])]
-    return Agreement(tuple(followed), len(asked), strays[1], strays[0], skipped,
+        calls += _asked(policies, [replace(drawn, kind=SEQUENCE) for drawn in pool], job, afresh=False)[0]
+    strays = [_strays(policy, calls, which, job.seed) for which, policy in enumerate(policies)]
+    kinds = dict.fromkeys(call.kind for call in calls)
+    followed = [one for kind in kinds for one in _followed(policies, [call for call in calls if call.kind == kind])]
+    return Agreement(tuple(followed), len(calls), strays[1], strays[0], skipped,
                      tuple(policy.golden_error for policy in policies),
                      tuple(policy.engine for policy in policies))  # fmt: skip
 
@@ -119,7 +111,7 @@ class _Asked:
     outputs: tuple[Mapping[str, Array], Mapping[str, Array]]
 
 
-def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job, afresh: bool = True) -> tuple[list[_Asked], int]:
+def _asked(policies: Sequence[Any], pool: Sequence[Any], job: PairJob, afresh: bool = True) -> tuple[list[_Asked], int]:
     """Ask both for every observation, some bits of which are new, right after a reset (``afresh``) or in a row."""
     from vlatool.errors import GraphError
     from vlatool.measurement.answers import varied
@@ -127,7 +119,7 @@ def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job, afresh: bool 
 
     numbers = np.random.default_rng([job.seed, 3])
     steps, spec = policies[0].bundle.manifest.program, policies[0].spec
-    found: list[_Asked] = []
+    calls: list[_Asked] = []
     skipped = 0
     end = time.monotonic() + job.seconds
     for place, drawn in enumerate(pool):
@@ -140,10 +132,10 @@ def _asked(policies: Sequence[Any], pool: Sequence[Any], job: Job, afresh: bool 
         except GraphError:
             skipped += 1
             continue
-        found.append(
+        calls.append(
             _Asked(drawn.kind, observation, noise, (theirs, _outputs(policies[1], observation, noise, afresh)))
         )
-    return found, skipped
+    return calls, skipped
 
 
 def _outputs(
@@ -154,35 +146,35 @@ def _outputs(
     return {name: np.array(value) for name, value in policy.infer(observation, noise=noise).outputs.items()}
 
 
-def _strays(policy: Any, asked: Sequence[_Asked], which: int, seed: int) -> int:
+def _strays(policy: Any, calls: Sequence[_Asked], which: int, seed: int) -> int:
     """Count the answers that are others in another order without reset; 0 for a policy that keeps values by design."""
     from vlatool.measurement.answers import Answers
 
     if any(step.keep for step in policy.bundle.manifest.program):
         return 0
-    answers = Answers([each.outputs[which] for each in asked])
-    for place in random.Random(seed).sample(range(len(asked)), len(asked)):
-        answers.look(place, policy.infer(asked[place].observation, noise=asked[place].noise).outputs)
+    answers = Answers([call.outputs[which] for call in calls])
+    for place in random.Random(seed).sample(range(len(calls)), len(calls)):
+        answers.look(place, policy.infer(calls[place].observation, noise=calls[place].noise).outputs)
     return answers.strays
 
 
-def _followed(policies: Sequence[Any], asked: Sequence[_Asked]) -> list[Followed]:
-    kind, count = asked[0].kind, len(asked)
-    found = []
+def _followed(policies: Sequence[Any], calls: Sequence[_Asked]) -> list[Followed]:
+    kind, count = calls[0].kind, len(calls)
+    followed = []
     for tensor in policies[0].spec.outputs:
         theirs, mine = (
-            _physical(policy, tensor.name, [each.outputs[which][tensor.name] for each in asked])
+            _physical(policy, tensor.name, [call.outputs[which][tensor.name] for call in calls])
             for which, policy in enumerate(policies)
         )
-        found.append(Followed(kind, tensor.name, correlation(mine, theirs), count))
-    return found
+        followed.append(Followed(kind, tensor.name, correlation(mine, theirs), count))
+    return followed
 
 
 def _physical(policy: Any, name: str, values: Sequence[Array]) -> Array:
     """Return an output in physical units by the bundle's own statistics, (N, ...); logits without their mean."""
     from vlatool.runtime.statistics import load_normaliser
 
-    tensor = next(each for each in policy.spec.outputs if each.name == name)
+    tensor = next(tensor for tensor in policy.spec.outputs if tensor.name == name)
     wide = np.stack(values).astype(np.float64)
     if tensor.kind == "discrete":
         return np.asarray(wide - wide.mean(-1, keepdims=True))
@@ -204,11 +196,10 @@ def correlation(mine: Array, theirs: Array) -> float:
     if not varied.any():
         near = float(np.linalg.norm(mine - theirs)) <= CLOSE * (float(np.linalg.norm(theirs)) or 1.0)
         return float(near)
-    one, two = ((each - each.mean(axis=0))[:, varied] / spread[varied] for each in (mine, theirs))
+    one, two = ((values - values.mean(axis=0))[:, varied] / spread[varied] for values in (mine, theirs))
     size = float(np.linalg.norm(one) * np.linalg.norm(two))
     return float((one * two).sum() / size) if size > 0 else 0.0
 
 
 if __name__ == "__main__":
-    die_with_parent()
-    answer(lambda: dataclasses.asdict(run_agreement(Job(**json.loads(sys.stdin.readline())))))
+    serve(PairJob, run_agreement)

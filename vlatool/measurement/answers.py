@@ -29,6 +29,23 @@ PAIRS = 40
 FEWEST = 10
 
 
+@dataclass(frozen=True)
+class AnswerCheck:
+    """Timed answers, held against those of an unhurried pass.
+
+    Args:
+        looked: How many were looked at.
+        strays: How many differ.
+        worst: The largest relative difference; None when one is not finite, or of another shape.
+        first: Which of the calls was the first to differ, from 0; -1 for none.
+    """
+
+    looked: int
+    strays: int
+    worst: float | None
+    first: int
+
+
 class Answers:
     """Compares outputs with those of an unhurried pass.
 
@@ -37,7 +54,7 @@ class Answers:
     """
 
     def __init__(self, expected: Sequence[Mapping[str, NDArray[Any]]]) -> None:
-        self._expected = [dict(each) for each in expected]
+        self._expected = [dict(outputs) for outputs in expected]
         self.looked = 0
         self.strays = 0
         self.worst = 0.0
@@ -62,10 +79,10 @@ class Answers:
             self.worst = max(self.worst, wrong if math.isfinite(wrong) else math.inf)
             self.first = self.looked if self.first < 0 else self.first
 
-    def to_dict(self) -> dict[str, float | None]:
-        """Return how many were looked at, how many differed, by how much (None: no number says) and which was first."""
+    def check(self) -> AnswerCheck:
+        """Return what was seen so far."""
         worst = self.worst if math.isfinite(self.worst) else None
-        return {"looked": self.looked, "strays": self.strays, "worst": worst, "first": self.first}
+        return AnswerCheck(self.looked, self.strays, worst, self.first)
 
 
 def expected_answers(
@@ -73,13 +90,13 @@ def expected_answers(
 ) -> Answers:
     """Run through the observations unhurriedly, as many as fit into some seconds, and return what they gave."""
     policy.reset()
-    found: list[Mapping[str, NDArray[Any]]] = []
+    expected: list[Mapping[str, NDArray[Any]]] = []
     end = time.monotonic() + seconds
     for number, observation in enumerate(observations):
         if number >= fewest and time.monotonic() > end:
             break
-        found.append({name: np.array(value) for name, value in policy.infer(observation).outputs.items()})
-    return Answers(found)
+        expected.append({name: np.array(value) for name, value in policy.infer(observation).outputs.items()})
+    return Answers(expected)
 
 
 @dataclass(frozen=True)

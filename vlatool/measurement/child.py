@@ -1,4 +1,7 @@
-"""A question to a fresh process: one line of JSON in, one out, and its errors come back as they were raised."""
+"""A question to a fresh process: one line of JSON in, one out, and its errors come back as they were raised.
+
+What processes say to each other are the frozen dataclasses below, each as a mapping of its name to its fields.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,18 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import IO, Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import IO, Any, TypeVar
 
 from vlatool import errors
 from vlatool.errors import GateFailed, GraphError, VlatoolError
-from vlatool.measurement.job import Limits
+from vlatool.files.messages import from_json, to_json
+from vlatool.machine.processes import die_with_parent
+from vlatool.measurement.jobs import Limits
 from vlatool.measurement.limited import command, ran_out
 
-SAID = "vlatool error"
+T = TypeVar("T")
 NO_MEMORY = (
     "MemoryError",
     "bad_alloc",
@@ -27,32 +33,72 @@ NO_MEMORY = (
 """What Python, C++ and the engines say when a limit is reached; a control group kills instead."""
 
 
+@dataclass(frozen=True)
+class Progress:
+    """What is being done, and the share that is done; None when it is not known."""
+
+    what: str
+    share: float | None
+
+
+@dataclass(frozen=True)
+class Ready:
+    """All is open and warm in the process of this number, which waits for a line before the first call that counts."""
+
+    process: int
+
+
+@dataclass(frozen=True)
+class Timed:
+    """The last call that counts is over; the process waits for a line again."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The last message of a process: what its job gave, as JSON values."""
+
+    value: Any
+
+
+@dataclass(frozen=True)
+class Raised:
+    """The last message of a process: the error of vlatool that it raised, by the name of its class."""
+
+    kind: str
+    message: str
+    fix: str = ""
+
+
+Message = Progress | Ready | Timed | Result | Raised
+MESSAGES: dict[str, type[Message]] = {kind.__name__.lower(): kind for kind in (Progress, Ready, Timed, Result, Raised)}
+
+
 def ask(
     module: str,
-    arguments: Sequence[str],
-    line: str,
+    job: Any,
+    kind: type[T],
     about: str,
     timeout: float | None = None,
     limits: Limits = Limits(),  # noqa: B008
-) -> dict[str, Any]:
+) -> T:
     """Run a module of vlatool in a fresh process and return what it answers.
 
     Args:
-        module: Run as ``python -m``; its last act is ``answer``.
-        arguments: Of the command.
-        line: For its standard input.
+        module: Run as ``python -m``; it calls ``serve``.
+        job: A dataclass, for its standard input.
+        kind: What it answers.
         about: What is asked about, for errors.
         timeout: Seconds; endless when None.
         limits: Of the process.
 
     Raises:
-        VlatoolError: what the process raised, of the same class; GraphError when it ended in another way; GateFailed
-            when it needed more memory than the limit.
+        VlatoolError: what the process raised, of the same class; GraphError when it ended in another way or answered
+            something else; GateFailed when it needed more memory than the limit.
     """
     try:
         done = subprocess.run(
-            command(limits, module, arguments),
-            input=line,
+            command(limits, module),
+            input=json.dumps(to_json(job)) + "\n",
             capture_output=True,
             text=True,
             check=False,
@@ -63,36 +109,51 @@ def ask(
             f"{about}: no result after {timeout:g} s, so the process was ended.",
             "see whether it hangs alone (vlatool benchmark); a gate allows more with latency: {timeout: SECONDS}",
         ) from error
-    found = message(done.stdout.rstrip("\n").rpartition("\n")[2])
-    raise_said(found, limits)
-    if done.returncode or not found:
+    message = read_line(done.stdout.rstrip("\n").rpartition("\n")[2])
+    if isinstance(message, Raised):
+        raise error_of(message, limits)
+    if done.returncode or not isinstance(message, Result):
         raise ended(about, done.returncode, done.stderr, limits)
-    return found
+    return result_of(message, kind, about)
 
 
-def message(text: str) -> dict[str, Any]:
-    """Return a line of JSON; nothing for what an engine prints, and for a line that its process did not live to end."""
+def result_of(message: Result, kind: type[T], about: str) -> T:
+    """Return the result of a process.
+
+    Raises:
+        GraphError: when it is not of the type.
+    """
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
+        return from_json(kind, message.value, "answer")
+    except ValueError as error:
+        raise GraphError(f"{about}: the process does not answer what it was asked: {error}.") from error
 
 
-def raise_said(
-    found: Mapping[str, Any],
+def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> Message | None:
+    """Return the message of a line; None for what an engine prints, and for a line that was not written to its end.
+
+    Args:
+        text: The line.
+        check: Called with its JSON values, and returns those that are read.
+    """
+    try:
+        ((name, value),) = check(json.loads(text)).items()
+        return from_json(MESSAGES[name], value)
+    except (ValueError, RecursionError, AttributeError, LookupError):
+        return None
+
+
+def error_of(
+    message: Raised,
     limits: Limits = Limits(),  # noqa: B008
     otherwise: type[VlatoolError] = GraphError,
-) -> None:
-    """Raise what a process said that it raised, ``otherwise`` when that is no error here; nothing when it did not."""
-    if SAID not in found:
-        return
-    told = str(found.get("message", ""))
-    if limits.memory_mb and any(sign in told for sign in NO_MEMORY):
-        raise too_large(limits)
-    kind = getattr(errors, str(found[SAID]), None)
+) -> VlatoolError:
+    """Return what a process says that it raised, as ``otherwise`` where that is no error of vlatool."""
+    if limits.memory_mb and any(sign in message.message for sign in NO_MEMORY):
+        return too_large(limits)
+    kind = getattr(errors, message.kind, None)
     raised = kind if isinstance(kind, type) and issubclass(kind, VlatoolError) else otherwise
-    raise raised(told, str(found.get("fix", "")))
+    return raised(message.message, message.fix)
 
 
 def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fresh process") -> VlatoolError:
@@ -134,12 +195,28 @@ def answers_alone() -> IO[str]:
     return stream
 
 
-def answer(give: Callable[[], dict[str, Any]], stream: IO[str] | None = None) -> None:
-    """Print what a function returns as one line of JSON, or what it raised."""
-    try:
-        found = give()
-    except VlatoolError as error:
-        found = {SAID: type(error).__name__, "message": error.message, "fix": error.fix}
+def say(message: Message, stream: IO[str] | None = None) -> None:
+    """Write a message as one line of JSON; to standard output when no stream is given."""
     out = stream or sys.stdout
-    out.write(json.dumps(found) + "\n")
+    out.write(json.dumps({type(message).__name__.lower(): to_json(message)}) + "\n")
     out.flush()
+
+
+def asked(kind: type[T]) -> T:
+    """Return the job on standard input."""
+    return from_json(kind, json.loads(sys.stdin.readline()))
+
+
+def answer(give: Callable[[], Any], stream: IO[str] | None = None) -> None:
+    """Say what a function returns, or the error of vlatool that it raises."""
+    try:
+        message: Message = Result(to_json(give()))
+    except VlatoolError as error:
+        message = Raised(type(error).__name__, error.message, error.fix)
+    say(message, stream)
+
+
+def serve(kind: type[T], run: Callable[[T], Any]) -> None:
+    """Answer ``ask``: run the job on standard input; this process ends with the one that started it."""
+    die_with_parent()
+    answer(lambda: run(asked(kind)))

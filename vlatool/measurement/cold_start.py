@@ -1,18 +1,17 @@
 """Run in a fresh process: load a bundle, infer, and say how long each part took and how much memory it needed.
 
-``python -m vlatool.measurement.cold_start BUNDLE ENGINE THREADS [OBSERVATIONS]`` prints one line of JSON.
+``python -m vlatool.measurement.cold_start`` reads a ``ColdStartJob`` and answers with a ``ColdStart``.
 """
 
 from __future__ import annotations
 
-import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool.machine.processes import die_with_parent
-from vlatool.measurement.child import answer, ask
-from vlatool.measurement.job import Limits
+from vlatool.measurement.child import ask, serve
+from vlatool.measurement.jobs import ColdStartJob, Limits
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
 
 MORE = 5
@@ -27,6 +26,31 @@ PARTS = {
 }
 
 
+@dataclass(frozen=True)
+class ColdStart:
+    """What a fresh process took.
+
+    Args:
+        start_ms: From the start of the process until its first line of Python.
+        import_ms: For numpy and the runtime.
+        engine_ms: For the engine's library.
+        load_ms: To verify and load the graphs.
+        first_ms: The first inference after the load.
+        total_ms: From the start of the process to the first action.
+        peak_rss_mb: Memory at most (10^6 bytes).
+        rss_mb: Part (of ``PARTS``) -> what the process holds once that part is done.
+    """
+
+    start_ms: float
+    import_ms: float
+    engine_ms: float
+    load_ms: float
+    first_ms: float
+    total_ms: float
+    peak_rss_mb: float
+    rss_mb: dict[str, float]
+
+
 def cold_start(
     bundle: Path,
     engine: str,
@@ -34,7 +58,7 @@ def cold_start(
     limits: Limits = Limits(),  # noqa: B008
     timeout: float | None = None,
     observations: Path | None = None,
-) -> dict[str, Any]:
+) -> ColdStart:
     """Probe a bundle in a fresh process, which may take ``timeout`` seconds.
 
     Args:
@@ -42,26 +66,17 @@ def cold_start(
         limits, timeout: Of the process.
         observations: File of observations (``save_drawn``) to infer on after the golden one.
 
-    Returns:
-        ``start_ms`` (from the start of the process until its first line of Python), ``import_ms``, ``engine_ms`` (the
-        engine's library), ``load_ms``, ``first_ms`` (the first inference after the load), ``total_ms`` (from the start
-        of the process to the first action), ``peak_rss_mb`` (10^6 bytes) and ``rss_mb``: part -> what the process
-        holds once that part is done.
-
     Raises:
         VlatoolError: what the bundle raises; GraphError when the process ends in another way, or takes longer.
     """
-    begun = time.monotonic_ns()
-    words = (str(bundle), engine, str(threads), *([str(observations)] if observations else []))
-    found = ask("vlatool.measurement.cold_start", words, "", str(bundle), timeout, limits)
-    found["start_ms"] = (found.pop("begun_ns") - begun) / 1e6
-    found["total_ms"] = (found.pop("acted_ns") - begun) / 1e6
-    return found
+    further = "" if observations is None else str(observations)
+    job = ColdStartJob(str(bundle), engine, threads, time.monotonic_ns(), further)
+    return ask("vlatool.measurement.cold_start", job, ColdStart, str(bundle), timeout, limits)
 
 
-def main(arguments: list[str]) -> dict[str, Any]:
+def run(job: ColdStartJob) -> ColdStart:
     """Load and run in this process."""
-    begun = time.monotonic_ns()  # the same clock in every process of a machine
+    begun = time.monotonic_ns()
     rss = {"interpreter": resident_mb()}
     from vlatool.bundle.bundle import Bundle
     from vlatool.runtime import load
@@ -69,11 +84,11 @@ def main(arguments: list[str]) -> dict[str, Any]:
 
     imported = time.monotonic_ns()
     rss["imported"] = resident_mb()
-    named = arguments[1] or Bundle.open(arguments[0], verify=False).manifest.engine  # load verifies what it opens
+    named = job.engine or Bundle.open(job.bundle, verify=False).manifest.engine  # load verifies what it opens
     _import_engine(named or DEFAULT_ENGINE)
     ready = time.monotonic_ns()
     rss["engine"] = resident_mb()
-    policy = load(arguments[0], engine=arguments[1], threads=int(arguments[2]), warmup=0)
+    policy = load(job.bundle, engine=job.engine, threads=job.threads, warmup=0)
     loaded = time.monotonic_ns()
     rss["loaded"] = resident_mb()
     observation, noise = _observation(policy)
@@ -83,24 +98,24 @@ def main(arguments: list[str]) -> dict[str, Any]:
     rss["first"] = resident_mb()
     for _ in range(MORE):
         policy.infer(observation, noise=noise)
-    if len(arguments) > 3:
-        _infer_on(policy, Path(arguments[3]))
+    if job.observations:
+        _infer_on(policy, Path(job.observations))
     rss["more"] = resident_mb()
-    return {
-        "begun_ns": begun,
-        "import_ms": (imported - begun) / 1e6,
-        "engine_ms": (ready - imported) / 1e6,
-        "load_ms": (loaded - ready) / 1e6,
-        "first_ms": (acted - before) / 1e6,
-        "acted_ns": acted,
-        "peak_rss_mb": peak_rss_mb(),
-        "rss_mb": rss,
-    }
+    return ColdStart(
+        start_ms=(begun - job.begun_ns) / 1e6,
+        import_ms=(imported - begun) / 1e6,
+        engine_ms=(ready - imported) / 1e6,
+        load_ms=(loaded - ready) / 1e6,
+        first_ms=(acted - before) / 1e6,
+        total_ms=(acted - job.begun_ns) / 1e6,
+        peak_rss_mb=peak_rss_mb(),
+        rss_mb=rss,
+    )
 
 
 def _observation(policy: Any) -> tuple[Any, Any]:
     """Return the golden observation with its noise, or a recorded or synthetic one where there is no golden."""
-    from vlatool.runtime.policy import load_golden
+    from vlatool.runtime.golden import load_golden
 
     golden = load_golden(policy.bundle)
     if golden is not None:
@@ -131,5 +146,4 @@ def _import_engine(name: str) -> None:
 
 
 if __name__ == "__main__":
-    die_with_parent()
-    answer(lambda: main(sys.argv[1:]))
+    serve(ColdStartJob, run)

@@ -73,13 +73,13 @@ def run_interleaved(
     """
     for contestant in contestants:
         contestant.warm_up(warmup)
-    each = -(-iterations // BLOCKS)
+    share = -(-iterations // BLOCKS)
     order = np.random.default_rng(0)
     for block in range(BLOCKS):
         tell("measuring latency", block / BLOCKS)
         between()
         for index in order.permutation(len(contestants)):
-            _time(contestants[int(index)], each, duration / BLOCKS)
+            _time(contestants[int(index)], share, duration / BLOCKS)
     between()
 
 
@@ -111,8 +111,8 @@ def latency_measurements(
         refusals, most, seconds: As ``percentile_measurements`` takes them; back to back when ``seconds`` is None.
     """
     taken = sum(samples) / 1e3 if seconds is None else seconds
-    found = percentile_measurements("latency", samples, PERCENTILES, refusals, most, taken)
-    return [*found, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
+    percentiles = percentile_measurements("latency", samples, PERCENTILES, refusals, most, taken)
+    return [*percentiles, Measurement("latency_max", max(samples), "ms", samples=len(samples))]
 
 
 def percentile_measurements(
@@ -136,30 +136,29 @@ def percentile_measurements(
         most: Independent calls that the samples are worth at most; 0 where nothing can be said.
         seconds: That it took to take them, for the refusals.
     """
-    found = []
+    measured, count = [], len(samples)
     for percent in percents:
-        seen = percentile(samples, percent, most=most)
-        name = f"{what}_{seen.name}"
-        if seen.known:
-            found.append(
-                Measurement(name, seen.value, "ms", samples=len(samples), high=seen.bound, confidence=seen.confidence)
-            )
+        bounded = percentile(samples, percent, most=most)
+        name = f"{what}_{bounded.name}"
+        if bounded.known:
+            high, confidence = bounded.bound, bounded.confidence
+            measured.append(Measurement(name, bounded.value, "ms", samples=count, high=high, confidence=confidence))
         elif percent == PERCENTILES[0]:
-            found.append(Measurement(name, float(np.median(samples)), "ms", samples=len(samples)))
+            measured.append(Measurement(name, float(np.median(samples)), "ms", samples=count))
         elif refusals:
-            note = _wanting(seen, len(samples), seconds)
-            found.append(Measurement(name, math.nan, "ms", samples=len(samples), note=note))
-    return found
+            measured.append(Measurement(name, math.nan, "ms", samples=count, note=_lacks(bounded, count, seconds)))
+    return measured
 
 
-def _wanting(seen: Percentile, calls: int, seconds: float) -> str:
+def _lacks(seen: Percentile, calls: int, seconds: float) -> str:
     """Return what a percentile lacks; calls that follow each other count for less than independent ones."""
-    if not seen.worth:
+    size = seen.effective_sample_size
+    if not size:
         return "ticks share inferences, so nothing bounds it; pass a lower --rate"
-    more = math.ceil(1.1 * seen.needed * max(1.0, calls / seen.worth) / 100) * 100
-    worth = f"{calls:,} calls" if seen.worth >= calls else f"{calls:,} calls that are worth {int(seen.worth):,}"
+    more = math.ceil(1.1 * seen.needed * max(1.0, calls / size) / 100) * 100
+    run = f"{calls:,} calls" if size >= calls else f"{calls:,} calls that are worth {int(size):,}"
     advice = f"pass --iterations {more} (about {seconds * more / calls:.0f} s)"
-    return f"needs {seen.needed:,} independent calls, this run has {worth}; {advice}"
+    return f"needs {seen.needed:,} independent calls, this run has {run}; {advice}"
 
 
 def speedup(contestant: Contestant, reference: Contestant) -> Measurement:

@@ -14,12 +14,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from vlatool.errors import UsageError
+from vlatool.files.messages import from_json, to_json
 from vlatool.machine.processes import die_with_parent, python_command
-from vlatool.measurement.job import Limits
+from vlatool.measurement.jobs import Limits
 
 GROUPS = (
     (Path("/sys/fs/cgroup"), "memory.max", ("memory.swap.max", "0")),
@@ -33,7 +34,7 @@ def command(limits: Limits, module: str, arguments: Sequence[str] = ()) -> list[
     """Return the command of a module, under the limits where there are any."""
     if not limits:
         return python_command(module, arguments)
-    return python_command("vlatool.measurement.limited", (json.dumps(asdict(limits)), module, *arguments))
+    return python_command("vlatool.measurement.limited", (json.dumps(to_json(limits)), module, *arguments))
 
 
 @contextlib.contextmanager
@@ -44,12 +45,12 @@ def grouped(limits: Limits) -> Iterator[Limits]:
     limits its private writable memory (``RLIMIT_DATA``), which counts what is reserved and not touched, too.
     """
     _sweep()
-    made = _made(limits) if limits.memory_mb else None
+    group = _new_group(limits) if limits.memory_mb else None
     try:
-        yield limits if made is None else replace(limits, cgroup=str(made))
+        yield limits if group is None else replace(limits, cgroup=str(group))
     finally:
-        if made is not None:
-            _remove(made)
+        if group is not None:
+            _remove(group)
 
 
 def _sweep() -> None:
@@ -90,40 +91,39 @@ def ran_out(limits: Limits) -> bool:
     return False
 
 
-def _made(limits: Limits) -> Path | None:
+def _new_group(limits: Limits) -> Path | None:
     size = str(int(limits.memory_mb * 1e6))
     for base, name, (swap, value) in GROUPS:
-        found = None
+        group = None
         try:
-            found = Path(tempfile.mkdtemp(prefix=f"vlatool-{os.getpid()}-", dir=base))
-            if not (found / name).exists():  # no group, but a plain directory: nothing is mounted there
-                raise FileNotFoundError(found / name)
-            (found / name).write_text(size, encoding="ascii")
+            group = Path(tempfile.mkdtemp(prefix=f"vlatool-{os.getpid()}-", dir=base))
+            if not (group / name).exists():  # no group, but a plain directory: nothing is mounted there
+                raise FileNotFoundError(group / name)
+            (group / name).write_text(size, encoding="ascii")
         except OSError:
-            if found is not None:
-                with contextlib.suppress(OSError):
-                    found.rmdir()
+            if group is not None:
+                _remove(group, 0.0)
             continue
         with contextlib.suppress(OSError):  # a kernel without swap accounting has no such file
-            (found / swap).write_text(value or size, encoding="ascii")
-        return found
+            (group / swap).write_text(value or size, encoding="ascii")
+        return group
     return None
 
 
 def chosen(limits: Limits) -> Limits:
-    """Return the limits with the processors named: those that are wanted, the first ones of them where fewer.
+    """Return the limits with the processors named: those that are asked for, the first ones of them where fewer.
 
     Raises:
-        UsageError: when one that is wanted is not there.
+        UsageError: when one that is asked for is not there.
     """
     usable = sorted(os.sched_getaffinity(0))
     if missing := [cpu for cpu in limits.cpus if cpu not in usable]:
-        told = ", ".join(map(str, usable))
-        raise UsageError(f"--pin names processor {missing[0]}; this process may use {told}.")
+        allowed = ", ".join(map(str, usable))
+        raise UsageError(f"--pin names processor {missing[0]}; this process may use {allowed}.")
     if not (limits.cpus or limits.cores):
         return limits
-    wanted = limits.cpus or tuple(usable)
-    return replace(limits, cpus=wanted[: limits.cores or len(wanted)])
+    cpus = limits.cpus or tuple(usable)
+    return replace(limits, cpus=cpus[: limits.cores or len(cpus)])
 
 
 def limit_this_process(limits: Limits) -> None:
@@ -144,8 +144,7 @@ def limit_this_process(limits: Limits) -> None:
 def main() -> None:
     """Set the limits and become the module."""
     die_with_parent()
-    read = json.loads(sys.argv[1])
-    limit_this_process(Limits(**{**read, "cpus": tuple(read["cpus"])}))
+    limit_this_process(from_json(Limits, json.loads(sys.argv[1])))
     module = sys.argv[2]
     sys.argv = [module, *sys.argv[3:]]
     runpy.run_module(module, run_name="__main__", alter_sys=True)

@@ -8,10 +8,8 @@ from pathlib import Path
 
 def resident_mb(status: Path = Path("/proc/self/status")) -> float:
     """Return the resident set of this process in MB (10^6 bytes)."""
-    for line in status.read_text(encoding="utf-8").splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return peak_rss_mb(status)
+    resident = _line_mb(status, "VmRSS:")
+    return peak_rss_mb(status) if resident is None else resident
 
 
 def peak_rss_mb(status: Path = Path("/proc/self/status")) -> float:
@@ -19,7 +17,10 @@ def peak_rss_mb(status: Path = Path("/proc/self/status")) -> float:
 
     ``ru_maxrss`` would do, but Linux lets a child inherit its parent's value; ``VmHWM`` belongs to the process alone.
     """
-    for line in status.read_text(encoding="utf-8").splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+    peak = _line_mb(status, "VmHWM:")
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6 if peak is None else peak
+
+
+def _line_mb(status: Path, name: str) -> float | None:
+    lines = status.read_text(encoding="utf-8").splitlines()
+    return next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(name)), None)

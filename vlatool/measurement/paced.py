@@ -16,6 +16,7 @@ from typing import Any
 
 from vlatool.measurement.answers import Answers
 from vlatool.measurement.interleaved import percentile_measurements
+from vlatool.measurement.measured import Pace
 from vlatool.report import Measurement
 from vlatool.runtime.policy import Policy
 from vlatool.stats.intervals import wilson
@@ -60,17 +61,17 @@ class Ticks:
         """Ticks whose action came after the next tick was due."""
         return sum(value > self.period_ms for value in self.response_ms)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON values."""
-        return {
-            "period_ms": self.period_ms,
-            "wakeup_ms": list(self.wakeup_ms),
-            "age_ms": list(self.age_ms),
-            "misses": self.misses,
-            "passed_over": self.passed_over,
-            "inferences": len(self.served),
-            "worth": sum(self.served) ** 2 / max(1, sum(count * count for count in self.served)),
-        }
+    def pace(self) -> Pace:
+        """Return what counts for the whole loop."""
+        return Pace(
+            period_ms=self.period_ms,
+            wakeup_ms=tuple(self.wakeup_ms),
+            age_ms=tuple(self.age_ms),
+            misses=self.misses,
+            passed_over=self.passed_over,
+            inferences=len(self.served),
+            effective_sample_size=sum(self.served) ** 2 / max(1, sum(count * count for count in self.served)),
+        )
 
 
 def run_paced(
@@ -97,66 +98,64 @@ def run_paced(
         between: Called with the share of ticks that are done, where there is time until the next.
     """
     period = 1.0 / rate
-    found = Ticks(period * 1e3)
+    ticked = Ticks(period * 1e3)
     begun = clock() + period
-    tick, served, told = 0, 0, -TELL_S
+    tick, served, last_told = 0, 0, -TELL_S
     actions: list[tuple[float, float]] = []  # the last two: when the observation was taken, when the action was there
     while tick < ticks:
         place = served % len(observations)
         if not place:
             policy.reset()
-        if (now := clock()) - told >= TELL_S:
+        if (now := clock()) - last_told >= TELL_S:
             tell(f"serving ticks at {rate:g} Hz", tick / ticks)
-            told = now
+            last_told = now
         due = begun + tick * period
         if (left := due - clock()) > 0:
             sleep(left)
-            found.wakeup_ms.append((clock() - due) * 1e3)
+            ticked.wakeup_ms.append((clock() - due) * 1e3)
         now = clock()
         newest = min(ticks - 1, max(tick, int((now - begun) / period)))
         action = policy.infer(observations[place])
         done = clock()
-        found.passed_over += newest - tick
-        found.served.append(newest + 1 - tick)
-        for each in range(tick, newest + 1):
-            when = begun + each * period
-            found.due_s.append(when)
-            found.response_ms.append((done - when) * 1e3)
+        ticked.passed_over += newest - tick
+        ticked.served.append(newest + 1 - tick)
+        for number in range(tick, newest + 1):
+            when = begun + number * period
+            ticked.due_s.append(when)
+            ticked.response_ms.append((done - when) * 1e3)
             if there := [taken for taken, ready in actions if ready <= when]:
-                found.age_ms.append((when - there[-1]) * 1e3)
+                ticked.age_ms.append((when - there[-1]) * 1e3)
         actions = [*actions[-1:], (now, done)]
         served, tick = served + 1, newest + 1
         if answers is not None:
             answers.look(place, action.outputs)
         if begun + tick * period - clock() > SLACK_S:
             between(tick / ticks)
-    return found
+    return ticked
 
 
-def paced_measurements(found: Mapping[str, Any], ticks: int, rate: float) -> list[Measurement]:
-    """Return misses, ages and lateness of a loop from ``Ticks.to_dict``."""
-    misses, period = int(found["misses"]), float(found["period_ms"])
-    worth = 0 if overloaded(found, ticks) else int(found["worth"])
-    low, high = wilson(min(worth, round(misses * worth / ticks)), worth) if worth else (None, None)
-    note = f"ticks at {rate:g} Hz whose action came after the next tick, {period:g} ms later; "
-    note += f"{found['inferences']:,} inferences, {found['passed_over']:,} ticks passed over while the policy computed"
-    measured = [Measurement("deadline_misses", misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
-    ages, late = found["age_ms"], found["wakeup_ms"]
-    if ages:
+def paced_measurements(pace: Pace, ticks: int, rate: float) -> list[Measurement]:
+    """Return misses, ages and lateness of a loop."""
+    size = 0 if overloaded(pace, ticks) else int(pace.effective_sample_size)
+    low, high = wilson(min(size, round(pace.misses * size / ticks)), size) if size else (None, None)
+    note = f"ticks at {rate:g} Hz whose action came after the next tick, {pace.period_ms:g} ms later; "
+    note += f"{pace.inferences:,} inferences, {pace.passed_over:,} ticks passed over while the policy computed"
+    measured = [Measurement("deadline_misses", pace.misses / ticks, "1", samples=ticks, low=low, high=high, note=note)]
+    if ages := pace.age_ms:
         about = "age of the observation behind the newest action when a tick is due"
-        measured += _percentiles("age", ages, worth, ticks / rate, about)
+        measured += _percentiles("age", ages, size, ticks / rate, about)
         measured.append(Measurement("age_max", max(ages), "ms", samples=len(ages), note=about))
-    if late:
+    if pace.wakeup_ms:
         about = "how late the loop wakes up for a tick that it slept until"
-        measured += _percentiles("wakeup", late, worth, ticks / rate, about)
+        measured += _percentiles("wakeup", pace.wakeup_ms, size, ticks / rate, about)
     return measured
 
 
-def _percentiles(what: str, samples: Sequence[float], worth: float, seconds: float, about: str) -> list[Measurement]:
-    found = percentile_measurements(what, samples, (50.0, 99.0), True, worth, seconds)
-    return [replace(each, note=each.note or about) for each in found]
+def _percentiles(what: str, samples: Sequence[float], size: float, seconds: float, about: str) -> list[Measurement]:
+    percentiles = percentile_measurements(what, samples, (50.0, 99.0), True, size, seconds)
+    return [replace(percentile, note=percentile.note or about) for percentile in percentiles]
 
 
-def overloaded(found: Mapping[str, Any], ticks: int) -> bool:
+def overloaded(pace: Pace, ticks: int) -> bool:
     """Say whether so many ticks share an inference that nothing can be bounded."""
-    return bool(found["passed_over"] > OVERLOADED * ticks)
+    return pace.passed_over > OVERLOADED * ticks

@@ -1,25 +1,22 @@
 """Two bundles timed call by call in one fresh process: the unit of which a gate takes several.
 
-``python -m vlatool.measurement.turns`` reads one line of JSON (the fields of ``Job``) and prints one (those of
-``Pairs``). Both bundles are in one process and take turns in random order, so that a slow phase of the machine hits
-both; the process is fresh, because how memory happens to lie makes one process faster than the next.
+``python -m vlatool.measurement.turns`` reads a ``PairJob`` and answers with ``Pairs``. Both bundles are in one process
+and take turns in random order, so that a slow phase of the machine hits both; the process is fresh, because how memory
+happens to lie makes one process faster than the next.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
-from typing import Any
 
 from vlatool.measurement.child import ask
 
 
 @dataclass(frozen=True)
-class Job:
+class PairJob:
     """What a process measures.
 
     Args:
@@ -43,6 +40,11 @@ class Job:
     seed: int = 0
     observations: str = ""
 
+    @property
+    def about(self) -> str:
+        """What is measured, for errors."""
+        return f"{self.candidate} beside {self.baseline}"
+
 
 MOST = 2.0
 """The largest factor that one observation counts for in the mean."""
@@ -57,7 +59,7 @@ class Pairs:
     Args:
         baseline_ms, candidate_ms: Milliseconds of each call, in the order of the pairs.
         places: What each pair was called with: an observation given exactly, or the same one varied, are two places
-            (``_turns.place_of``); each pair has one of its own when empty.
+            (``turns.place_of``); each pair has one of its own when empty.
         slow: Logarithms of candidate over baseline, of further pairs at the place that seemed the slowest for the
             candidate; empty when none seemed slow.
         slow_input: The observation of that place, in words.
@@ -104,13 +106,10 @@ def medians(taken: Sequence[float], places: Sequence[int]) -> dict[int, float]:
     return {place: median(values) for place, values in calls.items()}
 
 
-def measure_pairs(job: Job, timeout: float | None = None) -> Pairs:
+def measure_pairs(job: PairJob, timeout: float | None = None) -> Pairs:
     """Measure in a fresh process.
 
     Raises:
         VlatoolError: what a bundle raises; GraphError when the process ends or takes longer than ``timeout`` seconds.
     """
-    about = f"{job.candidate} beside {job.baseline}"
-    found = ask("vlatool.measurement.turns", (), json.dumps(dataclasses.asdict(job)), about, timeout)
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
-    return Pairs(**values)
+    return ask("vlatool.measurement.turns", job, Pairs, job.about, timeout)

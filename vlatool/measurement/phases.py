@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vlatool.measurement.measured import Phase
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program, Session
 
@@ -25,13 +26,13 @@ class _Timed:
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         start = time.perf_counter_ns()
-        found = self._session.run(feeds)
+        outputs = self._session.run(feeds)
         self.taken.append((time.perf_counter_ns() - start) / 1e6)
-        return found
+        return outputs
 
 
-def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], seconds: float) -> list[dict[str, Any]]:
-    """Return a line for each phase: ``phase``, ``calls`` in an action, ``p50 ms`` of a call, ``share %`` of an action.
+def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], seconds: float) -> list[Phase]:
+    """Return the parts of an inference, in their order.
 
     Args:
         policy: Left as it was.
@@ -44,9 +45,9 @@ def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], secon
 
     def noted(observation: Mapping[str, Any]) -> dict[str, Any]:
         start = time.perf_counter_ns()
-        found = encode(observation)
+        values = encode(observation)
         encoded.append((time.perf_counter_ns() - start) / 1e6)
-        return found
+        return values
 
     timed.encode = noted  # type: ignore[assignment]
     whole: list[float] = []
@@ -57,24 +58,17 @@ def time_phases(policy: Policy, observations: Sequence[Mapping[str, Any]], secon
         start = time.perf_counter_ns()
         timed.infer(observations[number % len(observations)])
         whole.append((time.perf_counter_ns() - start) / 1e6)
-    return _table(whole, encoded, {name: session.taken for name, session in sessions.items()})
+    return _phases(whole, encoded, {name: session.taken for name, session in sessions.items()})
 
 
-def _table(
-    whole: Sequence[float], encoded: Sequence[float], graphs: Mapping[str, Sequence[float]]
-) -> list[dict[str, Any]]:
+def _phases(whole: Sequence[float], encoded: Sequence[float], graphs: Mapping[str, Sequence[float]]) -> list[Phase]:
     actions = len(whole)
     sums = {ENCODE: np.array(encoded)}
     sums |= {name: np.array(taken).reshape(actions, -1).sum(1) for name, taken in graphs.items() if taken}
     sums[REST] = np.array(whole) - sum(sums.values())
     total = float(np.median(whole))
-    calls = {name: len(taken) // actions for name, taken in graphs.items()}
-    return [
-        {
-            "phase": name,
-            "calls": calls.get(name, 1),
-            "p50 ms": round(float(np.median(each)) / calls.get(name, 1), 5),
-            "share %": round(100 * float(np.median(each)) / total, 1),
-        }
-        for name, each in sums.items()
-    ]
+    phases = []
+    for name, taken_ms in sums.items():
+        calls, middle = len(graphs.get(name, whole)) // actions, float(np.median(taken_ms))
+        phases.append(Phase(name, calls, round(middle / calls, 5), round(100 * middle / total, 1)))
+    return phases

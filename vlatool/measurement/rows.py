@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from statistics import median
 from typing import Any
 
 import numpy as np
 
-from vlatool.measurement.cold_start import PARTS
+from vlatool.measurement.cold_start import PARTS, ColdStart
 from vlatool.measurement.interleaved import latency_measurements, percentile_measurements, speedup_of
+from vlatool.measurement.measured import Measured, PolicyRun
 from vlatool.measurement.paced import overloaded, paced_measurements
 from vlatool.report import Measurement
+from vlatool.telemetry import DEGREE, THROTTLE, Absent, Recorded
 
 ENERGY_S = 10.0
 """Seconds below which the energy of a run says little (MLPerf Tiny: runs of 10 s)."""
@@ -25,39 +27,31 @@ WINDOW = 0.1
 """Share of a sustained run that is its start, and its end."""
 
 
-def samples_of(policy: Mapping[str, Any]) -> list[float]:
-    """Return the milliseconds of all calls."""
-    return [value for block in policy["blocks_ms"] for value in block]
-
-
-def measurements(
-    found: Mapping[str, Any], policy: Mapping[str, Any], reference: Mapping[str, Any] | None, rate: float
-) -> list[Measurement]:
+def measurements(measured: Measured, policy: PolicyRun, reference: PolicyRun | None, rate: float) -> list[Measurement]:
     """Return the numbers of one policy.
 
     Args:
-        found: Of the whole run.
+        measured: The whole run.
         policy: One of its policies.
         reference: What its speed is compared with; None when it ran alone.
         rate: Ticks in a second; 0 for calls back to back.
     """
-    samples, paced = samples_of(policy), policy.get("paced")
-    most = math.inf if not paced else 0.0 if overloaded(paced, len(samples)) else float(paced["worth"])
-    seconds = len(samples) / rate if paced else None
-    measured = latency_measurements(samples, refusals=reference is None, most=most, seconds=seconds)
+    samples, pace = policy.samples, policy.pace
+    most = math.inf if not pace else 0.0 if overloaded(pace, len(samples)) else pace.effective_sample_size
+    seconds = len(samples) / rate if pace else None
+    numbers = latency_measurements(samples, refusals=reference is None, most=most, seconds=seconds)
     if reference is not None:
-        return [*measured, speedup_of(policy["blocks_ms"], reference["blocks_ms"], reference["name"]), *cold(policy)]
-    if paced:
+        return [*numbers, speedup_of(policy.blocks_ms, reference.blocks_ms, reference.name), *cold(policy)]
+    if pace:
         note = "from the moment at which the tick was due"
-        measured = [replace(each, note=each.note or note) for each in measured]
-        measured += paced_measurements(paced, len(samples), rate)
+        numbers = [replace(number, note=number.note or note) for number in numbers]
+        numbers += paced_measurements(pace, len(samples), rate)
     else:
-        measured.append(_throughput(samples))
-    measured.append(_jitter(samples))
-    busy = float(found["cpu_s"]) / max(float(found["wall_s"]), 1e-9)
-    measured.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
-    inferences = int(paced["inferences"]) if paced else len(samples)
-    return [*measured, *_board(found, inferences), *_golden(policy), *cold(policy)]
+        numbers.append(_throughput(samples))
+    numbers.append(_jitter(samples))
+    busy = measured.cpu_s / max(measured.wall_s, 1e-9)
+    numbers.append(Measurement("cpu", busy, "cores", note="user and system time of the process over the run"))
+    return [*numbers, *_board(measured, pace.inferences if pace else len(samples)), *_golden(policy), *cold(policy)]
 
 
 def _throughput(samples: Sequence[float]) -> Measurement:
@@ -69,110 +63,101 @@ def _jitter(samples: Sequence[float]) -> Measurement:
     return Measurement("jitter", value, "ms", samples=len(samples), note="between the quartiles of the latency")
 
 
-def _board(found: Mapping[str, Any], actions: int) -> list[Measurement]:
+def _board(measured: Measured, actions: int) -> list[Measurement]:
     """Return power, energy and the highest temperature, where the board tells them."""
-    telemetry = found.get("telemetry") or {}
-    measured = []
-    for energy in telemetry.get("energy", ())[:1]:
-        watts = float(energy["mean_w"])
-        note = f"{energy['label']} ({energy['source']}), idle power included"
-        measured.append(Measurement("power_mean", watts, "W", samples=energy["samples"], note=note))
-        if energy["seconds"] >= ENERGY_S:
-            seconds = float(found["ended_s"]) - float(found["begun_s"])
-            measured.append(
-                Measurement("energy_per_action", watts * seconds / actions, "J", samples=actions, note=note)
-            )
+    telemetry = measured.telemetry
+    if telemetry is None:
+        return []
+    numbers = []
+    for energy in telemetry.energy[:1]:
+        note = f"{energy.label} ({energy.source}), idle power included"
+        numbers.append(Measurement("power_mean", energy.mean_w, "W", samples=energy.samples, note=note))
+        if energy.seconds >= ENERGY_S:
+            joules = energy.mean_w * (measured.ended_s - measured.begun_s)
+            numbers.append(Measurement("energy_per_action", joules / actions, "J", samples=actions, note=note))
         else:
-            short = f"the run took {energy['seconds']:.1f} s; pass --duration {ENERGY_S:g} or more"
-            measured.append(Measurement("energy_per_action", float("nan"), "J", note=short))
-    hot = [(gauge["max"], name) for name, gauge in telemetry.get("gauges", {}).items() if gauge["unit"] == "degC"]
-    if hot:
+            short = f"the run took {energy.seconds:.1f} s; pass --duration {ENERGY_S:g} or more"
+            numbers.append(Measurement("energy_per_action", math.nan, "J", note=short))
+    if hot := [(gauge.max, name) for name, gauge in telemetry.gauges.items() if gauge.unit == DEGREE]:
         value, name = max(hot)
-        measured.append(Measurement("temperature_max", value, "degC", note=name))
-    return measured
+        numbers.append(Measurement("temperature_max", value, DEGREE, note=name))
+    return numbers
 
 
-def _golden(policy: Mapping[str, Any]) -> list[Measurement]:
-    error = policy.get("golden_error")
+def _golden(policy: PolicyRun) -> list[Measurement]:
     note = "relative difference of the golden action from the recorded one"
-    return [] if error is None else [Measurement("golden_error", float(error), "1", samples=1, note=note)]
+    error = policy.golden_error
+    return [] if error is None else [Measurement("golden_error", error, "1", samples=1, note=note)]
 
 
-def cold(policy: Mapping[str, Any]) -> list[Measurement]:
+def cold(policy: PolicyRun) -> list[Measurement]:
     """Return the cold start and the memory of fresh processes."""
-    starts = policy.get("cold")
-    if policy.get("cold_error"):
-        return [Measurement("cold_start", math.nan, "ms", note=policy["cold_error"])]
+    starts = policy.cold
+    if policy.cold_error:
+        return [Measurement("cold_start", math.nan, "ms", note=policy.cold_error)]
     if not starts:
         return []
-    count = len(starts)
-    note = f"fresh process; median of {count}"
-    peak = median(each["peak_rss_mb"] for each in starts)
-    steady = median(list(each["rss_mb"].values())[-1] for each in starts)
-    total = median(each["total_ms"] for each in starts)
-    cached = f"start of the process to the first action, its files in the page cache; {note}"
+    fresh = f"fresh process; median of {len(starts)}"
+    values = (
+        ("peak_rss", "MB", f"import, load, inferences in a {fresh}", [start.peak_rss_mb for start in starts]),
+        ("steady_rss", "MB", f"after some inferences in a {fresh}", [[*start.rss_mb.values()][-1] for start in starts]),
+        ("cold_start", "ms", f"start of the process to the first action, its files in the page cache; {fresh}",
+         [start.total_ms for start in starts]),
+    )  # fmt: skip
     return [
-        Measurement("peak_rss", peak, "MB", samples=count, note=f"import, load, inferences in a {note}"),
-        Measurement("steady_rss", steady, "MB", samples=count, note=f"after some inferences in a {note}"),
-        Measurement(
-            "cold_start",
-            total,
-            "ms",
-            samples=count,
-            note=cached,
-        ),
+        Measurement(name, median(samples), unit, samples=len(starts), note=note) for name, unit, note, samples in values
     ]
 
 
 def sustained(samples: Sequence[float]) -> list[Measurement]:
     """Return the median at the start of a long run and at its end, each with its bound, and their ratio."""
     count = max(1, int(WINDOW * len(samples)))
-    found = []
+    ends = []
     for name, which, part in (("start", "first", samples[:count]), ("sustained", "last", samples[-count:])):
         (middle,) = percentile_measurements(f"latency_{name}", part, (50.0,))
-        found.append(replace(middle, note=f"median of the {which} {100 * WINDOW:g} % of the run"))
-    slowdown = found[1].value / found[0].value
+        ends.append(replace(middle, note=f"median of the {which} {100 * WINDOW:g} % of the run"))
+    slowdown = ends[1].value / ends[0].value
     note = "end over start of the run"
-    return [*found, Measurement("sustained_slowdown", slowdown, "x", samples=2 * count, note=note)]
+    return [*ends, Measurement("sustained_slowdown", slowdown, "x", samples=2 * count, note=note)]
 
 
-def raw(found: Mapping[str, Any], policy: Mapping[str, Any], alone: bool) -> dict[str, list[float]]:
+def raw(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[float]]:
     """Return every sample: latencies, when each call began, and, of a run alone, what the board told meanwhile."""
-    series = {"latency_ms": samples_of(policy), "at_s": list(policy["at_s"])}
-    telemetry = found.get("telemetry")
-    if not alone or not telemetry:
+    series = {"latency_ms": policy.samples, "at_s": list(policy.at_s)}
+    if not alone or measured.telemetry is None:
         return series
-    begun = float(found["begun_s"])
-    for name, gauge in telemetry["gauges"].items():
-        series[f"telemetry.{name}"] = list(gauge["values"])
-        series[f"telemetry.{name}.at_s"] = [round(when - begun, 3) for when in gauge["times"]]
-    flags = [gauge for gauge in telemetry["gauges"].values() if gauge["unit"] == "throttle"]
-    moments = sorted(
-        round(when - begun, 3)
-        for gauge in flags
-        for when, value in zip(gauge["times"], gauge["values"], strict=True)
-        if value
-    )
-    return {**series, **({"throttled_at_s": moments} if moments else {})}
+    moments: list[float] = []
+    for name, gauge in measured.telemetry.gauges.items():
+        times = [round(when - measured.begun_s, 3) for when in gauge.times]
+        series |= {f"telemetry.{name}": list(gauge.values), f"telemetry.{name}.at_s": times}
+        if gauge.unit == THROTTLE:
+            moments += [when for when, value in zip(times, gauge.values, strict=True) if value]
+    return {**series, **({"throttled_at_s": sorted(moments)} if moments else {})}
 
 
-def tables(found: Mapping[str, Any], policy: Mapping[str, Any], alone: bool) -> dict[str, list[dict[str, Any]]]:
+def tables(measured: Measured, policy: PolicyRun, alone: bool) -> dict[str, list[dict[str, Any]]]:
     """Return what belongs to a policy as tables: engine, phases, memory and cold start by part, telemetry."""
-    told: dict[str, list[dict[str, Any]]] = {}
-    if policy.get("engines"):
-        told["engine"] = policy["engines"]
-    if policy.get("phases"):
-        told["time by phase"] = policy["phases"]
-    if policy.get("cold"):
-        told |= {"memory by part": _memory_parts(policy["cold"]), "cold start by part": _start_parts(policy["cold"])}
-    telemetry = found.get("telemetry")
-    if alone and telemetry:
-        told |= _telemetry(telemetry)
-    return told
+    details: dict[str, list[dict[str, Any]]] = {}
+    if policy.engines:
+        details["engine"] = [
+            {"graph": graph.graph, "engine": graph.engine, "version": graph.version, "providers": graph.providers,
+             "computes in": graph.computes_in, "MACs in": graph.macs_in}
+            for graph in policy.engines
+        ]  # fmt: skip
+    if policy.phases:
+        details["time by phase"] = [
+            {"phase": phase.name, "calls": phase.calls, "p50 ms": phase.p50_ms, "share %": phase.share_percent}
+            for phase in policy.phases
+        ]
+    if policy.cold:
+        details |= {"memory by part": _memory_parts(policy.cold), "cold start by part": _start_parts(policy.cold)}
+    if alone and measured.telemetry:
+        details |= _telemetry(measured.telemetry)
+    return details
 
 
-def _memory_parts(starts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    held = {name: median(each["rss_mb"][name] for each in starts) for name in starts[0]["rss_mb"]}
+def _memory_parts(starts: Sequence[ColdStart]) -> list[dict[str, Any]]:
+    held = {name: median(start.rss_mb[name] for start in starts) for name in starts[0].rss_mb}
     whole, before, lines = max(held.values()), 0.0, []
     for name, value in held.items():
         part = max(0.0, value - before)
@@ -181,32 +166,34 @@ def _memory_parts(starts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return lines
 
 
-def _start_parts(starts: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _start_parts(starts: Sequence[ColdStart]) -> list[dict[str, Any]]:
     parts = {"start_ms": "Python", "import_ms": "numpy and runtime", "engine_ms": "engine library",
              "load_ms": "verify and load the graphs", "first_ms": "first inference"}  # fmt: skip
-    return [{"part": told, "ms": round(median(each[name] for each in starts), 1)} for name, told in parts.items()]
+    return [
+        {"part": part, "ms": round(median(getattr(start, name) for start in starts), 1)} for name, part in parts.items()
+    ]
 
 
-def _telemetry(telemetry: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+def _telemetry(telemetry: Recorded) -> dict[str, list[dict[str, Any]]]:
     gauges = [
-        {"reading": name, "unit": each["unit"], "min": round(each["min"], 4), "mean": round(each["mean"], 4),
-         "max": round(each["max"], 4)}
-        for name, each in telemetry["gauges"].items()
+        {"reading": name, "unit": gauge.unit, "min": round(gauge.min, 4), "mean": round(gauge.mean, 4),
+         "max": round(gauge.max, 4)}
+        for name, gauge in telemetry.gauges.items()
     ]  # fmt: skip
     counters = [
-        {"reading": name, "unit": each["unit"], "difference": round(each["difference"], 4)}
-        for name, each in telemetry["counters"].items()
+        {"reading": name, "unit": counter.unit, "difference": round(counter.difference, 4)}
+        for name, counter in telemetry.counters.items()
         if name not in OWN
     ]
-    absent = _absent(telemetry["unmeasured"])
-    return {"telemetry": [*gauges, *counters], **({"unmeasured": absent} if absent else {})}
+    unmeasured = _unmeasured(telemetry.unmeasured)
+    return {"telemetry": [*gauges, *counters], **({"unmeasured": unmeasured} if unmeasured else {})}
 
 
-def _absent(unmeasured: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
+def _unmeasured(absent: Sequence[Absent]) -> list[dict[str, str]]:
     """Return what is unmeasured and why; sources of other kinds of boards in one line."""
-    others = [each["reader"] for each in unmeasured if any(sign in each["reason"] for sign in OTHER_BOARDS)]
-    told = [{"what": each["reader"], "why": each["reason"]} for each in unmeasured if each["reader"] not in others]
+    others = [part.reader for part in absent if any(sign in part.reason for sign in OTHER_BOARDS)]
+    lines = [{"what": part.reader, "why": part.reason} for part in absent if part.reader not in others]
     if others:
         why = "this machine does not have them; vlatool telemetry says more"
-        told.append({"what": ", ".join(sorted(others)), "why": why})
-    return told
+        lines.append({"what": ", ".join(sorted(others)), "why": why})
+    return lines

@@ -12,12 +12,9 @@ A place is what a call was made with: an observation, exact or varied (``place_o
 
 from __future__ import annotations
 
-import dataclasses
 import gc
-import json
 import math
 import random
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,15 +27,14 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import DRAWN, RECORDED, Drawer, Drawn, read_drawn
 from vlatool.errors import GraphError, VlatoolError
-from vlatool.machine.processes import die_with_parent
 from vlatool.measurement.answers import Answers, varied
-from vlatool.measurement.child import answer
-from vlatool.measurement.pairs import FEWEST, Job, Pairs, medians
+from vlatool.measurement.child import serve
+from vlatool.measurement.pairs import FEWEST, PairJob, Pairs, medians
 from vlatool.runtime import Policy, load
 from vlatool.runtime.program import draw
 
 WARMUP_MS = 200.0
-"""How long each bundle runs before its first call that counts, at least ``Job.warmup`` calls."""
+"""How long each bundle runs before its first call that counts, at least ``PairJob.warmup`` calls."""
 BLOCK, REPEATS = 10, 3
 """Observations of a block, and calls of each."""
 SUSPECT = 1.25
@@ -65,7 +61,7 @@ class Turns:
         VlatoolError: when one cannot be loaded.
     """
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: PairJob) -> None:
         self.job = job
         self.order = random.Random(job.seed)
         self.noise = np.random.default_rng([job.seed, 1])
@@ -91,12 +87,12 @@ class Turns:
         gc.enable()
         if not self.places:
             raise GraphError(f"{self.job.baseline} answers none of the observations that were drawn for it.")
-        slow, told = self._confirm()
+        slow, slow_input = self._confirm()
         self.policies = [None, None]
         looked, strays = self._replay(1)
         unsteady = self._replay(0)[1] if strays else 0
         baseline, candidate = map(tuple, self.taken)
-        return Pairs(baseline, candidate, tuple(self.places), slow, told, looked, strays, unsteady)
+        return Pairs(baseline, candidate, tuple(self.places), slow, slow_input, looked, strays, unsteady)
 
     def _load(self, which: int) -> Policy:
         path = (self.job.baseline, self.job.candidate)[which]
@@ -190,7 +186,7 @@ class Turns:
     def _confirm(self) -> tuple[tuple[float, ...], str]:
         """Time further pairs of the place (an observation, exact or varied) where the candidate seemed the slowest."""
         mine, theirs = (medians(self.taken[which], self.places) for which in (1, 0))
-        place = max(mine, key=lambda each: mine[each] / theirs[each])
+        place = max(mine, key=lambda place: mine[place] / theirs[place])
         if mine[place] / theirs[place] < SUSPECT:
             return (), ""
         before = len(self.places)
@@ -215,7 +211,7 @@ class Turns:
         return answers.looked, answers.strays
 
 
-def loaded(path: str, job: Job) -> Policy:
+def loaded(path: str, job: PairJob) -> Policy:
     """Load a bundle as a robot does: every file is hashed, and the golden action is computed.
 
     What a stage found to be wrong was looked at by the gate before.
@@ -224,7 +220,7 @@ def loaded(path: str, job: Job) -> Policy:
         VlatoolError: what ``load`` raises, with the bundle's path.
     """
     try:
-        known = [each["name"] for each in Bundle.described(path).manifest.findings]
+        known = [finding["name"] for finding in Bundle.described(path).manifest.findings]
         return load(path, engine=job.engine, threads=job.threads, seed=job.seed, accept=known)
     except VlatoolError as error:
         if path in error.message:
@@ -232,7 +228,7 @@ def loaded(path: str, job: Job) -> Policy:
         raise type(error)(f"{path}: {error.message}", error.fix) from error
 
 
-def pool_of(job: Job, baseline: Bundle) -> list[Drawn]:
+def pool_of(job: PairJob, baseline: Bundle) -> list[Drawn]:
     """Return the observations of a process: those of its file, else drawn from the baseline's spec alone."""
     if job.observations:
         return read_drawn(Path(job.observations))
@@ -260,15 +256,15 @@ def halved(numbers: Sequence[int], order: random.Random) -> list[int]:
     return [place_of(number, number in exact) for number in numbers]
 
 
-def sequence(places: Sequence[int], order: random.Random) -> list[int]:
+def sequence(pool: Sequence[int], order: random.Random) -> list[int]:
     """Return each place ``REPEATS`` times in random order, never twice in a row unless there is one alone."""
-    found: list[int] = []
+    places: list[int] = []
     for _ in range(REPEATS):
-        part = order.sample(places, len(places))
-        if found and part[0] == found[-1]:
+        part = order.sample(pool, len(pool))
+        if places and part[0] == places[-1]:
             part.reverse()
-        found += part
-    return found
+        places += part
+    return places
 
 
 def described(drawn: Drawn, exact: bool = True) -> str:
@@ -278,11 +274,10 @@ def described(drawn: Drawn, exact: bool = True) -> str:
     return ", ".join([kind, *([] if exact else ["slightly varied"]), *texts])
 
 
-def run_job(job: Job) -> Pairs:
+def run_job(job: PairJob) -> Pairs:
     """Measure in this process."""
     return Turns(job).measure()
 
 
 if __name__ == "__main__":
-    die_with_parent()
-    answer(lambda: dataclasses.asdict(run_job(Job(**json.loads(sys.stdin.readline())))))
+    serve(PairJob, run_job)

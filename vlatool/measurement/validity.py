@@ -9,7 +9,8 @@ from typing import Any
 from vlatool.measurement.answers import REMEMBERS
 from vlatool.measurement.clock_drift import MOVED, drift
 from vlatool.measurement.interleaved import MOST
-from vlatool.measurement.rows import samples_of
+from vlatool.measurement.jobs import LatencyJob
+from vlatool.measurement.measured import Measured, PolicyRun
 from vlatool.report import Finding
 
 SWITCHES_A_SECOND = 50.0
@@ -26,52 +27,53 @@ GOLDEN = 1e-2
 """Relative difference of the golden action that another processor's rounding explains in int8."""
 
 
-def findings(found: Mapping[str, Any], duration_is_sustained: bool = False) -> tuple[Finding, ...]:
+def findings(measured: Measured, job: LatencyJob, duration_is_sustained: bool = False) -> tuple[Finding, ...]:
     """Return what bears on the measurement, the worst first.
 
     Args:
-        found: What ``_agent.measure`` returned.
+        measured: What ``agent.measure`` returned.
+        job: What it was asked to do.
         duration_is_sustained: Whether the run was meant to heat the board up: then throttling is its result.
     """
     seen = [
-        *_answers(found["policies"]),
-        *_golden(found["policies"]),
-        *_threads(found),
-        *busy(found.get("host") or {}),
-        *_contended(found),
-        *_clock(found, duration_is_sustained),
-        *_later(found, duration_is_sustained),
-        *_memory(found),
-        *_governor(found.get("host") or {}),
-        *_full(found),
+        *_answers(measured.policies),
+        *_golden(measured.policies),
+        *_threads(measured, job),
+        *busy(measured.host),
+        *_contended(measured, job),
+        *_clock(measured, duration_is_sustained),
+        *_later(measured, job, duration_is_sustained),
+        *_memory(measured),
+        *_governor(measured.host),
+        *_full(measured, job),
     ]
     order = ("invalid", "suspect", "note")
-    return tuple(sorted(seen, key=lambda each: order.index(each.effect)))
+    return tuple(sorted(seen, key=lambda finding: order.index(finding.effect)))
 
 
 def validity(seen: Sequence[Finding]) -> str:
     """Return ``invalid``, ``suspect`` or ``valid``: the worst effect."""
-    effects = {each.effect for each in seen}
+    effects = {finding.effect for finding in seen}
     return next((effect for effect in ("invalid", "suspect") if effect in effects), "valid")
 
 
-def _answers(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+def _answers(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
     for policy in policies:
-        answers, memory = policy.get("answers"), policy.get("memory")
-        if answers and answers["strays"]:
-            worst = answers["worst"]
+        answers, memory = policy.answers, policy.memory
+        if answers and answers.strays:
+            worst = answers.worst
             how = "not finite, or of another shape" if worst is None else f"relative difference up to {worst:.3g}"
             yield Finding(
                 "invalid",
-                f"{policy['name']} answered {answers['strays']} of {answers['looked']} observations otherwise than in "
-                f"an unhurried pass before ({how}, first in call {answers['first'] + 1})",
+                f"{policy.name} answered {answers.strays} of {answers.looked} observations otherwise than in "
+                f"an unhurried pass before ({how}, first in call {answers.first + 1})",
                 "a fast wrong answer is no inference: check the engine and its version, then the memory of the machine",
             )
-        if memory and memory["remembers"]:
+        if memory and memory.remembers:
             yield Finding(
                 "invalid",
-                f"{policy['name']} takes {memory['ratio']:.2f} times as long for observations that it has not seen "
-                f"(at least {memory['low']:.2f} times; allowed {REMEMBERS:g}): it answers repeated ones from memory",
+                f"{policy.name} takes {memory.ratio:.2f} times as long for observations that it has not seen "
+                f"(at least {memory.low:.2f} times; allowed {REMEMBERS:g}): it answers repeated ones from memory",
                 "measure without the cache, or with --no-answers if a robot's observations do repeat",
             )
 
@@ -87,30 +89,27 @@ def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _golden(policies: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
+def _golden(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
     for policy in policies:
-        error = policy.get("golden_error")
+        error = policy.golden_error
         if error is not None and error > GOLDEN:
             yield Finding(
                 "suspect",
-                f"the golden action of {policy['name']} is off by {error:.2g} (relative) on this machine",
+                f"the golden action of {policy.name} is off by {error:.2g} (relative) on this machine",
                 "see what its engine and processor compute in: vlatool explain, vlatool doctor",
             )
-        if policy.get("engines") and policy.get("answers") is None:
-            yield Finding("note", f"the answers of {policy['name']} were not looked at (--no-answers)")
+        if policy.engines and policy.answers is None:
+            yield Finding("note", f"the answers of {policy.name} were not looked at (--no-answers)")
 
 
-def _crowded(found: Mapping[str, Any]) -> tuple[int, int]:
+def _crowded(measured: Measured, job: LatencyJob) -> tuple[int, int]:
     """Return the threads of the engine, and the processors that they share."""
-    job, host = found.get("job") or {}, found.get("host") or {}
-    limits = job.get("limits") or {}
-    usable = int(host.get("cores") or 1)
-    pinned = len(limits.get("cpus") or ()) or usable
-    return int(job.get("threads") or 1), min(usable, pinned, int(limits.get("cores") or usable))
+    usable = int(measured.host.get("cores") or 1)
+    return job.threads, min(usable, len(job.limits.cpus) or usable, job.limits.cores or usable)
 
 
-def _threads(found: Mapping[str, Any]) -> Iterator[Finding]:
-    threads, processors = _crowded(found)
+def _threads(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
+    threads, processors = _crowded(measured, job)
     if threads > processors:
         yield Finding(
             "suspect",
@@ -119,24 +118,21 @@ def _threads(found: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _contended(found: Mapping[str, Any]) -> Iterator[Finding]:
-    wall = max(float(found["wall_s"]), 1e-9)
-    counters = (found.get("telemetry") or {}).get("counters", {})
-    stolen = counters.get("process.machine_steal")
-    cores = (found.get("host") or {}).get("cores") or 1
-    switches = float(found["switches"]) / wall
-    threads, processors = _crowded(found)
+def _contended(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
+    switches = measured.switches / max(measured.wall_s, 1e-9)
+    threads, processors = _crowded(measured, job)
     if switches > SWITCHES_A_SECOND * threads and threads <= processors:
         yield Finding(
             "suspect",
             f"other work took the processor from the measurement {switches:.0f} times in a second",
             "stop it, or keep processors free for the run: --pin; ratios within the run still compare",
         )
-    if stolen and stolen["difference"] > STOLEN * stolen["seconds"] * cores:
-        share = stolen["difference"] / (stolen["seconds"] * cores)
+    stolen = measured.telemetry.counters.get("process.machine_steal") if measured.telemetry else None
+    seconds = stolen.seconds * (measured.host.get("cores") or 1) if stolen else 0.0
+    if stolen and stolen.difference > STOLEN * seconds:
         yield Finding(
             "suspect",
-            f"the host of this virtual machine took {share:.1%} of its processors' time",
+            f"the host of this virtual machine took {stolen.difference / seconds:.1%} of its processors' time",
             "measure on the board itself, or on a machine that is not shared",
         )
 
@@ -144,45 +140,47 @@ def _contended(found: Mapping[str, Any]) -> Iterator[Finding]:
 def throttled(causes: Sequence[str], effect: str = "suspect") -> Iterator[Finding]:
     """Tell of a board that throttled, from what throttled it in words."""
     if causes:
-        told = "; ".join(causes)
-        yield Finding(effect, f"the board was throttled: {told}", "cool it, or choose a power mode that it can hold")
+        reason = f"the board was throttled: {'; '.join(causes)}"
+        yield Finding(effect, reason, "cool it, or choose a power mode that it can hold")
 
 
-def _clock(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
-    telemetry = found.get("telemetry") or {}
-    yield from throttled(telemetry.get("throttling") or (), "note" if sustained else "suspect")
-    moved = drift(found.get("canary_ms") or ())
+def _clock(measured: Measured, sustained: bool) -> Iterator[Finding]:
+    effect = "note" if sustained else "suspect"
+    yield from throttled(measured.telemetry.throttling if measured.telemetry else (), effect)
+    moved = drift(measured.canary_ms)
     if abs(moved) > MOVED:
-        word = "slower" if moved > 0 else "faster"
         yield Finding(
-            "note" if sustained else "suspect",
-            f"the processor became {abs(moved):.0%} {word} from the first half of the run to the second (a fixed piece "
+            effect,
+            f"the processor became {_slower(moved)} from the first half of the run to the second (a fixed piece "
             "of work beside the policy)",
             "fix the clock (jetson_clocks, or the governor 'performance'), cool the board, or end what else runs",
         )
 
 
-def _later(found: Mapping[str, Any], sustained: bool) -> Iterator[Finding]:
+def _slower(share: float) -> str:
+    return f"{abs(share):.0%} {'slower' if share > 0 else 'faster'}"
+
+
+def _later(measured: Measured, job: LatencyJob, sustained: bool) -> Iterator[Finding]:
     """Tell of a policy alone that did not settle; several in turns slow down together, and their ratios stand."""
-    policy, *others = found["policies"]
-    samples = samples_of(policy)
+    policy, *others = measured.policies
+    samples = policy.samples
     quarter = len(samples) // 4
     if quarter < FEWEST or sustained or others:
         return
-    first, last = median(samples[:quarter]), median(samples[-quarter:])
-    if abs(last / first - 1) > LATER:
-        word = "slower" if last > first else "faster"
-        longer = "--duration" if (found.get("job") or {}).get("rate") else "--sustained"
+    moved = median(samples[-quarter:]) / median(samples[:quarter]) - 1
+    if abs(moved) > LATER:
+        longer = "--duration" if job.rate else "--sustained"
         yield Finding(
             "suspect",
-            f"the last quarter of {policy['name']} was {abs(last / first - 1):.0%} {word} than the first",
+            f"the last quarter of {policy.name} was {_slower(moved)} than the first",
             f"warm up longer (--warmup), or see how it goes on: {longer} 600",
         )
 
 
-def _memory(found: Mapping[str, Any]) -> Iterator[Finding]:
-    held = (found.get("telemetry") or {}).get("gauges", {}).get("process.memory")
-    values = list(held["values"]) if held else []
+def _memory(measured: Measured) -> Iterator[Finding]:
+    held = measured.telemetry.gauges.get("process.memory") if measured.telemetry else None
+    values = held.values if held else ()
     third = len(values) // 3
     if third < 3:
         return
@@ -195,11 +193,10 @@ def _memory(found: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _full(found: Mapping[str, Any]) -> Iterator[Finding]:
-    asked = (found.get("job") or {}).get("iterations", MOST)
-    for policy in found["policies"]:
-        if len(policy["at_s"]) == MOST > asked:
-            yield Finding("note", f"{policy['name']} ended after {MOST:,} calls: every one of them is kept")
+def _full(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
+    for policy in measured.policies:
+        if len(policy.at_s) == MOST > job.iterations:
+            yield Finding("note", f"{policy.name} ended after {MOST:,} calls: every one of them is kept")
 
 
 def _governor(host: Mapping[str, Any]) -> Iterator[Finding]:

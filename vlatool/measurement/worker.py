@@ -1,32 +1,31 @@
 """The process that calls the policies: ``python -m vlatool.measurement.worker``.
 
-It reads a job (one line of JSON), opens and warms up, says ``{"ready": PID}`` and waits for a line: whoever started it
-begins to record the board then, and ends it when the worker says ``{"timed": true}`` and waits again. It says
-``{"progress": [what, share]}`` meanwhile and ``{"result": ...}``, or what it raised, in the end. It imports what a
-robot imports, so that its memory is that of a robot's process.
+It reads a ``WorkerJob``, opens and warms up, says ``Ready`` and waits for a line: whoever started it begins to record
+the board then, and ends it when the worker says ``Timed`` and waits again. It says ``Progress`` meanwhile and in the
+end ``Measured``, or what it raised. It imports what a robot imports, so that its memory is that of a robot's process.
 """
 
 from __future__ import annotations
 
 import gc
-import json
 import os
 import resource
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError
 from vlatool.machine.processes import die_with_parent
-from vlatool.measurement.answers import expected_answers, remembered
-from vlatool.measurement.child import answer, answers_alone
+from vlatool.measurement import child
+from vlatool.measurement.answers import Memory, expected_answers, remembered
 from vlatool.measurement.clock_drift import canary_ms
 from vlatool.measurement.interleaved import BLOCKS, Contestant, Tell, run_interleaved, unique_names
-from vlatool.measurement.job import Job
+from vlatool.measurement.jobs import LatencyJob, WorkerJob
+from vlatool.measurement.measured import GraphEngine, Measured, Pace, Phase, PolicyRun
 from vlatool.measurement.paced import run_paced
 from vlatool.measurement.phases import time_phases
 from vlatool.runtime.policy import Policy
@@ -39,42 +38,28 @@ EXTRA_S = 3.0
 """Seconds at most for the phases, and for the look at repeated observations."""
 
 
-def main() -> dict[str, Any]:
-    """Run the job that standard input names."""
+def main(stream: IO[str]) -> Measured:
+    """Run the job that standard input names, and say on a stream how far it is."""
     die_with_parent()
-    asked = json.loads(sys.stdin.readline())
-    trust.restore(asked.pop("named", ()))
-    job = Job.from_dict(asked)
+    asked = child.asked(WorkerJob)
+    trust.restore(asked.named)
 
-    def wait() -> None:
-        _say({"ready": os.getpid()})
-        _await()
+    def pause(message: child.Ready | child.Timed) -> None:
+        child.say(message, stream)
+        if not sys.stdin.readline():
+            raise SystemExit("whoever started the measurement has gone")
 
-    def timed() -> None:
-        _say({"timed": True})
-        _await()
-
-    return {"result": run_job(job, lambda what, share: _say({"progress": [what, share]}), wait, timed)}
-
-
-def _await() -> None:
-    if not sys.stdin.readline():
-        raise SystemExit("whoever started the measurement has gone")
-
-
-_answers: IO[str] | None = None
-"""Where answers go; standard output when None."""
-
-
-def _say(line: dict[str, Any]) -> None:
-    stream = _answers or sys.stdout
-    stream.write(json.dumps(line) + "\n")
-    stream.flush()
+    return run_job(
+        asked.job,
+        lambda what, share: child.say(child.Progress(what, share), stream),
+        lambda: pause(child.Ready(os.getpid())),
+        lambda: pause(child.Timed()),
+    )
 
 
 def run_job(
-    job: Job, tell: Tell, wait: Callable[[], None] = lambda: None, timed: Callable[[], None] = lambda: None
-) -> dict[str, Any]:
+    job: LatencyJob, tell: Tell, wait: Callable[[], None] = lambda: None, timed: Callable[[], None] = lambda: None
+) -> Measured:
     """Measure in this process.
 
     Args:
@@ -82,9 +67,6 @@ def run_job(
         tell: What is being done, and the share that is done.
         wait: Called when all is open and warm, before the first call that counts.
         timed: Called after the last one.
-
-    Returns:
-        JSON values; ``policies`` has an entry for each bundle.
 
     Raises:
         VlatoolError: what a bundle raises.
@@ -97,11 +79,11 @@ def run_job(
 
 def measure(
     contestants: Sequence[Contestant],
-    job: Job,
+    job: LatencyJob,
     tell: Tell,
     wait: Callable[[], None] = lambda: None,
     timed: Callable[[], None] = lambda: None,
-) -> dict[str, Any]:
+) -> Measured:
     """Measure policies that are open."""
     for contestant in contestants:
         tell("warming up", None)
@@ -113,9 +95,9 @@ def measure(
     gc.freeze()
     canaries: list[float] = []
     wait()
-    before = _usage()
+    before = resource.getrusage(resource.RUSAGE_SELF)
     begun = time.monotonic()
-    paced = None
+    pace: Pace | None = None
     if job.rate:
         only = contestants[0]
         ticks = max(job.iterations, round(job.duration * job.rate))
@@ -124,19 +106,24 @@ def measure(
             if share * BLOCKS >= len(canaries):
                 canaries.append(canary_ms())
 
-        seen = run_paced(only.policy, only.observations, job.rate, ticks, only.answers, tell, between=between)
-        only.blocks, only.starts, paced = [seen.response_ms], seen.due_s, seen.to_dict()
+        ticked = run_paced(only.policy, only.observations, job.rate, ticks, only.answers, tell, between=between)
+        only.blocks, only.starts, pace = [ticked.response_ms], ticked.due_s, ticked.pace()
     else:
         run_interleaved(contestants, job.iterations, 0, tell, job.duration, lambda: canaries.append(canary_ms()))
-    ended = time.monotonic()
-    found: dict[str, Any] = {"begun_s": begun, "ended_s": ended, "canary_ms": canaries, **_used(before, _usage())}
+    ended, after = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF)
     timed()
-    found["policies"] = [_policy(each, job, begun, tell) for each in contestants]
-    found["policies"][0]["paced"] = paced
-    return found
+    return Measured(
+        begun_s=begun,
+        ended_s=ended,
+        cpu_s=after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        wall_s=ended - begun,
+        switches=after.ru_nivcsw - before.ru_nivcsw,
+        canary_ms=tuple(canaries),
+        policies=tuple(_policy(contestant, job, begun, pace, tell) for contestant in contestants),
+    )
 
 
-def opened(path: str, job: Job) -> Contestant:
+def opened(path: str, job: LatencyJob) -> Contestant:
     """Open a bundle through the runtime, or a torch source in eager torch.
 
     Raises:
@@ -148,10 +135,12 @@ def opened(path: str, job: Job) -> Contestant:
         policy = Policy.open(bundle, engine=job.engine, threads=job.threads, seed=0)
         policy.warm_up(1, first_run_s=FIRST_RUN_S)
     elif "factory" in manifest.source:
+        import torch
+
         from vlatool.module.torch_policy import torch_policy
 
         policy = torch_policy(bundle, seed=0)
-        _set_torch_threads(job.threads)
+        torch.set_num_threads(job.threads)  # as many as the engine gets
     else:
         raise BundleError(f"{bundle.path} has nothing to run.")
     stage = str(manifest.made_by.get("stage", "policy")).rpartition(".")[2]
@@ -159,66 +148,45 @@ def opened(path: str, job: Job) -> Contestant:
     return Contestant(name, bundle, policy, observations_for(bundle, OBSERVATIONS))
 
 
-def _policy(contestant: Contestant, job: Job, begun: float, tell: Tell) -> dict[str, Any]:
+def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | None, tell: Tell) -> PolicyRun:
     policy = contestant.policy
-    found: dict[str, Any] = {
-        "name": contestant.name,
-        "blocks_ms": [[round(value, 6) for value in block] for block in contestant.blocks],
-        "at_s": [round(start - begun, 6) for start in contestant.starts],
-        "engine": policy.engine,
-        "engines": _engines(policy),
-        "golden_error": policy.golden_error,
-    }
+    memory: Memory | None = None
     if contestant.answers is not None:
-        found["answers"] = contestant.answers.to_dict()
         tell("repeated against fresh observations", None)
         memory = remembered(policy, contestant.observations, EXTRA_S)
-        found["memory"] = None if memory is None else {**vars(memory), "remembers": memory.remembers}
+    phases: Sequence[Phase] = ()
     if job.phases and contestant.bundle.manifest.graphs:
         tell("timing the phases", None)
-        found["phases"] = time_phases(policy, contestant.observations, EXTRA_S)
-    return found
+        phases = time_phases(policy, contestant.observations, EXTRA_S)
+    return PolicyRun(
+        name=contestant.name,
+        blocks_ms=tuple(tuple(round(value, 6) for value in block) for block in contestant.blocks),
+        at_s=tuple(round(start - begun, 6) for start in contestant.starts),
+        engine=policy.engine,
+        engines=tuple(_engines(policy)),
+        golden_error=policy.golden_error,
+        answers=None if contestant.answers is None else contestant.answers.check(),
+        memory=memory,
+        phases=tuple(phases),
+        pace=pace,
+    )
 
 
-def _engines(policy: Policy) -> list[dict[str, Any]]:
-    """Return for each graph what runs it, as the session says."""
-    found = []
+def _engines(policy: Policy) -> Iterator[GraphEngine]:
+    """Yield for each graph what runs it, as the session says."""
     for name, graph in policy.bundle.manifest.graphs.items():
         session = policy.program.sessions[name]
         shares = sorted(graph.precision.items(), key=lambda item: -item[1])
-        found.append(
-            {
-                "graph": name,
-                "engine": policy.engine,
-                "version": session.version() if hasattr(session, "version") else "",
-                "providers": ", ".join(getattr(session, "providers", [])) or "CPU",
-                "computes in": getattr(session, "precision", graph.compute or "float32"),
-                "MACs in": ", ".join(f"{kind} {share:.1%}" for kind, share in shares),
-            }
+        yield GraphEngine(
+            graph=name,
+            engine=policy.engine,
+            version=session.version() if hasattr(session, "version") else "",
+            providers=", ".join(getattr(session, "providers", [])) or "CPU",
+            computes_in=getattr(session, "precision", graph.compute or "float32"),
+            macs_in=", ".join(f"{kind} {share:.1%}" for kind, share in shares),
         )
-    return found
-
-
-def _usage() -> dict[str, float]:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return {
-        "cpu_s": used.ru_utime + used.ru_stime,
-        "switches": used.ru_nivcsw,
-        "wall_s": time.monotonic(),
-    }
-
-
-def _used(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
-    return {name: after[name] - before[name] for name in before}
-
-
-def _set_torch_threads(threads: int) -> None:
-    """Give eager torch as many threads as the engine gets."""
-    import torch
-
-    torch.set_num_threads(threads)
 
 
 if __name__ == "__main__":
-    _answers = answers_alone()
-    answer(main, _answers)
+    answers = child.answers_alone()
+    child.answer(lambda: main(answers), answers)

@@ -11,8 +11,9 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
 from vlatool.module.cut import RETRACE
-from vlatool.module.factory import exits_told
+from vlatool.module.factory import exits_caught
 from vlatool.module.failures import remedy_for
+from vlatool.module.modules import outputs_of
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -106,7 +107,7 @@ class BatchedProgram:
     def _step(self, step: ProgramStep, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return what one run of a step's module changes."""
         size = len(values[next(iter(step.feeds.values()))])
-        gives = outputs_of(self._module(step.graph, size), step, [values[name] for name in step.feeds.values()])
+        gives = run_module(self._module(step.graph, size), step, [values[name] for name in step.feeds.values()])
         changed = dict(zip(step.gives.values(), gives, strict=True))
         for source, target in step.carry.items():
             changed[target] = changed[source] if source in changed else values[source]
@@ -117,7 +118,7 @@ def _rows(values: Mapping[str, Tensor], start: int, end: int) -> dict[str, Tenso
     return {name: value[start:end] for name, value in values.items()}
 
 
-def outputs_of(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) -> list[Tensor]:
+def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) -> list[Tensor]:
     """Run a user's module and return its outputs in the order of the step's ``gives``.
 
     Raises:
@@ -125,7 +126,7 @@ def outputs_of(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
     """
     torch = require("torch", "build")
     try:
-        with exits_told("the policy's forward()"):
+        with exits_caught("the policy's forward()"):
             given = module(*arguments)
     except SourceError:
         raise
@@ -136,10 +137,10 @@ def outputs_of(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
             f"The policy fails on a batch of observations: {type(error).__name__}: {reason} (given {shapes}).",
             remedy_for(error),
         ) from error
-    outputs = list(given) if isinstance(given, tuple | list) else [given]
-    if len(outputs) != len(step.gives) or not all(isinstance(output, torch.Tensor) for output in outputs):
+    outputs = outputs_of(given, step)
+    if not all(isinstance(output, torch.Tensor) for output in outputs):
         kinds = ", ".join(type(output).__name__ for output in outputs)
-        raise SourceError(f"The module of '{step.graph}' gives {kinds}; the program says {', '.join(step.gives)}.")
+        raise SourceError(f"The module of '{step.graph}' gives {kinds}; wanted tensors.")
     return outputs
 
 

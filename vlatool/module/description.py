@@ -7,10 +7,11 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import LOCATION
+from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import MissingExtra, SourceError, SpecError, nearest
@@ -24,6 +25,8 @@ KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
     "parts", "calibration", "evaluation", "weights", "files",
 )  # fmt: skip
+IN_MANIFEST = ("name", "version", "spec", "program", "environment", "parts", "description", "license")
+"""Fields that a bundle's manifest takes from the description."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,25 @@ class Description:
     weights: str = ""
     files: tuple[str, ...] | None = None
 
-    def assets(self) -> set[str]:
-        """Files, relative to the folder, that the spec needs on the robot."""
-        inputs = [*self.spec.inputs, *self.spec.outputs]
-        statistics = {tensor.statistics.partition("#")[0] for tensor in inputs if tensor.statistics}
-        return statistics | {tensor.tokenizer for tensor in inputs if tensor.tokenizer}
+    def assets(self) -> list[Path]:
+        """Files in the folder that the spec needs on the robot."""
+        names = {file for tensor in (*self.spec.inputs, *self.spec.outputs) for file in tensor.assets()}
+        return [self.folder / name for name in sorted(names)]
+
+    def recordings(self) -> dict[str, Path]:
+        """Recorded observations: ``calibration``, ``evaluation`` or both -> file."""
+        files = {"calibration": self.calibration, "evaluation": self.evaluation}
+        return {name: file for name, file in files.items() if file}
+
+    def manifest(self, **fields: Any) -> Manifest:
+        """Return the manifest of a bundle of this policy, with the fields that only its source knows."""
+        own = {name: getattr(self, name) for name in IN_MANIFEST}
+        return Manifest(**{**own, **fields})
+
+
+def description_file(path: Path) -> Path:
+    """Return ``policy.yaml`` in a directory, any other path as it is."""
+    return path / FILE if path.is_dir() else path
 
 
 def read_description(path: Path) -> Description:
@@ -73,8 +90,10 @@ def read_description(path: Path) -> Description:
         SourceError: when it is missing, is not YAML, or lacks something.
         SpecError: when the spec or the program is impossible.
     """
-    file = path / FILE if path.is_dir() else path
-    data = _mapping(file)
+    file = description_file(path)
+    if not file.exists():
+        raise SourceError(f"No such file: {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
+    data = read_mapping(file, str(file), SourceError)
     for key in data:
         if key not in KEYS:
             raise SourceError(f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.")
@@ -112,24 +131,25 @@ def _files(file: Path, patterns: Any) -> tuple[str, ...] | None:
     """Globs inside the policy's folder."""
     if patterns is None:
         return None
-    each = [patterns] if isinstance(patterns, str) else patterns
-    inside = isinstance(each, list) and all(
-        isinstance(one, str) and one and not one.startswith("/") and ".." not in one.split("/") for one in each
-    )
-    if not inside:
+    globs = [patterns] if isinstance(patterns, str) else patterns
+    if not isinstance(globs, list) or not all(glob and _inside(glob) for glob in globs):
         raise SourceError(f"{file}: 'files' must be globs inside the folder, as [weights.pt]; got {patterns!r}.")
-    return tuple(each)
+    return tuple(globs)
 
 
 def _weights(file: Path, pattern: Any) -> str:
     """A glob inside the policy's folder."""
-    if not isinstance(pattern, str) or pattern.startswith("/") or ".." in pattern.split("/"):
+    if not _inside(pattern):
         raise SourceError(f"{file}: 'weights' must be a glob inside the folder, as \"*.safetensors\"; got {pattern!r}.")
-    return pattern
+    return str(pattern)
+
+
+def _inside(pattern: Any) -> bool:
+    return isinstance(pattern, str) and not pattern.startswith("/") and ".." not in pattern.split("/")
 
 
 def write_location(out: Path, folder: Path) -> None:
-    """Note where the policy's code is; the note is no part of the bundle's identity."""
+    """Note where the policy's code is; the note is not part of the bundle's identity."""
     (out / LOCATION).write_text(json.dumps({"folder": str(folder.resolve())}) + "\n", encoding="utf-8")
 
 
@@ -152,12 +172,6 @@ def read_location(bundle: Path) -> Path:
     return folder
 
 
-def _mapping(file: Path) -> Mapping[str, Any]:
-    if not file.exists():
-        raise SourceError(f"There is no {file}.", "a policy needs a description; see docs/guides/your-own-policy.md")
-    return read_mapping(file, str(file), SourceError)
-
-
 def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
     """The named file must exist; the default name may be absent."""
     named = data.get(key)
@@ -174,19 +188,17 @@ def copy_assets(described: Description, out: Path) -> None:
         SourceError: when a file that the spec names is missing.
         SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
     """
-    for name in sorted(described.assets()):
-        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise SourceError(f"The spec names {name}, which is not inside {described.folder}.")
-        if not (described.folder / name).is_file():
+    for file in described.assets():
+        name = file.relative_to(described.folder)
+        if not file.is_file():
             raise SourceError(f"The spec names {name}, which is not in {described.folder}.")
         target = out / "assets" / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(described.folder / name, target)
+        shutil.copyfile(file, target)
     check_assets(described, out / "assets")
-    for key, path in (("calibration", described.calibration), ("evaluation", described.evaluation)):
-        if path is not None:
-            (out / "data").mkdir(exist_ok=True)
-            carry(path, out / "data" / f"{key}.npz")
+    for key, path in described.recordings().items():
+        (out / "data").mkdir(exist_ok=True)
+        carry(path, out / "data" / f"{key}.npz")
 
 
 def check_assets(described: Description, copies: Path) -> None:

@@ -51,7 +51,7 @@ class Edit:
 
 
 def is_changed(bundle: Bundle) -> bool:
-    """Say whether a bundle has modules other than those that its factory makes."""
+    """Return whether a bundle has modules other than those that its factory makes."""
     return any(name.startswith(f"{FOLDER}/") for name in bundle.manifest.files)
 
 
@@ -59,7 +59,7 @@ def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
     """Return the structural edits of a bundle.
 
     Raises:
-        SourceError: when the file makes no sense.
+        SourceError: when the file is invalid.
     """
     if EDITS not in bundle.manifest.files:
         return ()
@@ -67,21 +67,23 @@ def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
     listed = read_json(path.read_bytes(), str(path), SourceError, "make the bundle again")
     if not isinstance(listed, list):
         raise SourceError(f"{path} must hold a list of edits; got {type(listed).__name__}.")
-    return tuple(_edit(each, path) for each in listed)
+    return tuple(_edit(entry, path) for entry in listed)
 
 
 def _edit(value: Any, path: Path) -> Edit:
-    known = set(Edit.__dataclass_fields__)
-    fits = isinstance(value, Mapping) and set(value) == known and isinstance(value["keep"], list)
-    whole = fits and all(isinstance(each, int) and not isinstance(each, bool) and each >= 0 for each in value["keep"])
-    if (
-        not whole
-        or not value["keep"]
-        or len(set(value["keep"])) != len(value["keep"])
-        or not AXIS.fullmatch(str(value["axis"]))
-    ):
-        raise SourceError(f"{path} has an edit that makes no sense: {json.dumps(value)[:200]}.")
+    if not _is_edit(value):
+        raise SourceError(f"{path} has an invalid edit: {json.dumps(value)[:200]}.")
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
+
+
+def _is_edit(value: Any) -> bool:
+    if not isinstance(value, Mapping) or set(value) != set(Edit.__dataclass_fields__):
+        return False
+    keep = value["keep"]
+    if not isinstance(keep, list) or not keep or not AXIS.fullmatch(str(value["axis"])):
+        return False
+    whole = all(isinstance(index, int) and not isinstance(index, bool) and index >= 0 for index in keep)
+    return whole and len(set(keep)) == len(keep)
 
 
 def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = True) -> dict[str, nn.Module]:
@@ -217,7 +219,7 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
     Raises:
         SourceError: when a tensor is missing or has another shape.
     """
-    found = {}
+    tensors = {}
     for name, value in module.state_dict().items():
         tensor = stored.get(f"{graph}.{name}", stored.get(name))
         if tensor is None:
@@ -225,8 +227,8 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
         if tensor.shape != value.shape:
             got, want = list(tensor.shape), list(value.shape)
             raise SourceError(f"'{name}' has the shape {got} in {where}; the module's is {want}.")
-        found[name] = tensor.to(value.dtype)
-    module.load_state_dict(found)
+        tensors[name] = tensor.to(value.dtype)
+    module.load_state_dict(tensors)
 
 
 def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module]) -> None:

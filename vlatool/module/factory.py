@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, nearest
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, install, nearest
 from vlatool.files.printable import message_of
 from vlatool.module.fresh import compile_afresh
 from vlatool.user_code.children import left
@@ -37,9 +37,9 @@ def _no_function(named: str) -> SourceError:
     if named.endswith(".onnx"):
         fix = "name the file itself as SOURCE, and leave source out of the policy.yaml beside it: vlatool export "
         fix += named if "/" in named else f"DIRECTORY/{named}"
-        return SourceError(f"'{named}' is an ONNX file and no Python function.", fix)
+        return SourceError(f"'{named}' is an ONNX file, not a Python function.", fix)
     if named.endswith(".py"):
-        return SourceError(f"'{named}' names a file and no function in it.", f"add the function: {named}:NAME")
+        return SourceError(f"'{named}' names a file but no function in it.", f"add the function: {named}:NAME")
     return SourceError(f"'{named}' names no factory.", "write path/to/policy.py:make or package.module:make")
 
 
@@ -62,12 +62,12 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
     where, function = split_factory(factory)
     path = factory_file(factory, folder)
     if path is not None and not path.is_file():
-        raise SourceError(f"There is no file {path} (from '{factory}').")
+        raise SourceError(f"No such file: {path} (from '{factory}').")
     if path is None:
         _check_package(factory)
     compile_afresh(folder)
     try:
-        with exits_told(f"importing '{where}'"):
+        with exits_caught(f"importing '{where}'"):
             module = _import_path(path) if path is not None else importlib.import_module(where)
     except VlatoolError:
         raise
@@ -78,13 +78,13 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         ) from error
     except Exception as error:  # the seam: user code may raise anything while it is imported
         raise SourceError(f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.") from error
-    found = getattr(module, function, None)
-    if not callable(found):
+    make = getattr(module, function, None)
+    if not callable(make):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
         raise SourceError(f"'{where}' has no function '{function}'; {nearest(function, known)}.")
     if path is None:
-        _check_own(found, factory)
-    return found  # type: ignore[no-any-return]
+        _check_own(make, factory)
+    return make  # type: ignore[no-any-return]
 
 
 def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
@@ -95,7 +95,7 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
     """
     make = import_factory(factory, folder)
     try:
-        with _importable(factory_file(factory, folder)), exits_told(f"the factory '{factory}'"):
+        with _importable(factory_file(factory, folder)), exits_caught(f"the factory '{factory}'"):
             return make(**arguments)
     except (VlatoolError, MemoryError):
         raise
@@ -108,7 +108,7 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
 
 
 @contextlib.contextmanager
-def exits_told(what: str) -> Iterator[None]:
+def exits_caught(what: str) -> Iterator[None]:
     """Turn what a user's code raises beside ``Exception`` (``sys.exit``, classes of its own) into an error.
 
     Errors of vlatool that say what input was bad, or what package is absent, pass: its functions raise them where the
@@ -123,8 +123,8 @@ def exits_told(what: str) -> Iterator[None]:
     except (InputError, MissingExtra, KeyboardInterrupt):
         raise
     except VlatoolError as error:
-        told = message_of(error).partition("\n")[0].rstrip(".")
-        raise SourceError(f"{about} raised {type(error).__name__}: {told}.") from error
+        message = message_of(error).partition("\n")[0].rstrip(".")
+        raise SourceError(f"{about} raised {type(error).__name__}: {message}.") from error
     except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything
@@ -141,14 +141,14 @@ def _check_package(factory: str) -> None:
         )
 
 
-def _check_own(found: Any, factory: str) -> None:
+def _check_own(make: Any, factory: str) -> None:
     """Refuse a function that the named package only imports from elsewhere.
 
     Raises:
         SourceError: naming the module that defines it.
     """
     package = split_factory(factory)[0].partition(".")[0]
-    module = str(getattr(found, "__module__", None) or type(found).__module__)
+    module = str(getattr(make, "__module__", None) or type(make).__module__)
     if module.partition(".")[0] != package:
         raise SourceError(
             f"'{factory}' is defined in '{module}', not in the package '{package}'.",
@@ -177,7 +177,7 @@ def _import_path(path: Path) -> ModuleType:
 
 @contextlib.contextmanager
 def _importable(path: Path | None) -> Iterator[None]:
-    """Let the file import its neighbours."""
+    """Make the files beside a file importable."""
     if path is None:
         yield
         return
@@ -196,4 +196,4 @@ def _importable(path: Path | None) -> Iterator[None]:
 def _install_hint(package: str) -> str:
     extra = {"torch": "build", "minigrid": "sim", "gymnasium": "sim", "metaworld": "metaworld", "mujoco": "metaworld"}
     known = extra.get(package.partition(".")[0])
-    return f"pip install 'vlatool[{known}]'" if known else f"pip install {package}"
+    return install(known) if known else f"pip install {package}"

@@ -54,7 +54,7 @@ CHECKED = Cause(
 CONTROL_FLOW = Cause(
     "data-dependent control flow",
     r"data-dependent|DataDependent|Dynamic control flow|_local_scalar_dense|Tensor-likes? to a (?:bool|number)",
-    "decide with torch.where() in the place of 'if', a fixed number of turns in the place of 'while'; keep int(), "
+    "decide with torch.where() instead of 'if', a fixed number of turns instead of 'while'; keep int(), "
     "float() and .item() of tensors out of forward()",
 )  # fmt: skip
 OTHER = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
@@ -67,7 +67,7 @@ CAUSES = (
     Cause(
         "a shape that depends on values",
         r"Size-like symbols: (?!none)|DynamicOutputShapeException|Unbacked ?[Ss]ym[Nn]ode",
-        "keep tensors in their full shape and multiply by a mask, in the place of x[mask], nonzero() or unique()",
+        "keep tensors in their full shape and multiply by a mask, instead of x[mask], nonzero() or unique()",
     ),
     CONTROL_FLOW,
     Cause(
@@ -121,11 +121,11 @@ CAUSES = (
         "give every axis a number in policy.yaml, and take shapes from the spec, not from the data",
     ),
 )  # fmt: skip
-"""The table: the first cause whose pattern is found is the one that is told."""
+"""The table: the first cause whose pattern matches is reported."""
 
 
 def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
-    """Return what to tell of an export that failed.
+    """Return the error for an export that failed.
 
     Args:
         error: What ``torch.onnx.export`` raised.
@@ -134,31 +134,31 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
     """
     chain = list(_chain(error))
     cause = _cause(chain, module)
-    told = [f"torch cannot export the graph '{graph}'"]
-    told += [cause.name] if cause.name else []
+    parts = [f"torch cannot export the graph '{graph}'"]
+    parts += [cause.name] if cause.name else []
     node = _node(chain)
     operator = _operator(chain, node)
     where = _of_node(node) if node is not None else _of_frames(chain)
-    told.append(_line(chain))
-    places = [f"operator {operator}"] if operator and operator not in told[-1] else []
+    parts.append(_line(chain))
+    places = [f"operator {operator}"] if operator and operator not in parts[-1] else []
     places += [where] if where else []
-    return GraphError(f"{': '.join(told)}{' (' + '; '.join(places) + ')' if places else ''}.", cause.remedy)
+    return GraphError(f"{': '.join(parts)}{' (' + '; '.join(places) + ')' if places else ''}.", cause.remedy)
 
 
 def remedy_for(error: BaseException) -> str:
     """Return the remedy for what a module raised when it ran; empty when its own text must do."""
-    cause = _told(list(_chain(error)))
+    cause = _cause_in_text(list(_chain(error)))
     return cause.remedy if cause else ""
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
     """The error and its causes, the root last."""
     seen: set[int] = set()
-    each: BaseException | None = error
-    while each is not None and id(each) not in seen:
-        seen.add(id(each))
-        yield each
-        each = each.__cause__
+    current: BaseException | None = error
+    while current is not None and id(current) not in seen:
+        seen.add(id(current))
+        yield current
+        current = current.__cause__
 
 
 def _cause(chain: list[BaseException], module: Any) -> Cause:
@@ -166,8 +166,8 @@ def _cause(chain: list[BaseException], module: Any) -> Cause:
         return GENERATE
     if any(type(part).__module__.startswith("torch.jit") for part in module.modules()):
         return SCRIPTED
-    told = _told(chain) or OTHER
-    return CHECKED if told is CONTROL_FLOW and _in_distribution(chain) else told
+    cause = _cause_in_text(chain) or OTHER
+    return CHECKED if cause is CONTROL_FLOW and _in_distribution(chain) else cause
 
 
 def _in_distribution(chain: list[BaseException]) -> bool:
@@ -175,9 +175,9 @@ def _in_distribution(chain: list[BaseException]) -> bool:
     return any(name.startswith("torch.distributions.") for name in names)
 
 
-def _told(chain: list[BaseException]) -> Cause | None:
+def _cause_in_text(chain: list[BaseException]) -> Cause | None:
     """Return the first cause of the table that the text of an error names."""
-    texts = [f"{type(each).__name__}: {message_of(each)}" for each in reversed(chain)]
+    texts = [f"{type(error).__name__}: {message_of(error)}" for error in reversed(chain)]
     for cause in CAUSES:
         if any(re.search(cause.pattern or "", text, re.DOTALL) for text in texts):
             return cause
@@ -188,21 +188,21 @@ def _line(chain: list[BaseException]) -> str:
     """The first line of torch's own message at the root."""
     root = chain[-1]
     lines = [line.strip() for line in message_of(root).splitlines() if line.strip()]
-    told = one_line(lines[0] if lines else "", LONGEST).rstrip(".")
-    return f"{type(root).__name__}: {told}" if told else type(root).__name__
+    text = one_line(lines[0] if lines else "", LONGEST).rstrip(".")
+    return f"{type(root).__name__}: {text}" if text else type(root).__name__
 
 
 def _operator(chain: list[BaseException], node: Any) -> str:
-    found = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1]))
-    if found:
-        return found[1]
+    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1]))
+    if match:
+        return match[1]
     return str(node.target) if node is not None and node.op == "call_function" else ""
 
 
 def _node(chain: list[BaseException]) -> Any:
     """Return the node of torch's graph that was translated when the error came; None when there was none."""
-    for each in chain:
-        for frame, _line in _frames(each):
+    for error in chain:
+        for frame, _line in _frames(error):
             node = frame.f_locals.get("node")
             if _is_tool(frame) and hasattr(node, "meta") and hasattr(node, "op"):
                 return node
@@ -211,17 +211,17 @@ def _node(chain: list[BaseException]) -> Any:
 
 def _of_node(node: Any) -> str:
     """Return module and line that a node of torch's graph was traced from."""
-    told = []
+    parts = []
     stack = list((node.meta.get("nn_module_stack") or {}).values())
     if stack and stack[-1][0]:
         kind = stack[-1][1]
-        told.append(f"module {stack[-1][0]} ({getattr(kind, '__name__', str(kind).rpartition('.')[2])})")
+        parts.append(f"module {stack[-1][0]} ({getattr(kind, '__name__', str(kind).rpartition('.')[2])})")
     lines = re.findall(r'File "([^"]+)", line (\d+), in (\w+)', str(node.meta.get("stack_trace") or ""))
     own = [line for line in lines if not set(TOOLS) & set(Path(line[0]).parts)]
     if own:
         file, number, function = own[-1]
-        told.append(_place(file, int(number), function))
-    return ", ".join(told)
+        parts.append(_place(file, int(number), function))
+    return ", ".join(parts)
 
 
 def _of_frames(chain: list[BaseException]) -> str:
@@ -231,8 +231,8 @@ def _of_frames(chain: list[BaseException]) -> str:
         return ""
     frame, line = frames[-1]
     owner = frame.f_locals.get("self")
-    told = [f"module {type(owner).__name__}"] if hasattr(owner, "named_modules") else []
-    return ", ".join([*told, _place(frame.f_code.co_filename, line, frame.f_code.co_name)])
+    module = [f"module {type(owner).__name__}"] if hasattr(owner, "named_modules") else []
+    return ", ".join([*module, _place(frame.f_code.co_filename, line, frame.f_code.co_name)])
 
 
 def _place(file: str, number: int, function: str) -> str:
@@ -251,7 +251,7 @@ def _frames(error: BaseException) -> Iterator[tuple[FrameType, int]]:
 
 
 def _is_tool(frame: FrameType) -> bool:
-    """Say whether a frame is of torch, its exporter, vlatool or Python itself."""
+    """Return whether a frame is of torch, its exporter, vlatool or Python itself."""
     package = str(frame.f_globals.get("__name__", "")).partition(".")[0]
     file = os.path.realpath(frame.f_code.co_filename)
     own = (str(Path(__file__).parents[1]), os.path.realpath(sysconfig.get_path("stdlib")))

@@ -11,11 +11,12 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
-from vlatool.errors import SourceError, require
+from vlatool.errors import require
 from vlatool.module.edits import edited, loses_units, read_edits
-from vlatool.module.factory import exits_told
-from vlatool.module.modules import modules_of
+from vlatool.module.factory import exits_caught
+from vlatool.module.modules import modules_of, outputs_of
 from vlatool.module.origin import origin_of
+from vlatool.runtime.contract import sources_of
 from vlatool.runtime.observation import ObservationEncoder
 
 DRAWING = (
@@ -46,27 +47,18 @@ def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
     encode = ObservationEncoder(bundle.manifest.spec, bundle.path / "assets")
     values = {name: (np.shape(array), array.dtype) for name, array in encode(observations_for(bundle, 1)[0]).items()}
     for step in bundle.manifest.program:
-        _declare(step, values)
+        values |= {name: (tuple(port.axes or ()), np.dtype(port.dtype)) for name, port in sources_of(step).items()}
         module = modules[step.graph]
-        with _fake(module) as (mode, real):
-            feeds = [_fake_tensor(torch, mode, *values[value]) for value in step.feeds.values()]
-            with visit(step, module, feeds, real) or contextlib.nullcontext():
-                outputs = _outputs(torch, step, module, feeds)
+        with _fake(module) as real:
+            given = [values[value] for value in step.feeds.values()]
+            feeds = [torch.empty(shape, dtype=getattr(torch, str(dtype)), device="cpu") for shape, dtype in given]
+            within = visit(step, module, feeds, real) or contextlib.nullcontext()
+            with within, torch.inference_mode(False), torch.no_grad(), exits_caught("the policy's forward()"):
+                outputs = outputs_of(module(*feeds), step)
         for value, tensor in zip(step.gives.values(), outputs, strict=True):
             values[value] = (tuple(tensor.shape), np.dtype(str(tensor.dtype).removeprefix("torch.")))
         for source, target in step.carry.items():
             values[target] = values[source]
-
-
-def _declare(step: ProgramStep, values: dict[str, Any]) -> None:
-    """Add shape and dtype of what a step brings into being."""
-    for name, wanted in step.noise.items():
-        values[name] = (tuple(wanted["shape"]), np.dtype(np.float32))
-    for name, numbers in step.schedule.items():
-        whole = all(isinstance(number, int) for number in numbers)
-        values[name] = ((1,), np.dtype(np.int64 if whole else np.float32))
-    for name, kept in step.keep.items():
-        values[name] = (tuple(kept["shape"]), np.dtype(kept.get("dtype", "float32")))
 
 
 def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
@@ -74,8 +66,8 @@ def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
     origin.check((".py",))
     traced = loses_units(read_edits(bundle))  # a trace runs the module, with all that it computes
     with contextlib.nullcontext() if traced else _parameters_on_meta(torch):
-        made = origin.made()
-    modules = modules_of(made, (step.graph for step in bundle.manifest.program))
+        product = origin.build()
+    modules = modules_of(product, (step.graph for step in bundle.manifest.program))
     modules = edited(modules, bundle, weights=False)
     for module in modules.values() if traced else ():
         _to_meta(torch, module)
@@ -126,8 +118,8 @@ def _nothing_drawn(torch: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _fake(module: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Put fake tensors in the place of parameters and buffers; yield the mode and the real buffers by name."""
+def _fake(module: Any) -> Iterator[dict[str, Any]]:
+    """Replace parameters and buffers by fake tensors; yield the real buffers by name, under the fake mode."""
     from torch._subclasses import FakeTensorMode
 
     real = {name: buffer for name, buffer in module.named_buffers() if not buffer.is_meta}
@@ -138,15 +130,15 @@ def _fake(module: Any) -> Iterator[tuple[Any, dict[str, Any]]]:
         for key, value in held.items()
         if value is not None
     ]
-    made: dict[int, Any] = {}
+    fakes: dict[int, Any] = {}
     mode = FakeTensorMode(allow_non_fake_inputs=True)
     try:
         for held, key, value in places:
-            if id(value) not in made:
-                made[id(value)] = _like(mode, value)
-            held[key] = made[id(value)]
+            if id(value) not in fakes:
+                fakes[id(value)] = _like(mode, value)
+            held[key] = fakes[id(value)]
         with mode:
-            yield mode, real
+            yield real
     finally:
         for held, key, value in places:
             held[key] = value
@@ -158,16 +150,3 @@ def _like(mode: Any, value: Any) -> Any:
     with mode:
         fake = torch.empty(value.shape, dtype=value.dtype, device="cpu")
         return torch.nn.Parameter(fake, requires_grad=False) if isinstance(value, torch.nn.Parameter) else fake
-
-
-def _fake_tensor(torch: Any, mode: Any, shape: tuple[int, ...], dtype: Any) -> Any:
-    return torch.empty(shape, dtype=getattr(torch, str(np.dtype(dtype))), device="cpu")
-
-
-def _outputs(torch: Any, step: ProgramStep, module: Any, feeds: list[Any]) -> list[Any]:
-    with torch.inference_mode(False), torch.no_grad(), exits_told("the policy's forward()"):
-        given = module(*feeds)
-    outputs = list(given) if isinstance(given, tuple | list) else [given]
-    if len(outputs) != len(step.gives):
-        raise SourceError(f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.")
-    return outputs

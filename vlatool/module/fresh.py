@@ -1,4 +1,4 @@
-"""A policy's own code is compiled from its source: bytecode in ``__pycache__`` is in no hash, and may say anything."""
+"""A policy's own code is compiled from its source: bytecode in ``__pycache__`` is in no hash, and could do anything."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _usual = SourceFileLoader.get_code
 
 
 def compile_afresh(folder: Path) -> None:
-    """Let this process read no ``__pycache__`` below a policy's folder, however its files are imported.
+    """Keep this process from reading ``__pycache__`` below a policy's folder, however its files are imported.
 
-    Where the folder was trusted before, all that lies outside of Python's own directories is compiled afresh, and
+    Where the folder was trusted before, everything outside of Python's own directories is compiled afresh, and
     Python processes that the policy starts read no such directory at all.
     """
     remembered = not trust.is_named(folder)
@@ -40,10 +40,10 @@ def _get_code(self: SourceFileLoader, fullname: str) -> CodeType | None:
 
 
 def _is_own(place: str) -> bool:
-    """Say whether a directory holds a policy's code, and not what is installed."""
+    """Return whether a directory holds a policy's code, and not what is installed."""
     places = {os.path.abspath(place), os.path.realpath(place)}
-    inside = {remembered for folder, remembered in _folders.items() if any(_below(each, folder) for each in places)}
-    library = any(_below(os.path.realpath(place), each) for each in _libraries())
+    inside = {remembered for folder, remembered in _folders.items() if any(_below(path, folder) for path in places)}
+    library = any(_below(os.path.realpath(place), folder) for folder in _libraries())
     return True in inside or (not library and (bool(inside) or any(_folders.values())))
 
 
@@ -54,7 +54,7 @@ def _below(place: str, folder: str) -> bool:
 @lru_cache(1)
 def _libraries() -> tuple[str, ...]:
     """Python's own directories, those of installed packages, and this package."""
-    found = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-    found += [*site.getsitepackages(), site.getusersitepackages(), str(Path(__file__).parents[1])]
-    found += [entry for entry in sys.path if Path(entry).name in ("site-packages", "dist-packages")]
-    return tuple({os.path.realpath(entry) for entry in found})
+    folders = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    folders += [*site.getsitepackages(), site.getusersitepackages(), str(Path(__file__).parents[1])]
+    folders += [entry for entry in sys.path if Path(entry).name in ("site-packages", "dist-packages")]
+    return tuple({os.path.realpath(entry) for entry in folders})

@@ -12,7 +12,7 @@ BY_FILE = {"spec_from_file_location", "run_path", "SourceFileLoader"}
 HIDDEN_NAMES = BY_FILE | {
     "import_module", "run_module", "load_source", "find_spec",
 }  # fmt: skip
-"""What imports without an import statement: then each Python file beside the code may be meant."""
+"""What imports without an import statement: then any Python file beside the code may be imported."""
 
 
 def imported_files(roots: Iterable[Path], folder: Path) -> set[Path]:
@@ -25,35 +25,35 @@ def imported_files(roots: Iterable[Path], folder: Path) -> set[Path]:
         roots: Files of code in the folder.
         folder: Where imports begin; packages below it are followed.
     """
-    found: set[Path] = set()
+    files: set[Path] = set()
     waiting = [root for root in roots if root.is_file()]
     while waiting:
         file = waiting.pop()
-        if file in found:
+        if file in files:
             continue
-        found.add(file)
+        files.add(file)
         try:
             tree = ast.parse(file.read_bytes())
         except (SyntaxError, ValueError, RecursionError):  # importing it says what is wrong
-            found.update(folder.glob("*.py"))
+            files.update(folder.glob("*.py"))
             continue
-        if _hides(tree):
+        if _has_hidden_imports(tree):
             waiting += folder.glob("*.py")
-        waiting += [each for names, base in _imports(tree, file, folder) for each in _files(names, base)]
-    return found
+        waiting += [imported for names, base in _imports(tree, file, folder) for imported in _files(names, base)]
+    return files
 
 
 def _imports(tree: ast.AST, file: Path, folder: Path) -> Iterator[tuple[tuple[str, ...], Path]]:
     """Yield what is imported: parts of a module's name and where they begin."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            for each in node.names:
-                yield tuple(each.name.split(".")), folder
+            for alias in node.names:
+                yield tuple(alias.name.split(".")), folder
         elif isinstance(node, ast.ImportFrom):
             base = file.parents[node.level - 1] if 0 < node.level <= len(file.parents) else folder
             parts = tuple(filter(None, (node.module or "").split(".")))
-            for each in node.names:
-                yield (*parts, each.name), base
+            for alias in node.names:
+                yield (*parts, alias.name), base
         elif isinstance(node, ast.Call):
             for name in _literal_import(node):
                 yield tuple(name.replace("/", ".").split(".")), folder
@@ -73,15 +73,15 @@ def _literal_import(node: ast.Call) -> list[str]:
     """Return the modules that a call names by a literal: ``import_module("name")``, or a file ``name.py``."""
     name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
     if name in BY_FILE:
-        literals = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant)]
+        literals = [part.value for part in ast.walk(node) if isinstance(part, ast.Constant)]
         return [text.removesuffix(".py") for text in literals if isinstance(text, str) and text.endswith(".py")]
     literal = node.args[0].value if node.args and isinstance(node.args[0], ast.Constant) else None
     alone = name == "import_module" and len(node.args) == 1 and isinstance(literal, str)
     return [str(literal)] if alone and not str(literal).startswith(".") else []
 
 
-def _hides(tree: ast.AST) -> bool:
-    """Say whether code imports, or may import, what no statement names."""
+def _has_hidden_imports(tree: ast.AST) -> bool:
+    """Return whether code imports, or may import, what no statement names."""
     known = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call) and _literal_import(node)}
     for node in ast.walk(tree):
         if id(node) in known:

@@ -5,35 +5,48 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, nearest, require
 
 
-def modules_of(made: Any, wanted: Iterable[str]) -> dict[str, Any]:
+def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     """Return the modules that a program runs: graph name -> torch module in evaluation mode.
 
     Args:
-        made: A module, a program of ``torch.export``, or a mapping of graph names to them.
-        wanted: Names of the program's graphs.
+        product: A module, a program of ``torch.export``, or a mapping of graph names to them.
+        graphs: Names of the program's graphs.
 
     Raises:
         SourceError: when one is missing or is something else.
     """
     torch = require("torch", "build")
-    given = made if isinstance(made, Mapping) else {"main": made}
-    found = {}
-    for name in dict.fromkeys(wanted):
-        if name not in given:
-            raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, given)}.")
-        module = given[name]
+    products = product if isinstance(product, Mapping) else {"main": product}
+    modules = {}
+    for name in dict.fromkeys(graphs):
+        if name not in products:
+            raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, products)}.")
+        module = products[name]
         if isinstance(module, torch.export.ExportedProgram):
             module = module.module()
         if not isinstance(module, torch.nn.Module):
             raise SourceError(f"The factory gave a {type(module).__name__} for '{name}'; wanted a torch module.")
-        found[name] = _evaluating(module)
-    return found
+        modules[name] = _in_eval_mode(module)
+    return modules
 
 
-def _evaluating(module: Any) -> Any:
+def outputs_of(result: Any, step: ProgramStep) -> list[Any]:
+    """Return what a module gave as a list, one value for each output of its step.
+
+    Raises:
+        SourceError: for another number of outputs.
+    """
+    outputs = list(result) if isinstance(result, tuple | list) else [result]
+    if len(outputs) != len(step.gives):
+        raise SourceError(f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.")
+    return outputs
+
+
+def _in_eval_mode(module: Any) -> Any:
     """Put a module into evaluation mode; a part that torch.export made has the mode in which it was exported."""
     try:
         return module.eval()

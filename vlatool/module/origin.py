@@ -1,4 +1,4 @@
-"""What of a policy's code a source bundle may run: as the policy's own description says it, where that may run."""
+"""What a source bundle may run of a policy's code: what the policy's own description names, where that is trusted."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ class Origin:
             if not file.is_file() or hash_file(file) != digest:
                 raise SourceError(f"{file} has changed since the source bundle was made.", AGAIN)
 
-    def made(self) -> Any:
+    def build(self) -> Any:
         """Call the factory.
 
         Raises:
             SourceError: when it fails, or imports a file of its folder that was not recorded.
         """
         before = set(sys.modules)
-        made = call_factory(self.factory, self.folder, dict(self.arguments))
+        product = call_factory(self.factory, self.folder, dict(self.arguments))
         self._check_imports({name: module for name, module in sys.modules.items() if name not in before})
-        return made
+        return product
 
     def _check_imports(self, loaded: Mapping[str, Any]) -> None:
         path = factory_file(self.factory, self.folder)
@@ -114,7 +114,7 @@ def origin_of(bundle: Bundle) -> Origin:
 
 
 def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:
-    """Let a bundle name functions in the policy's own files only."""
+    """Refuse a factory outside of the policy's own files."""
     file = factory_file(factory, folder)
     if file is None or not file.is_relative_to(folder.resolve()):
         raise SourceError(
@@ -126,8 +126,8 @@ def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:
 def _code(bundle: Bundle) -> dict[str, str]:
     code = bundle.manifest.source.get("code", {})
     if not isinstance(code, Mapping):
-        raise SourceError(f"{bundle.path} records the policy's code in a way that makes no sense.", AGAIN)
+        raise SourceError(f"{bundle.path} has an invalid record of the policy's code.", AGAIN)
     for name in code:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or str(PurePosixPath(name)) != name:
-            raise SourceError(f"{bundle.path} records code as {name!r}, which is no file beside the factory.", AGAIN)
+            raise SourceError(f"{bundle.path} records code as {name!r}, which is not a file beside the factory.", AGAIN)
     return {str(name): str(digest) for name, digest in code.items()}

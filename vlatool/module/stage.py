@@ -52,13 +52,13 @@ class ModuleStage(Transform):
         """
         raise NotImplementedError(self.name())
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
-        """Say how large the modules are, and how to go on."""
-        size = sum(record.bytes for name, record in made.manifest.files.items() if name.endswith(".safetensors"))
-        folder = read_location(made.path)
+    def lines(self, bundle: Bundle) -> tuple[str, ...]:
+        """Return how large the modules are, and how to go on."""
+        size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
+        folder = read_location(bundle.path)
         return (
-            f"weights {size / 1e6:.2f} MB, {len(read_edits(made))} structural edits; not exported yet:",
-            f"vlatool export {made.path} -o BUNDLE --trust {folder}",
+            f"weights {size / 1e6:.2f} MB, {len(read_edits(bundle))} structural edits; not exported yet:",
+            f"vlatool export {bundle.path} -o BUNDLE --trust {folder}",
         )
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
@@ -69,10 +69,10 @@ class ModuleStage(Transform):
         modules = load_modules(bundle)
         edits = self.change(modules, bundle, context)
         modules = apply(modules, edits, bundle)
-        made = write_changed(bundle, out, joined_edits(read_edits(bundle), edits), modules, self.made_by())
+        changed = write_changed(bundle, out, joined_edits(read_edits(bundle), edits), modules, self.made_by())
         context.tell("running the changed policy", None)
-        torch_policy(made, SEED).infer(observations_for(made, 1)[0])
-        return made
+        torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
+        return changed
 
 
 def write_changed(

@@ -1,4 +1,4 @@
-"""A torch module as an ONNX model: torch's dynamo exporter, kept quiet, its faults in words, nodes named by modules."""
+"""A torch module as an ONNX model: torch's dynamo exporter, quiet, its errors explained, nodes named by modules."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.graph.draws import refuse_draws
 from vlatool.graph.nodes import FOLDED
-from vlatool.module.factory import exits_told
+from vlatool.module.factory import exits_caught
 from vlatool.module.failures import export_error
 from vlatool.module.norms import divide_by_roots
 
@@ -38,7 +38,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     """
     torch = require("torch", "build")
     try:
-        with quiet_exporter(), torch.no_grad(), exits_told("the policy's forward()"):
+        with quiet_exporter(), torch.no_grad(), exits_caught("the policy's forward()"):
             exported = torch.onnx.export(
                 module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
                 output_names=list(step.gives), verbose=False, **options,
@@ -73,12 +73,12 @@ def name_by_module(model: Any) -> None:
     seen: Counter[str] = Counter()
     for node in model.graph.all_nodes():
         scopes = node.metadata_props.get("pkg.torch.onnx.name_scopes", "")
-        found = ast.literal_eval(scopes) if scopes.startswith("[") else []
-        if len(found) < 2 or not found[-2]:
+        names = ast.literal_eval(scopes) if scopes.startswith("[") else []
+        if len(names) < 2 or not names[-2]:
             continue
-        module = _folded_into(node) or found[-2]
-        if module != found[-2]:
-            node.metadata_props[FOLDED] = found[-2]
+        module = _folded_into(node) or names[-2]
+        if module != names[-2]:
+            node.metadata_props[FOLDED] = names[-2]
         base = f"{module}/{node.op_type}"
         node.name = base if not seen[base] else f"{base}_{seen[base]}"
         seen[base] += 1

@@ -13,9 +13,9 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
 from vlatool.module.edits import edited, load_tensors, read_tensors
-from vlatool.module.factory import exits_told
+from vlatool.module.factory import exits_caught
 from vlatool.module.failures import remedy_for
-from vlatool.module.modules import modules_of
+from vlatool.module.modules import modules_of, outputs_of
 from vlatool.module.origin import origin_of
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
@@ -45,7 +45,7 @@ def unedited_modules(source: Bundle) -> dict[str, nn.Module]:
     require("torch", "build")
     origin = origin_of(source)
     origin.check()
-    modules = modules_of(origin.made(), sorted({step.graph for step in source.manifest.program}))
+    modules = modules_of(origin.build(), sorted({step.graph for step in source.manifest.program}))
     if origin.weights:
         for name, module in modules.items():
             _load_weights(name, module, origin.folder, origin.weights)
@@ -101,8 +101,8 @@ class TorchSession:
             self.first_feeds = dict(feeds)
         arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
         try:
-            with torch.inference_mode(), exits_told("the policy's forward()"):
-                given = self.module(*arguments)
+            with torch.inference_mode(), exits_caught("the policy's forward()"):
+                result = self.module(*arguments)
         except SourceError:
             raise
         except Exception as error:  # the seam: the user's module may raise anything
@@ -112,11 +112,7 @@ class TorchSession:
                 f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
                 remedy_for(error),
             ) from error
-        outputs = list(given) if isinstance(given, tuple | list) else [given]
-        if len(outputs) != len(self.step.gives):
-            raise SourceError(
-                f"The module gives {len(outputs)} outputs; the program says {', '.join(self.step.gives)}."
-            )
+        outputs = outputs_of(result, self.step)
         for name, value in zip(self.step.gives, outputs, strict=True):
             if not isinstance(value, torch.Tensor):
                 raise SourceError(

@@ -45,6 +45,11 @@ def choose(
     return [chosen if item is best else item for item in judged]
 
 
+def chosen_of(judged: list[Judged]) -> Judged:
+    """Return the row that is marked as chosen."""
+    return next(item for item in judged if item.row.role == "chosen")
+
+
 def _nearest(judged: list[Judged], origin: str, elsewhere: str) -> tuple[Judged, str, tuple[str, ...]]:
     """Return the candidate that misses the limits by least, and what is said of all of them.
 
@@ -114,19 +119,19 @@ def _times(row: Row, base: Row) -> str:
 
 def foretold(row: Row, base: Row, elsewhere: str) -> str:
     """Return a sentence on what a row is predicted to need on a board, with its range; empty without a board."""
-    found = row.get("latency_p50", "predicted")
+    latency = row.get("latency_p50", "predicted")
     if not elsewhere:
         return ""
-    if found is None or not found.known:
+    if latency is None or not latency.known:
         return f" No latency can be predicted for {elsewhere}."
     span = (
         ""
-        if found.low is None or found.high is None
-        else f" ({found.low:.3g} to {found.high:.3g}, {found.confidence:.0%})"
+        if latency.low is None or latency.high is None
+        else f" ({latency.low:.3g} to {latency.high:.3g}, {latency.confidence:.0%})"
     )
     reference = base.get("latency_p50", "predicted")
     beside = f", {base.name} {reference.value:.3g} ms" if row is not base and reference and reference.known else ""
-    return f" Predicted for {elsewhere}, not measured there: {found.value:.3g} ms{span}{beside}."
+    return f" Predicted for {elsewhere}, not measured there: {latency.value:.3g} ms{span}{beside}."
 
 
 def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
@@ -151,33 +156,44 @@ def _praise(best: Judged, judged: list[Judged], small: bool, elsewhere: str) -> 
     row, base = best.row, judged[0].row
     if best is judged[0]:
         return _float32_kept(judged, elsewhere)
-    size = f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
-    accuracy = row.get("success")
-    success = f" {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed." if accuracy else ""
+    success = f" {_episodes(row)}." if row.get("success") else ""
     why = ""
     if not is_faster(row, base):
         reason = "memory was asked for" if small and judged[0].within else f"{base.name} is outside: {base.reason}"
         why = f" It was chosen because {reason}."
-    told = foretold(row, base, elsewhere)
-    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {size}.{why}{success}{told}"
-    return (first, f"{row.reason[:1].upper()}{row.reason[1:]}.")
+    board = foretold(row, base, elsewhere)
+    first = f"{row.name} is {speed_words(row, base, elsewhere)}; {_size(row, base)}.{why}{success}{board}"
+    return (first, _reason(row))
+
+
+def _size(row: Row, base: Row) -> str:
+    return f"its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
+
+
+def _episodes(row: Row) -> str:
+    success = row.get("success")
+    return f"{success.value:.1%} of {success.samples} closed-loop episodes succeed" if success else ""
+
+
+def _reason(row: Row) -> str:
+    return f"{row.reason[:1].upper()}{row.reason[1:]}."
 
 
 def _float32_kept(judged: list[Judged], elsewhere: str) -> tuple[str, ...]:
     base = judged[0].row
     outside = [item for item in judged[1:] if not item.within and is_faster(item.row, base)]
     inside = [item for item in judged[1:] if item.within]
-    told = tuple(f"{item.row.name} is {speed_words(item.row, base, elsewhere)}." for item in inside)
+    speeds = tuple(f"{item.row.name} is {speed_words(item.row, base, elsewhere)}." for item in inside)
     board = foretold(base, base, elsewhere)
     if outside:
         return (
             f"{base.name} was kept: no candidate inside the limits is faster on this host.{board}",
-            *told,
+            *speeds,
             *(f"{item.row.name} is faster, but outside: {item.row.reason}." for item in outside),
         )
     return (
         f"{base.name} was kept: no quantized candidate is faster on this host.{board}",
-        *told,
+        *speeds,
         "In a graph this small the quantize and dequantize steps can cost more than int8 arithmetic saves.",
     )
 
@@ -194,15 +210,14 @@ def _foretell(best: Judged, judged: list[Judged]) -> tuple[str, ...]:
     times = ratio(row, base, "predicted")
     faster = is_faster(row, base, "predicted")
     speed = f"{times:.2f}x as fast as {base.name}" if faster else f"not faster than {base.name} ({times:.3g}x)"
-    here = f" Measured on this host: its graphs take {row.value('size'):.3g} MB instead of {base.value('size'):.3g} MB"
-    if accuracy := row.get("success"):
-        here += f", and {accuracy.value:.1%} of {accuracy.samples} closed-loop episodes succeed"
+    here = f" Measured on this host: {_size(row, base)}"
+    here += f", and {_episodes(row)}" if row.get("success") else ""
     overlap = ""
     if faster and reference.low is not None and reference.low < high:
         overlap = f" (whose range, {reference.low:.4g} to {reference.high or reference.value:.4g} ms, overlaps)"
     return (
         f"{row.name} is predicted to need {own.value:.4g} ms ({low:.4g} to {high:.4g}) on {own.where}, "
         f"{speed}{overlap}; not measured there.{here}.",
-        f"{row.reason[:1].upper()}{row.reason[1:]}.",
+        _reason(row),
         "The board's engine does not run on this host: the latencies measured here are ONNX Runtime's on this CPU.",
     )

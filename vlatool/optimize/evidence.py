@@ -33,10 +33,12 @@ def with_accuracy(
     """
     (base, baseline), *_ = bundles.items()
     success: dict[str, Row] = {}
-    found: dict[str, Row] = {}
+    evaluated: dict[str, Row] = {}
     for name, bundle in bundles.items():
         row = rows[name]
-        found[name] = replace(row, measurements=(*row.measurements, *_recorded(bundle, baseline, loop, cache, context)))
+        evaluated[name] = replace(
+            row, measurements=(*row.measurements, *_recorded(bundle, baseline, loop, cache, context))
+        )
         if loop is None:
             continue
         success[name] = cached_measure(loop, bundle, cache, context).rows[-1]
@@ -44,8 +46,8 @@ def with_accuracy(
             played = _with_controls(loop, bundle, success[name], cache, context)
         else:
             played = compare_success(success[base], success[name])
-        found[name] = _joined(found[name], played)
-    return found
+        evaluated[name] = _joined(evaluated[name], played)
+    return evaluated
 
 
 def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:

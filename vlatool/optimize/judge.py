@@ -6,85 +6,19 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from vlatool.errors import RecipeError, nearest
+from vlatool.optimize.budget import Budget, distance_of
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
 if TYPE_CHECKING:
-    from vlatool.bundle.spec import PolicySpec
     from vlatool.hardware.profile import Profile
 
 TOLERANCE = 1e-12
 AGAINST_FLOAT32 = "against float32"
-PROXY = 0.05
-"""Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
 FROM_FLOAT32 = ("relative_error", "disagreement", "error_baseline", "gripper_flips_baseline")
 """Beginnings of the measurements that are distances from float32 themselves."""
 DROPS = ("success_drop", "agreement_drop", "error_increase")
 """Which accuracy decides: the closed loop where there is one, else recorded observations."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What a plan may cost in accuracy, in a measure that recorded observations give.
-
-    Args:
-        name: The measurement, or ``unit:UNIT`` for the worst action element of that unit.
-        value: The largest allowed.
-    """
-
-    name: str
-    value: float
-
-    def of(self, row: Row) -> Measurement | None:
-        """Return the measurement of a row that the budget is about, None when there is none."""
-        if self.name == "disagreement":
-            found = row.get("agreement_baseline")
-            return None if found is None else replace(found, name=self.name, value=1.0 - found.value)
-        if self.name.startswith("unit:"):
-            unit = self.name.partition(":")[2]
-            alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
-            return max(alike, key=lambda m: m.value, default=None)
-        return row.get(self.name) or row.get(f"error_baseline.{self.name}")
-
-    def found(self, row: Row) -> Measurement:
-        """Return the measurement of a row that the budget is about.
-
-        Raises:
-            RecipeError: when the row has none of that name; names those that it has.
-        """
-        found = self.of(row)
-        if found is not None:
-            return found
-        known = [each.name.removeprefix("error_baseline.") for each in row.measurements if each.origin == "measured"]
-        units = {f"unit:{each.unit}" for each in row.measurements if each.name.startswith("error_baseline.")}
-        raise RecipeError(
-            f"--max-drop names '{self.name}', which is not measured on this policy; "
-            f"{nearest(self.name, [*known, *sorted(units)])}."
-        )
-
-
-def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
-    """Return the budget on recorded observations.
-
-    Args:
-        limits: What was asked for.
-        spec: The policy's.
-        proxy: Whether something else decides in the end (episodes, the expert's actions), so that a plan is only worth
-            a look when it is near float32.
-    """
-    if limits.metric:
-        return Budget(limits.metric, limits.max_metric or 0.0)
-    name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
-    return Budget(name, min(max(PROXY, limits.max_drop), limits.max_distance) if proxy else limits.max_drop)
-
-
-def distance_of(row: Row) -> Measurement | None:
-    """Return how far a row's actions are from float32's own, None when that is not measured.
-
-    Continuous: the mean |difference| by float32's standard deviation; discrete: the share of other answers.
-    """
-    return Budget("disagreement", 0.0).of(row) or row.get("error_baseline")
 
 
 @dataclass(frozen=True)
@@ -123,7 +57,7 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
     """
     is_baseline = row is baseline
     row = _with_drop(row, baseline)
-    decisive = next((found for name in DROPS if (found := row.get(name)) is not None), None)
+    decisive = next((measured for name in DROPS if (measured := row.get(name)) is not None), None)
     if limits.metric:
         decisive = Budget(limits.metric, 0.0).of(row)
     rate = _both(_judge_rate(row, limits, profile, on_board), _judge_memory(row, limits, profile, on_board))
@@ -156,8 +90,8 @@ def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verd
         allowed = limits.max_metric or 0.0
         if drop.value <= allowed:
             return _Verdict()
-        told = f"{_drop_words(drop)}, allowed {_allowed(limits, drop)}"
-        return _Verdict((told,), drop.value / max(allowed, 1e-9) - 1)
+        over_limit = f"{_drop_words(drop)}, allowed {_allowed(limits, drop)}"
+        return _Verdict((over_limit,), drop.value / max(allowed, 1e-9) - 1)
     over = drop.value - limits.max_drop
     if over > TOLERANCE:
         return _Verdict((f"{_drop_words(drop)}, {_points(over)} over the budget",), over / max(limits.max_drop, 0.001))
@@ -174,15 +108,15 @@ def _judge_accuracy(row: Row, drop: Measurement | None, limits: Limits) -> _Verd
 
 def _judge_distance(row: Row, decisive: Measurement | None, limits: Limits) -> _Verdict:
     """Judge the distance from float32's own actions, which a drop against the expert or of success does not show."""
-    found = distance_of(row)
-    if found is None or (decisive is not None and _is_distance(decisive)):
+    distance = distance_of(row)
+    if distance is None or (decisive is not None and _is_distance(decisive)):
         return _Verdict()
-    if not found.known:
-        return _Verdict((f"its distance from float32 is unknown: {found.note}",), math.inf)
-    if found.value <= limits.max_distance:
+    if not distance.known:
+        return _Verdict((f"its distance from float32 is unknown: {distance.note}",), math.inf)
+    if distance.value <= limits.max_distance:
         return _Verdict()
-    told = f"{_distance_words(found)}, allowed {_percent(limits.max_distance)} (--max-distance)"
-    return _Verdict((told,), found.value / max(limits.max_distance, 1e-9) - 1)
+    reason = f"{_distance_words(distance)}, allowed {_percent(limits.max_distance)} (--max-distance)"
+    return _Verdict((reason,), distance.value / max(limits.max_distance, 1e-9) - 1)
 
 
 def _is_distance(decisive: Measurement) -> bool:
@@ -190,10 +124,10 @@ def _is_distance(decisive: Measurement) -> bool:
     return decisive.note == AGAINST_FLOAT32 or decisive.name.startswith(FROM_FLOAT32)
 
 
-def _distance_words(found: Measurement) -> str:
-    if found.name == "disagreement":
-        return f"{_percent(found.value)} of the answers are not those of float32"
-    return f"the action differs from float32's by {_percent(found.value)} of its standard deviation"
+def _distance_words(distance: Measurement) -> str:
+    if distance.name == "disagreement":
+        return f"{_percent(distance.value)} of the answers are not those of float32"
+    return f"the action differs from float32's by {_percent(distance.value)} of its standard deviation"
 
 
 def _percent(share: float) -> str:
@@ -204,11 +138,11 @@ def _with_drop(row: Row, baseline: Row) -> Row:
     """Add the drop on recorded observations, in the direction in which more is worse."""
     if row is baseline:
         return row
-    found: list[Measurement] = []
+    drops: list[Measurement] = []
     for name, drop, sign in (("agreement_expert", "agreement_drop", -1.0), ("error_expert", "error_increase", 1.0)):
         own, base = row.get(name), baseline.get(name)
         if own is not None and base is not None and own.known:
-            found.append(
+            drops.append(
                 Measurement(
                     drop,
                     sign * (own.value - base.value),
@@ -218,15 +152,15 @@ def _with_drop(row: Row, baseline: Row) -> Row:
                     note="recorded observations",
                 )
             )
-    if not found:
+    if not drops:
         against = row.get("agreement_baseline") or row.get("error_baseline")
         if against is not None and against.known:
             agreement = against.name == "agreement_baseline"
             value = 1.0 - against.value if agreement else against.value
             name = "agreement_drop" if agreement else "error_increase"
             where, count = against.where, against.samples
-            found.append(Measurement(name, value, "1", where=where, samples=count, note=AGAINST_FLOAT32))
-    return replace(row, measurements=(*row.measurements, *found))
+            drops.append(Measurement(name, value, "1", where=where, samples=count, note=AGAINST_FLOAT32))
+    return replace(row, measurements=(*row.measurements, *drops))
 
 
 def _both(first: _Verdict, second: _Verdict) -> _Verdict:
@@ -239,13 +173,13 @@ def _judge_memory(row: Row, limits: Limits, profile: Profile | None, on_board: b
     if limits.max_memory_mb is None:
         return _Verdict()
     measured = profile is None or on_board
-    found = row.get("peak_rss") if measured else row.get("memory", "predicted")
-    if found is None or not found.known:
+    memory = row.get("peak_rss") if measured else row.get("memory", "predicted")
+    if memory is None or not memory.known:
         return _Verdict(warnings=(f"{row.name}: its memory is not known, so {limits.max_memory_mb:g} MB is unjudged",))
-    if found.value <= limits.max_memory_mb:
+    if memory.value <= limits.max_memory_mb:
         return _Verdict()
-    told = f"needs {found.value:.4g} MB{'' if measured else ' (predicted)'} > {limits.max_memory_mb:g} MB"
-    return _Verdict((told,), found.value / limits.max_memory_mb - 1)
+    reason = f"needs {memory.value:.4g} MB{'' if measured else ' (predicted)'} > {limits.max_memory_mb:g} MB"
+    return _Verdict((reason,), memory.value / limits.max_memory_mb - 1)
 
 
 def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: bool) -> _Verdict:
@@ -254,8 +188,8 @@ def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: boo
     if budget_ms is None:
         return _Verdict()
     if on_board or profile is None:
-        found = row.get("latency_p90") or row.get("latency_p50")
-        p90 = found.value if found else math.inf
+        latency = row.get("latency_p90") or row.get("latency_p50")
+        p90 = latency.value if latency else math.inf
         late = (f"p90 latency {p90:.3g} ms > {budget_ms:.3g} ms",)
         return _Verdict(late, p90 / budget_ms - 1) if p90 > budget_ms else _Verdict()
     predicted = row.get("latency_p50", "predicted")
@@ -263,12 +197,12 @@ def _judge_rate(row: Row, limits: Limits, profile: Profile | None, on_board: boo
         unjudged = f"{row.name}: no latency can be predicted for {profile.name}, so {_rate(limits)} is unjudged"
         return _Verdict(warnings=(unjudged,))
     low, high = predicted.low or predicted.value, predicted.high or predicted.value
-    told = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
-    told += f", {_rate(limits)} needs {budget_ms:.3g} ms"
+    reason = f"predicted {predicted.value:.3g} ms ({low:.3g}-{high:.3g}) on {profile.name}"
+    reason += f", {_rate(limits)} needs {budget_ms:.3g} ms"
     if low > budget_ms:
-        return _Verdict((told,), predicted.value / budget_ms - 1)
+        return _Verdict((reason,), predicted.value / budget_ms - 1)
     if high > budget_ms:
-        return _Verdict(warnings=(f"{row.name}: {told}: too close to call, measure on the board",))
+        return _Verdict(warnings=(f"{row.name}: {reason}: too close to call, measure on the board",))
     return _Verdict()
 
 
@@ -308,5 +242,5 @@ def _points(share: float) -> str:
 
 def p50(row: Row, origin: str = "measured") -> float:
     """Return the median latency of a row in ms, infinite when it is not known."""
-    found = row.get("latency_p50", origin)
-    return found.value if found is not None and found.known else math.inf
+    latency = row.get("latency_p50", origin)
+    return latency.value if latency is not None and latency.known else math.inf

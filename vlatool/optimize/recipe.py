@@ -45,9 +45,9 @@ class Limits(Numeric):
     @property
     def latency_ms(self) -> float | None:
         """What one inference may take, by rate and latency."""
-        given = [1000.0 / self.hz] if self.hz else []
-        given += [self.max_latency_ms] if self.max_latency_ms else []
-        return min(given) if given else None
+        limits = [1000.0 / self.hz] if self.hz else []
+        limits += [self.max_latency_ms] if self.max_latency_ms else []
+        return min(limits) if limits else None
 
 
 class Effort(Numeric):
@@ -124,9 +124,9 @@ def stage_entries(stages: StageList) -> list[tuple[str, dict[str, Any]]]:
     Raises:
         RecipeError: when an entry is not a mapping of one name to options.
     """
-    found: list[tuple[str, dict[str, Any]]] = []
+    entries: list[tuple[str, dict[str, Any]]] = []
     for entry in stages:
         if len(entry) != 1:
             raise RecipeError(f"A stage is one name with its options; got {entry}.")
-        found.extend(entry.items())
-    return found
+        entries.extend(entry.items())
+    return entries

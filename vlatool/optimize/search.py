@@ -15,7 +15,7 @@ from __future__ import annotations
 import glob
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,12 +30,13 @@ from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import isa
 from vlatool.machine.instruction_sets import board_set
-from vlatool.optimize.judge import budget_of
-from vlatool.optimize.recipe import Limits, StageList, stage_entries
+from vlatool.optimize.budget import budget_of
+from vlatool.optimize.plan import transforms
+from vlatool.optimize.recipe import Limits, StageList
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
 from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context, Transform, build_stage, stage_class
+from vlatool.stage.base import Context, stage_class
 from vlatool.stage.run import cached_measure, cached_transform
 
 if TYPE_CHECKING:
@@ -109,19 +110,19 @@ class Search:
         self._observations = recorded_observations(self.baseline, 256)
         self.budget = budget_of(self.limits, self.baseline.manifest.spec)
 
-    def run(self, given: Mapping[str, StageList]) -> dict[str, StageList]:
+    def run(self, candidates: Mapping[str, StageList]) -> dict[str, StageList]:
         """Try everything; return the finalists that are not among the given candidates, fastest first."""
-        variants = {**given, **variants_for(self.profile, calibrated=bool(self._observations))}
+        variants = {**candidates, **variants_for(self.profile, calibrated=bool(self._observations))}
         self._planned = len(variants) + 2 * ROUNDS
         for name, stages in variants.items():
             self._try(name, stages)
         self._repair()
         chosen = self._finalists()
-        return {trial.name: trial.stages for trial in chosen if trial.name not in given}
+        return {trial.name: trial.stages for trial in chosen if trial.name not in candidates}
 
     def tables(self) -> dict[str, list[dict[str, Any]]]:
         """Return what was tried, and which layers cost the accuracy, as tables of the report."""
-        found: dict[str, list[dict[str, Any]]] = {
+        tables: dict[str, list[dict[str, Any]]] = {
             "Plans tried by the search": [
                 {
                     "plan": trial.name,
@@ -135,23 +136,23 @@ class Search:
             ]
         }
         if self._layers:
-            found["Layers by what they cost when they alone are int8"] = [
+            tables["Layers by what they cost when they alone are int8"] = [
                 {"layer": layer.name, "error": f"{layer.error:.4g}", "share of MACs": f"{layer.macs_share:.1%}"}
                 for layer in self._layers[:15]
             ]
-        return found
+        return tables
 
     def _try(self, name: str, stages: StageList) -> Trial:
         """Build a plan, time it against float32 and measure its error; failures are trials that say why."""
         done = len(self.trials)
         self._planned = max(self._planned, done + 1)
         left = (time.monotonic() - self._begun) / done * (self._planned - done) if done else math.nan
-        told = f", about {left:.0f} s left" if done else ""
-        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{told}: {name}", done / self._planned)
+        rest = f", about {left:.0f} s left" if done else ""
+        self.context.tell(f"search: plan {done + 1} of at most {self._planned}{rest}: {name}", done / self._planned)
         quiet = replace(self.context, tell=lambda _what, _share: None)
         try:
             bundle = self.baseline
-            for stage in built(stages):
+            for stage in transforms(stages):
                 stage.check(bundle, self.profile)
                 bundle = cached_transform(stage, bundle, self.cache, quiet)
             refuse_findings(bundle, self.limits.accept)
@@ -174,8 +175,8 @@ class Search:
         count = max(8, min(len(self._observations), 64))
         recorded = Recorded(data=self.baseline.path / CALIBRATION, baseline=self.baseline.path, samples=count)
         row = cached_measure(recorded, bundle, self.cache, context).rows[-1]
-        found = self.budget.of(row)
-        return math.inf if found is None or not found.known else found.value
+        error = self.budget.of(row)
+        return math.inf if error is None or not error.known else error.value
 
     def _repair(self) -> None:
         """Leave sensitive layers in float where a plan is fast enough to be worth it, but outside the budget."""
@@ -184,7 +185,7 @@ class Search:
             best = max((other.speedup for other in rivals), default=0.0)
             if trial.within or trial.speedup <= 1.05 * best or not math.isfinite(trial.error):
                 continue
-            stage = built(trial.stages)[-1]
+            stage = transforms(trial.stages)[-1]
             if isinstance(stage, StaticInt8) and not stage.elementwise and not stage.attention:
                 self._mix(trial, stage)
 
@@ -231,15 +232,15 @@ class Search:
 
     def _finalists(self) -> list[Trial]:
         """Return the finalists of all plans that are compared with each other."""
-        made = [trial for trial in self.trials if trial.speedup > 0]
-        engines = dict.fromkeys(trial.engine for trial in made)
-        return [each for engine in engines for each in self._finalists_of([t for t in made if t.engine == engine])]
+        timed = [trial for trial in self.trials if trial.speedup > 0]
+        engines = dict.fromkeys(trial.engine for trial in timed)
+        return [best for engine in engines for best in self._finalists_of([t for t in timed if t.engine == engine])]
 
-    def _finalists_of(self, made: list[Trial]) -> list[Trial]:
+    def _finalists_of(self, timed: list[Trial]) -> list[Trial]:
         """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
-        inside = sorted((trial for trial in made if trial.within), key=lambda trial: -trial.speedup)
+        inside = sorted((trial for trial in timed if trial.within), key=lambda trial: -trial.speedup)
         if not inside:
-            return sorted(made, key=lambda trial: trial.error)[:1]
+            return sorted(timed, key=lambda trial: trial.error)[:1]
         fast = [trial for trial in inside if trial.speedup >= 0.8 * inside[0].speedup][:FINALISTS]
         accurate = min(inside, key=lambda trial: trial.error)
         return fast if accurate in fast or accurate.speedup < 1.0 else [*fast, accurate]
@@ -254,17 +255,17 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
     """
     known = engine_names()
     board = known if profile is None else [name for name in known if name in profile.engines]
-    found: dict[str, StageList] = {}
+    variants: dict[str, StageList] = {}
     for name in board:
         if installed(name):
-            found |= engine_class(name).variants(partial(processor_has, profile), calibrated)
+            variants |= engine_class(name).variants(partial(processor_has, profile), calibrated)
     for name in registry.names("quantize"):
         try:
             method = stage_class(f"quantize.{name}")
         except PluginError:  # doctor says so; nobody asked for it here
             continue
-        found |= {f"{name}{ending}": ({method.name(): dict(how)},) for ending, how in method.tried.items()}
-    return found
+        variants |= {f"{name}{ending}": ({method.name(): dict(how)},) for ending, how in method.tried.items()}
+    return variants
 
 
 def graphs_of(bundle: Bundle) -> str:
@@ -280,9 +281,3 @@ def processor_has(profile: Profile | None, *features: str) -> bool:
     if profile is not None:
         return any(name in features for unit in profile.units.values() for name in unit.isa)
     return any(name in features for name in isa() or [])
-
-
-def built(stages: Iterable[dict[str, dict[str, Any]]]) -> list[Transform]:
-    """Return the stage objects of a list of entries."""
-    made = [build_stage(name, options or {}) for name, options in stage_entries(tuple(stages))]
-    return [stage for stage in made if isinstance(stage, Transform)]

@@ -12,13 +12,16 @@ from vlatool.boards.predict import predictions
 from vlatool.bundle.bundle import Bundle
 from vlatool.hardware.profile import Profile
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
-from vlatool.optimize.engines_apart import REFERENCE, joined
 from vlatool.optimize.recipe import Effort
 from vlatool.report import Measurement, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_measure
 
+REFERENCE = "openvino_float32_latency_p50"
+"""Of the baseline's row: float32 in OpenVINO, of the run that timed OpenVINO's plans."""
+IN_OPENVINO = "float32 in OpenVINO"
+OWN_SET = "this host's own instruction set"
 Timed = tuple[dict[str, Row], tuple[str, ...]]
 """Name -> row, float32 first, and what a reader should know."""
 
@@ -53,9 +56,9 @@ class Timing:
             torch = [source] if source.manifest.source and source.path != baseline.path else []
             return self._timed(bundles, torch)
         own = {name: bundle for name, bundle in bundles.items() if name != base and engine_of(bundle) == ENGINE}
-        rows, told = self._timed({name: bundle for name, bundle in bundles.items() if name not in own})
+        rows, warnings = self._timed({name: bundle for name, bundle in bundles.items() if name not in own})
         theirs, more = self._timed({base: baseline, **own}, engine=ENGINE) if own else ({}, ())
-        return joined(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*told, *more)))
+        return joined(rows, theirs, list(bundles), self.where), tuple(dict.fromkeys((*warnings, *more)))
 
     def _timed(self, bundles: Mapping[str, Bundle], torch: Sequence[Bundle] = (), engine: str = "") -> Timed:
         """Time bundles in one run, eager torch last; all in one engine where it is named."""
@@ -73,9 +76,52 @@ class Timing:
             own = replace(eager, name="torch_eager_latency_p50", note="eager torch, same run")
             named[base] = replace(named[base], measurements=(*named[base].measurements, own))
         seen = [
-            "; ".join(filter(None, (each.reason, each.remedy))) for each in report.findings if each.effect != "note"
+            "; ".join(filter(None, (finding.reason, finding.remedy)))
+            for finding in report.findings
+            if finding.effect != "note"
         ]
         return named, (*report.warnings, *seen, *(kept if report.created < begun else ()))
+
+
+def joined(ours: Mapping[str, Row], theirs: Mapping[str, Row], order: Sequence[str], where: BoardSet) -> dict[str, Row]:
+    """Return the rows of two runs, one for each engine, in an order.
+
+    Args:
+        ours: ONNX Runtime's plans by name, the baseline first.
+        theirs: OpenVINO's plans by name, after the baseline as OpenVINO runs it.
+        order: The names, the baseline first.
+        where: The set that OpenVINO is confined to.
+    """
+    base = order[0]
+    rows = {name: replace(row, measurements=_noted(row, OWN_SET)) for name, row in ours.items()}
+    reference = theirs[base].get("latency_p50") if theirs else None
+    if reference is not None:
+        own = replace(reference, name=REFERENCE, where=where.where, note=f"{IN_OPENVINO}, in the run of its plans")
+        rows[base] = replace(rows[base], measurements=(*rows[base].measurements, own))
+    rows[base] = replace(rows[base], role="baseline")  # of a run alone it is none
+    rows |= {name: replace(row, measurements=_noted(row, where.ratio)) for name, row in theirs.items() if name != base}
+    return {name: rows[name] for name in order}
+
+
+def _noted(row: Row, what: str) -> tuple[Measurement, ...]:
+    """Say of a row's speed-up what it is a ratio of."""
+    of = IN_OPENVINO if what != OWN_SET else "float32 in ONNX Runtime"
+    note = f"ratio of medians to {of}, interleaved: {what}"
+    return tuple(replace(number, note=note) if number.name == "speedup" else number for number in row.measurements)
+
+
+def placed(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> dict[str, Row]:
+    """Return the rows with OpenVINO's measurements placed where they were taken, if that is a host that is confined."""
+    if not where.confined:
+        return dict(rows)
+
+    def moved(number: Measurement) -> Measurement:
+        return replace(number, where=where.where) if number.origin == "measured" else number
+
+    return {
+        name: replace(row, measurements=tuple(map(moved, row.measurements))) if engines.get(name) == ENGINE else row
+        for name, row in rows.items()
+    }  # fmt: skip
 
 
 def foretold_by_engine(
@@ -88,11 +134,11 @@ def foretold_by_engine(
         bundles: Name -> bundle, float32 first.
         where: The set that OpenVINO is confined to, if it is.
     """
-    found = {name: predictions(profile, bundle) for name, bundle in bundles.items()}
+    predicted = {name: predictions(profile, bundle) for name, bundle in bundles.items()}
     (base, baseline), *_ = bundles.items()
     own = predictions(profile, baseline, ENGINE) if where.confined else []
-    found[base] += [replace(each, name=REFERENCE) for each in own if each.name == "latency_p50"]
-    return found
+    predicted[base] += [replace(number, name=REFERENCE) for number in own if number.name == "latency_p50"]
+    return predicted
 
 
 def engine_of(bundle: Bundle) -> str:

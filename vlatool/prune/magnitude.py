@@ -1,4 +1,4 @@
-"""Structured pruning by magnitude: whole neurons go, so that every engine is faster without sparse kernels."""
+"""Structured pruning by magnitude: whole neurons are removed, so that every engine is faster without sparse kernels."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ ELEMENTWISE = (
 class Magnitude(ModuleStage):
     """Remove the neurons of least magnitude from the hidden layers of MLPs.
 
-    A hidden layer is what lies between two Linear layers of an ``nn.Sequential`` with nothing but elementwise modules
+    A hidden layer is what is between two Linear layers of an ``nn.Sequential`` with nothing but elementwise modules
     between them. A neuron's magnitude is the product of the L2 norms of its incoming and of its outgoing weights: what
     it can add to the output. Train the policy further afterwards (``vlatool distill weights`` takes the result).
     """
 
-    ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer that goes")
-    multiple: int = Field(8, ge=1, description="neurons that stay are a multiple of this, as vector units want it")
+    ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer to remove")
+    multiple: int = Field(8, ge=1, description="the neurons that stay are a multiple of this, for vector units")
     include: tuple[str, ...] = Field((), description="globs of module names (of the first Linear); all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 
@@ -44,13 +44,13 @@ class Magnitude(ModuleStage):
         Raises:
             RecipeError: when no hidden layer can be pruned, or a pattern matches none.
         """
-        found = [(graph, *layer) for graph, module in modules.items() for layer in hidden_layers(module)]
-        names = [first for _, first, *_ in found]
+        layers = [(graph, *layer) for graph, module in modules.items() for layer in hidden_layers(module)]
+        names = [first for _, first, *_ in layers]
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):
                 raise RecipeError(f"No hidden layer matches '{pattern}'; {nearest(pattern, names)}.")
         edits: list[Edit] = []
-        for graph, first, second, incoming, outgoing in found:
+        for graph, first, second, incoming, outgoing in layers:
             if (not self.include or matches(first, self.include)) and not matches(first, self.exclude):
                 context.tell(f"pruning {first}", None)
                 keep = self._kept(incoming, outgoing)
@@ -67,11 +67,11 @@ class Magnitude(ModuleStage):
         """Return the indices of the neurons that stay, in their order."""
         torch = require("torch", "build")
         size = incoming.out_features
-        wanted = max(1, round(size * (1 - self.ratio)))
-        count = min(size, max(self.multiple, self.multiple * round(wanted / self.multiple)))
+        share = max(1, round(size * (1 - self.ratio)))
+        count = min(size, max(self.multiple, self.multiple * round(share / self.multiple)))
         magnitude = incoming.weight.detach().double().norm(dim=1) * outgoing.weight.detach().double().norm(dim=0)
         chosen = torch.argsort(magnitude, descending=True, stable=True)[:count]
-        return tuple(sorted(int(each) for each in chosen))
+        return tuple(sorted(int(index) for index in chosen))
 
 
 def hidden_layers(module: nn.Module) -> Iterator[tuple[str, str, Any, Any]]:
@@ -87,7 +87,7 @@ def hidden_layers(module: nn.Module) -> Iterator[tuple[str, str, Any, Any]]:
             place = f"{name}.{key}" if name else key
             if type(child) is torch.nn.Linear:
                 if first is not None and all(
-                    seen[id(each)] < 2 for layer in (first[1], child) for each in (layer, layer.weight)
+                    seen[id(weight)] < 2 for layer in (first[1], child) for weight in (layer, layer.weight)
                 ):
                     yield first[0], place, first[1], child
                 first = place, child

@@ -15,6 +15,7 @@ from typing import IO, Any, cast
 
 from vlatool import errors
 from vlatool.machine.processes import SINGLE, python_command
+from vlatool.quantize._compute import Job
 from vlatool.quantize._records import Record, Tools, compute
 
 
@@ -79,13 +80,8 @@ class Worker:
     """A process that computes one record at a time."""
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            python_command("vlatool.quantize._worker"),
-            env={**os.environ, **SINGLE},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        command, pipe = python_command("vlatool.quantize._worker"), subprocess.PIPE
+        self._process = subprocess.Popen(command, env={**os.environ, **SINGLE}, stdin=pipe, stdout=pipe, text=True)
         self._requests, self._answers = cast(IO[str], self._process.stdin), cast(IO[str], self._process.stdout)
 
     def compute(self, record: Record, file: Path, offset: int) -> dict[str, Any]:
@@ -95,7 +91,7 @@ class Worker:
             OSError: when the disk is full.
             VlatoolError: what the record raises, or GraphError when the process died.
         """
-        request = {"job": record.fill.to_json(), "size": record.size, "file": str(file), "offset": offset}
+        request = {"job": cast(Job, record.fill).to_json(), "size": record.size, "file": str(file), "offset": offset}
         line = ""
         with contextlib.suppress(BrokenPipeError, ValueError):
             self._requests.write(json.dumps(request) + "\n")

@@ -20,6 +20,7 @@ from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
+from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import precision_shares
 from vlatool.stage.base import Context, Transform, source_of
@@ -83,7 +84,7 @@ class Quantization(Transform):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         (out / "graphs").mkdir()
-        made: dict[str, Graph] = {}
+        graphs: dict[str, Graph] = {}
         program = bundle.manifest.program
         for number, (name, graph) in enumerate(bundle.manifest.graphs.items()):
             context.tell(f"quantizing {name}", number / len(bundle.manifest.graphs))
@@ -97,17 +98,17 @@ class Quantization(Transform):
                     save(load(original), target)
                 if compute == "bfloat16":
                     program, parted = part_phases(program, name, target)
-                    made.update({key: replace(part, opset=graph.opset) for key, part in parted.items()})
+                    graphs.update({key: replace(part, opset=graph.opset) for key, part in parted.items()})
                 shares = precision_shares(target)
             if compute:
                 shares = {compute if key == "float32" else key: share for key, share in shares.items()}
-            made[name] = Graph(graph.file, shares, graph.opset, compute or "")
+            graphs[name] = Graph(graph.file, shares, graph.opset, compute or "")
         carry_over(bundle, out)
         context.tell("running the quantized graphs", None)
         observations = self.golden(bundle)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
-        told = made_by or self.made_by()
-        return finish(bundle, out, made_by=told, graphs=made, observations=observations, changes=changes)
+        made_by = made_by or self.made_by()
+        return finish(bundle, out, made_by=made_by, graphs=graphs, observations=observations, changes=changes)
 
     def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
         """Return observations, the first of which become golden; all are looked at where the engine differs.
@@ -121,6 +122,15 @@ class Quantization(Transform):
         """Return the names of the graphs that are quantized."""
         names = bundle.manifest.graphs
         return [name for name in names if not self.graphs or any(fnmatch.fnmatch(name, glob) for glob in self.graphs)]
+
+    def layers_of(self, bundle: Bundle, ops: Iterable[str], **kinds: bool) -> dict[str, list[Layer]]:
+        """Return graph -> the selected layers; ``ops`` and ``kinds`` are those of ``find_layers``."""
+        layers = {}
+        for name in self.chosen_graphs(bundle):
+            with foreign_errors(name):
+                layers[name] = find_layers(read(bundle.file(bundle.manifest.graphs[name].file)), ops, **kinds)
+        selected = self.selected([layer.name for graph in layers.values() for layer in graph], bundle)
+        return {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
 
     def selected(self, names: Iterable[str], bundle: Bundle) -> set[str]:
         """Return which of those nodes are quantized, by include, exclude and parts.
@@ -164,6 +174,13 @@ class Quantization(Transform):
         return kept
 
 
+def check_ops(ops: Iterable[str]) -> None:
+    """Raise a user error for an operator that no method quantizes."""
+    for name in ops:
+        if name not in QUANTIZED_OPS:
+            raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
+
+
 @contextlib.contextmanager
 def quiet_quantizer() -> Iterator[Path]:
     """Yield a scratch directory; keep the quantizer's prints, log lines and warnings away from the user."""
@@ -184,11 +201,11 @@ def quiet_quantizer() -> Iterator[Path]:
 
 def _folded(bundle: Bundle) -> dict[str, str]:
     """Return node -> ``MODULE/TYPE`` of the module that was folded into it when the policy was exported."""
-    found = {}
+    modules = {}
     for name, graph in bundle.manifest.graphs.items():
         with foreign_errors(name):
             for node in read(bundle.file(graph.file), weights=False).graph.node:
-                noted = {each.key: each.value for each in node.metadata_props}
-                if FOLDED in noted:
-                    found[node.name] = f"{noted[FOLDED]}/{node.op_type}"
-    return found
+                for note in node.metadata_props:
+                    if note.key == FOLDED:
+                        modules[node.name] = f"{note.value}/{node.op_type}"
+    return modules

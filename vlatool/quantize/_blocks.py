@@ -287,11 +287,11 @@ def quantize_planes(
 
 def squared_error(planes: Array, stored: Array, chosen: Chosen, form: Format, scratch: Scratch) -> float:
     """Return the sum of squared differences between planes and what the stored codes mean."""
-    found = scratch("codes", planes.shape)
-    np.subtract(unpack(stored, form, scratch), chosen.zero, out=found)
-    np.multiply(found, chosen.scale, out=found)
-    np.subtract(found, planes, out=found)
-    return float(np.vdot(found, found))
+    meant = scratch("codes", planes.shape)
+    np.subtract(unpack(stored, form, scratch), chosen.zero, out=meant)
+    np.multiply(meant, chosen.scale, out=meant)
+    np.subtract(meant, planes, out=meant)
+    return float(np.vdot(meant, meant))
 
 
 def pack_zeros(zero: Array, form: Format) -> Array:

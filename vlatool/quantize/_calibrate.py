@@ -13,46 +13,44 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, GraphError, require
-from vlatool.graph.files import write_beside
+from vlatool.errors import DataError, GraphError
+from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._ranges import Statistics
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
-from vlatool.runtime.policy import Policy
-from vlatool.runtime.program import Program
+from vlatool.quantize._watched import SAMPLE, Watcher, run_watched
 from vlatool.stage.base import Context
 
-Wanted = Mapping[str, Iterable[str]]
+Values = Mapping[str, Iterable[str]]
+"""Graph name -> names of its values."""
 
 
-class _Calibrating:
-    """A session of a graph whose chosen values are outputs too; hands on what the program asked for."""
+class _Calibrating(Watcher):
+    """Adds chosen values to their statistics."""
 
-    def __init__(self, graph: str, path: Path, outputs: list[str], statistics: dict[str, Statistics]) -> None:
-        self.graph = graph
-        self.sample = 0
-        self.statistics = statistics
-        self._outputs = outputs
-        self._session = engine_class()(path, 1)
+    def __init__(self, graph: str, path: Path, scratch: Path, statistics: dict[str, Statistics]) -> None:
+        self.graph, self.statistics = graph, statistics
+        super().__init__(path, scratch / f"{graph}.onnx", self._show)
 
-    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run, take in the statistics, return the graph's own outputs."""
-        given = dict(self._session.run(feeds))
-        for name, found in self.statistics.items():
-            values = np.asarray(feeds[name] if name in feeds else given[name])
-            if not np.isfinite(values).all():
-                bad = int(np.size(values) - np.isfinite(values).sum())
+    def _show(self, graph: OnnxGraph) -> None:
+        known = graph.outputs.union(value.name for value in graph.graph.input)
+        graph.graph.output.extend(graph.onnx.ValueInfoProto(name=name) for name in self.statistics if name not in known)
+
+    def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+        """Take in the statistics."""
+        for name, statistics in self.statistics.items():
+            array = np.asarray(feeds[name] if name in feeds else values[name])
+            if not np.isfinite(array).all():
+                bad = int(np.size(array) - np.isfinite(array).sum())
                 raise DataError(
-                    f"Calibration sample {self.sample} makes the tensor '{name}' of the graph '{self.graph}' not "
-                    f"finite ({bad} of {values.size} values).",
+                    f"{SAMPLE} {self.sample} makes the tensor '{name}' of the graph '{self.graph}' not "
+                    f"finite ({bad} of {array.size} values).",
                     "look at that sample and at the float32 policy; int8 cannot represent what float32 cannot",
                 )
-            found.add(values)
-        return {name: given[name] for name in self._outputs}
+            statistics.add(array)
 
 
 def calibrate(
     bundle: Bundle,
-    wanted: Wanted,
+    values: Values,
     observations: Iterable[Mapping[str, Any]],
     context: Context,
     *,
@@ -63,7 +61,7 @@ def calibrate(
 
     Args:
         bundle: A float32 bundle.
-        wanted: Graph name -> names of its values.
+        values: What is looked at.
         observations: Raw observations, consumed one at a time.
         context: For progress.
         channels: Whether the largest magnitude of each entry of the last axis is kept too.
@@ -77,54 +75,16 @@ def calibrate(
             sample and the tensor.
         GraphError: when the program never runs a graph, whose ranges would be guesses.
     """
-    manifest = bundle.manifest
-    sessions: dict[str, Any] = {}
-    found: dict[str, dict[str, Statistics]] = {}
+    statistics = {graph: {name: Statistics(channels) for name in names} for graph, names in values.items()}
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-        recorders = []
-        for graph, names in wanted.items():
-            found[graph] = {name: Statistics(channels) for name in names}
-            original = bundle.file(manifest.graphs[graph].file)
-            path, outputs = _with_outputs(original, list(names), Path(scratch), graph)
-            recorder = _Calibrating(graph, path, outputs, found[graph])
-            sessions[graph] = recorder
-            recorders.append(recorder)
-        for graph, described in manifest.graphs.items():
-            if graph not in sessions:
-                sessions[graph] = engine_class()(bundle.file(described.file), 1)
-        policy = Policy(bundle, Program(manifest.program, sessions, seed=0), DEFAULT_ENGINE)
-        for place, observation in enumerate(observations):
-            number = numbers[place] if numbers else place
-            if place % 8 == 0:
-                context.tell(f"calibrating on sample {number}", place / len(numbers) if numbers else None)
-            for recorder in recorders:
-                recorder.sample = number
-            try:
-                policy.infer(observation)
-            except (GraphError, DataError) as error:
-                if str(error).startswith("Calibration sample"):
-                    raise
-                raise DataError(f"Calibration sample {number}: {error.message}", error.fix) from error
-    for graph, statistics in found.items():
-        idle = [name for name, each in statistics.items() if not each.samples]
+        files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in statistics}
+        watchers = {graph: _Calibrating(graph, file, Path(scratch), statistics[graph]) for graph, file in files.items()}
+        run_watched(bundle, watchers, observations, context, "calibrating on", numbers)
+    for graph, collected in statistics.items():
+        idle = [name for name, of_value in collected.items() if not of_value.samples]
         if idle:
             raise GraphError(
                 f"The graph '{graph}' was never run on calibration data, so '{idle[0]}' has no range.",
                 "leave that graph out with --graphs, or fix the program",
             )
-    return found
-
-
-def _with_outputs(path: Path, names: list[str], scratch: Path, graph: str) -> tuple[Path, list[str]]:
-    """Write the graph once more with those values as outputs; return it and the outputs that it had.
-
-    Large weights stay where they are.
-    """
-    onnx = require("onnx", "build")
-    model = onnx.load(str(path), load_external_data=False)
-    outputs = [value.name for value in model.graph.output]
-    have = {*outputs, *(value.name for value in model.graph.input)}
-    for name in names:
-        if name not in have:
-            model.graph.output.append(onnx.ValueInfoProto(name=name))
-    return write_beside(model, path, scratch / f"{graph}.onnx"), outputs
+    return statistics

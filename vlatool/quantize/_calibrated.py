@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from vlatool.quantize._gptq import Rounded, awq, gptq, nearest_codes
 from vlatool.quantize._journal import DATA
 from vlatool.quantize._layerwise import Layerwise, Values
 from vlatool.quantize._records import Record, Tools, padded
-from vlatool.quantize._rewrite import Layer, Task
+from vlatool.quantize._rewrite import Product, Task
 from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan
 from vlatool.runtime.observation import ObservationEncoder
@@ -37,14 +37,16 @@ def calibrated_records(
     plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, seen: SampleSet
 ) -> list[Record]:
     """Return all records; those of quantized weights drive the policy from layer to layer and must run in order."""
-    observations = [dict(each) for each in seen.watch(recorded_observations(bundle, stage.samples, stage.calibration))]
+    observations = [
+        dict(observation) for observation in seen.watch(recorded_observations(bundle, stage.samples, stage.calibration))
+    ]
     walk = _Walk(plan, bundle, stage, place, observations)
     records: list[Record] = []
     for number, task in enumerate(plan.tasks):
         if task.kind == "copy":
             records += records_of(task, stage.form, stage.choose, 0.0)
             continue
-        records.append(Record(task.label, padded(task.size), _Filler(walk, number), task.source.count, False))
+        records.append(Record(task.label, padded(task.size), partial(walk.fill, number), task.source.count, False))
     return records
 
 
@@ -58,7 +60,7 @@ class _Walk:
         self._observations = observations
         self._offsets = plan.offsets()
         self._wanted = -1
-        self._shared = {id(layer): number for graph in plan.graphs.values() for layer, number in graph.layers}
+        self._shared = {id(layer): number for graph in plan.graphs.values() for layer, number in graph.products}
         owners: dict[int, int] = {}
         for layer, number in self._shared.items():
             owners.setdefault(number, layer)
@@ -93,14 +95,14 @@ class _Walk:
             for values in samples:
                 _begin(step, values, random)
             graph = self._plan.graphs[step.graph]
-            layers = [layer for layer, _ in graph.layers]
+            layers = [layer for layer, _ in graph.products]
             local = [{name: values[value] for name, value in step.feeds.items()} for values in samples]
             yield from Layerwise(graph.skeleton, layers, self._product).run(local, tools)
-            for values, given in zip(samples, local, strict=True):
-                values.update({value: given[name] for name, value in step.gives.items()})
+            for values, outputs in zip(samples, local, strict=True):
+                values.update({value: outputs[name] for name, value in step.gives.items()})
                 values.update({target: values[source] for source, target in step.carry.items()})
 
-    def _product(self, layer: Layer, rows: Array, tools: Tools) -> Array:
+    def _product(self, layer: Product, rows: Array, tools: Tools) -> Array:
         number = self._numbers.get(id(layer))
         if number is None:  # a weight that was quantized for another layer: the float one serves
             return rows @ whole_weight(self._plan.tasks[self._shared[id(layer)]], tools).T
@@ -113,10 +115,10 @@ class _Walk:
                 f"The calibration samples make what the layer '{layer.node.name}' reads not finite.",
                 "look at the samples and at the float32 policy: vlatool explain names where it begins",
             )
-        made = self._round(weight, rows)
-        self._store(task, made, self._target)
-        self._note = _note(task, weight, made, rows, SLACK * self._stage.form.largest_error)
-        return rows @ made.meant.T
+        rounded = self._round(weight, rows)
+        self._store(task, rounded, self._target)
+        self._note = _note(task, weight, rounded, rows, SLACK * self._stage.form.largest_error)
+        return rows @ rounded.meant.T
 
     def _round(self, weight: Array, rows: Array) -> Rounded:
         """Round by the method; to nearest where its activations make it lose more than the weights can spare."""
@@ -124,18 +126,18 @@ class _Walk:
         method = gptq if self._stage.method == "gptq" else awq
         form, choose = self._stage.form, METHODS[self._stage.choose]
         with contextlib.suppress(torch.linalg.LinAlgError):
-            made = method(weight, rows, form, choose)
-            if np.linalg.norm(made.meant - weight) <= SLACK * form.largest_error * np.linalg.norm(weight):
-                return made
+            rounded = method(weight, rows, form, choose)
+            if np.linalg.norm(rounded.meant - weight) <= SLACK * form.largest_error * np.linalg.norm(weight):
+                return rounded
         nearest = nearest_codes(weight, form, choose)
         return nearest if method is gptq else nearest._replace(inputs=np.ones(weight.shape[1], np.float32))
 
-    def _store(self, task: Task, made: Rounded, data: Array) -> None:
+    def _store(self, task: Task, rounded: Rounded, data: Array) -> None:
         if task.kind == "blocks":
-            piece(task, 0, data)[:] = made.codes.reshape(-1)
-        store(task, self._stage.form, made.codes, made.scale, made.zero, data)
-        if made.inputs is not None:
-            piece(task, len(task.pieces) - 1, data)[:] = made.inputs.view(np.uint8)
+            piece(task, 0, data)[:] = rounded.codes.reshape(-1)
+        store(task, self._stage.form, rounded.codes, rounded.scale, rounded.zero, data)
+        if rounded.inputs is not None:
+            piece(task, len(task.pieces) - 1, data)[:] = rounded.inputs.view(np.uint8)
 
     def _finished(self, task: Task, number: int) -> Array:
         """Return what an earlier run stored for a layer, as (columns, rows) float32."""
@@ -147,8 +149,8 @@ class _Walk:
 
 def _begin(step: ProgramStep, values: Values, random: np.random.Generator) -> None:
     """Bring noise, the first entries of schedules and zeros for kept values into being."""
-    for name, wanted in step.noise.items():
-        values[name] = draw(wanted, random)
+    for name, noise in step.noise.items():
+        values[name] = draw(noise, random)
     for name, numbers in step.schedule.items():
         whole = all(isinstance(number, int) for number in numbers)
         values[name] = np.array([numbers[0]], np.int64 if whole else np.float32)
@@ -156,27 +158,11 @@ def _begin(step: ProgramStep, values: Values, random: np.random.Generator) -> No
         values[name] = np.zeros(kept["shape"], kept.get("dtype", "float32"))
 
 
-def _note(task: Task, weight: Array, made: Rounded, rows: Array, tolerance: float) -> dict[str, Any]:
+def _note(task: Task, weight: Array, rounded: Rounded, rows: Array, tolerance: float) -> dict[str, Any]:
     """Return the figures of a layer: what its weights and its products on the calibration samples lose."""
-    difference = made.meant - weight
+    difference = rounded.meant - weight
     lost, norm = float(np.vdot(difference, difference)), float(np.vdot(weight, weight))
-    wanted = rows @ weight.T
-    of_product = np.linalg.norm(rows @ difference.T) / (np.linalg.norm(wanted) or 1.0)
+    products = rows @ weight.T
+    of_product = np.linalg.norm(rows @ difference.T) / (np.linalg.norm(products) or 1.0)
     note = figures(task, lost, norm, tolerance)
     return {**note, "product_error": float(of_product), "sha256": ""}
-
-
-@dataclass(frozen=True)
-class _Filler:
-    """Computes the record of one task; only here, and only after those before it."""
-
-    walk: _Walk
-    number: int
-
-    def __call__(self, tools: Tools, data: Array) -> dict[str, Any]:
-        """Fill the record."""
-        return self.walk.fill(self.number, tools, data)
-
-    def to_json(self) -> str:
-        """Never called: such a record is not portable."""
-        raise NotImplementedError(self.number)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import calibration_recording, doubts
+from vlatool.data import calibration_checks, calibration_recording
 from vlatool.errors import DataError
 from vlatool.quantize._base import Quantization
-from vlatool.quantize._calibrate import Wanted, calibrate
+from vlatool.quantize._calibrate import Values, calibrate
 from vlatool.quantize._ranges import Statistics
 from vlatool.stage.base import Context, SampleSet
 
@@ -55,16 +55,16 @@ class Calibrated(Quantization):
             raise self._missing(bundle)
         numbers = recording.spread(self.samples)
         asked = self.samples if self.samples != type(self).model_fields["samples"].default else 0
-        for doubt in doubts(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
+        for doubt in calibration_checks(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
             warnings.warn(doubt, stacklevel=3)
         return numbers, seen.watch(recording.observation(number) for number in numbers)
 
     def statistics(
-        self, bundle: Bundle, wanted: Wanted, seen: SampleSet, context: Context
+        self, bundle: Bundle, values: Values, seen: SampleSet, context: Context
     ) -> dict[str, dict[str, Statistics]]:
         """Run the calibration samples; return graph -> value -> statistics. See ``calibrate`` for the errors."""
         numbers, observations = self.observed(bundle, seen)
-        return calibrate(bundle, wanted, observations, context, numbers=numbers)
+        return calibrate(bundle, values, observations, context, numbers=numbers)
 
     def _missing(self, bundle: Bundle) -> DataError:
         fix = f"pass --calibration FILE.npz{self.without}"

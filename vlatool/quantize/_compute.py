@@ -70,13 +70,11 @@ class Job:
     @classmethod
     def from_json(cls, line: str) -> Job:
         """Build a job from its line."""
-        told = json.loads(line)
-        task, source = told["task"], told["task"]["source"]
-        stored = StoredTensor(**{**source, "file": Path(source["file"]), "shape": tuple(source["shape"])})
-        pieces = tuple(Piece(**{**each, "shape": tuple(each["shape"])}) for each in task["pieces"])
-        return cls(
-            **{**told, "task": Task(**{**task, "source": stored, "pieces": pieces}), "form": Format(**told["form"])}
-        )
+        fields = json.loads(line)
+        task, form = fields.pop("task"), Format(**fields.pop("form"))
+        source = task["source"] | {"file": Path(task["source"]["file"]), "shape": tuple(task["source"]["shape"])}
+        pieces = tuple(Piece(**{**entry, "shape": tuple(entry["shape"])}) for entry in task["pieces"])
+        return cls(Task(**{**task, "source": StoredTensor(**source), "pieces": pieces}), form, **fields)
 
 
 def records_of(task: Task, form: Format, choose: str, tolerance: float) -> list[Record]:
@@ -86,12 +84,12 @@ def records_of(task: Task, form: Format, choose: str, tolerance: float) -> list[
         job = Job(task, form, choose, tolerance)
         return [Record(task.label, padded(task.size), job, source.count, source.array is None)]
     width = OUT_BYTES.get(task.dtype) or source.item_bytes
-    step, found = PART_BYTES // width, []
+    step, records = PART_BYTES // width, []
     for first in range(0, max(source.count, 1), step):
         count = min(step, source.count - first)
         job = Job(task, form, choose, tolerance, first, count)
-        found.append(Record(task.label, padded(count * width), job, count, source.array is None, "copied"))
-    return found
+        records.append(Record(task.label, padded(count * width), job, count, source.array is None, "copied"))
+    return records
 
 
 def quantize_tensor(
@@ -102,26 +100,20 @@ def quantize_tensor(
     Raises:
         GraphError: when a weight is not finite, or the error is beyond what the bits allow.
     """
-    count = -(-task.rows // form.block)
-    codes = np.empty((task.columns, count, form.bytes), np.uint8) if task.kind == "qdq" else None
-    stored = piece(task, 0, data).reshape(task.columns, count, form.bytes) if codes is None else codes
-    scale = tools.scratch("scale", (task.columns, count))
-    zero = tools.scratch("zero", (task.columns, count), np.uint8)
+    shape = (task.columns, -(-task.rows // form.block))
+    stored = piece(task, 0, data) if task.kind == "blocks" else np.empty((*shape, form.bytes), np.uint8)
+    stored = stored.reshape(-1, form.bytes)
+    scale, zero = tools.scratch("scale", shape), tools.scratch("zero", shape, np.uint8)
     digest = hashlib.sha256()
     lost = norm = 0.0
-    for planes, place in _planes(task, form, tools, digest):
-        target = stored.reshape(-1, form.bytes)[place] if isinstance(place, slice) else stored[place]
-        made = quantize_planes(planes, form, choose, tools.scratch, target)
-        check_finite(made.squared_norm, task.source)
-        if isinstance(place, slice):
-            scale.reshape(-1)[place], zero.reshape(-1)[place] = made.scale, made.zero
-        else:
-            scale[place], zero[place] = made.scale, made.zero
-        lost += made.squared_error
-        norm += made.squared_norm
+    for planes, blocks in _planes(task, form, tools, digest):
+        quantized = quantize_planes(planes, form, choose, tools.scratch, stored[blocks])
+        check_finite(quantized.squared_norm, task.source)
+        scale.reshape(-1)[blocks], zero.reshape(-1)[blocks] = quantized.scale, quantized.zero
+        lost += quantized.squared_error
+        norm += quantized.squared_norm
     store(task, form, stored, scale, zero, data)
-    note = figures(task, lost, norm, tolerance)
-    return {**note, "sha256": digest.hexdigest()}
+    return {**figures(task, lost, norm, tolerance), "sha256": digest.hexdigest()}
 
 
 def figures(task: Task, lost: float, norm: float, tolerance: float) -> dict[str, Any]:
@@ -181,50 +173,47 @@ def _linear(codes: Array, form: Format) -> Array:
     return packed
 
 
-def _planes(task: Task, form: Format, tools: Tools, digest: Any) -> Iterator[tuple[Array, Any]]:
-    """Yield planes of a weight and their place: a slice of all blocks, or (slice of columns, block)."""
+def _planes(task: Task, form: Format, tools: Tools, digest: Any) -> Iterator[tuple[Array, slice]]:
+    """Yield planes of a weight, and which blocks they are when all are counted column by column."""
     source = task.source
     if not task.output_first:
         yield from _planes_of_columns(task, form, tools, digest)
         return
     whole = task.rows % form.block == 0
-    unit = form.block * source.item_bytes if whole else task.rows * source.item_bytes
-    blocks = 1 if whole else -(-task.rows // form.block)
-    step = max(1, READ_BYTES // unit) * unit
-    done = 0
-    for begin in range(0, source.nbytes, step):
-        raw = tools.read.read(source, begin, min(step, source.nbytes - begin))
-        digest.update(raw)
+    row = (form.block if whole else task.rows) * source.item_bytes
+    size, done = COMPUTED * source.item_bytes, 0
+    for raw in _parts(source, row, tools, digest):
         if not whole:
-            raw = _with_padding(raw, unit, blocks * form.block * source.item_bytes)
-        size = COMPUTED * source.item_bytes
+            raw = np.pad(raw.reshape(-1, row), ((0, 0), (0, -task.rows % form.block * source.item_bytes))).reshape(-1)
         for part in range(0, len(raw), size):
             planes = planes_of(raw[part : part + size], source.dtype, form.block, tools.scratch)
             yield planes, slice(done, done + planes.shape[1])
             done += planes.shape[1]
 
 
-def _with_padding(raw: Array, unit: int, wanted: int) -> Array:
-    rows = raw.reshape(-1, unit)
-    wide = np.zeros((len(rows), wanted), np.uint8)
-    wide[:, :unit] = rows
-    return wide.reshape(-1)
-
-
-def _planes_of_columns(task: Task, form: Format, tools: Tools, digest: Any) -> Iterator[tuple[Array, Any]]:
-    source = task.source
-    width = task.columns * source.item_bytes
-    step = COMPUTED // form.block
-    for block in range(-(-task.rows // form.block)):
-        count = min(form.block, task.rows - block * form.block)
-        raw = tools.read.read(source, block * form.block * width, count * width)
+def _parts(source: StoredTensor, unit: int, tools: Tools, digest: Any) -> Iterator[Array]:
+    """Yield the bytes of a tensor, a few megabytes of whole units at a time, and hash them."""
+    step = max(1, READ_BYTES // unit) * unit
+    for begin in range(0, source.nbytes, step):
+        raw = tools.read.read(source, begin, min(step, source.nbytes - begin))
         digest.update(raw)
-        rows = as_float32(raw, source.dtype).reshape(count, task.columns)
-        if count < form.block:
-            rows = np.pad(rows, ((0, form.block - count), (0, 0)))
+        yield raw
+
+
+def _planes_of_columns(task: Task, form: Format, tools: Tools, digest: Any) -> Iterator[tuple[Array, slice]]:
+    source, count = task.source, -(-task.rows // form.block)
+    step, width = COMPUTED // form.block, task.columns * source.item_bytes
+    for block in range(count):
+        height = min(form.block, task.rows - block * form.block)
+        raw = tools.read.read(source, block * form.block * width, height * width)
+        digest.update(raw)
+        rows = as_float32(raw, source.dtype).reshape(height, task.columns)
+        if height < form.block:
+            rows = np.pad(rows, ((0, form.block - height), (0, 0)))
         for begin in range(0, task.columns, step):
             end = min(begin + step, task.columns)
-            yield planes_of_rows(rows[:, begin:end], tools.scratch), (slice(begin, end), block)
+            places = slice(begin * count + block, end * count, count)
+            yield planes_of_rows(rows[:, begin:end], tools.scratch), places
 
 
 def as_float32(raw: Array, dtype: str) -> Array:
@@ -280,7 +269,7 @@ def stored_meaning(task: Task, data: Array, form: Format) -> Array:
         scales = scale.reshape(count, task.columns).T
         if not form.symmetric:
             zero = _unlinear(piece(task, 2, data), zero.size, form).reshape(count, task.columns).T
-        spread = [np.repeat(each, form.block, axis=1)[:, : task.rows] for each in (scales, zero.astype(np.float32))]
+        spread = [np.repeat(part, form.block, axis=1)[:, : task.rows] for part in (scales, zero.astype(np.float32))]
         meant: Array = (flat.astype(np.float32) - spread[1]) * spread[0]
     else:
         if not form.symmetric:

@@ -9,12 +9,12 @@ stay until something mixes rows (attention); what they hold is never read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from vlatool.graph.nodes import read_names, reads
+from vlatool.graph.onnx_graph import FLOAT
 from vlatool.quantize._conv1x1_forms import Forms, Names
 
 FEWEST = 32
@@ -26,7 +26,6 @@ BY_ROW = FUSED | {"Add", "Sub", "Div", "Pow", "Sqrt", "Reciprocal", "Neg", "Erf"
 SMALL = 1e-30
 """A bias that changes no sum. With a bias OpenVINO scales an int8 convolution's sums within it; without one (zeros are
 removed) it does so after copying them as float32."""
-FLOAT = 1  # onnx.TensorProto.FLOAT
 
 
 def use_convolutions(model: Any) -> int:
@@ -41,14 +40,16 @@ def use_convolutions(model: Any) -> int:
     return _Rewriter(model).rewrite()
 
 
-@dataclass
 class _Rewriter(Forms):
-    merged: set[str] = field(default_factory=set)
-    count: int = 0
+    def __init__(self, model: Any) -> None:
+        super().__init__(model)
+        self.merged: set[str] = set()
+        self.count = 0
 
     def rewrite(self) -> int:
         """Rebuild the list of nodes."""
-        for node in list(self.graph.node):
+        stored = set(self.constants)
+        for node in self.graph.node:
             if node.output[0] in self.merged:
                 continue
             if not (self._product(node) or self._in_pixels(node) or self._in_padded(node)):
@@ -57,22 +58,22 @@ class _Rewriter(Forms):
                 self.nodes.append(node)
         for value in self.graph.output:
             self.rows(value.name)
-        if self.count:
-            read = read_names(self.nodes) | self.outputs
-            self.nodes = [node for node in self.nodes if node.op_type != "DequantizeLinear" or node.output[0] in read]
-            used = read_names(self.nodes) | self.outputs
-            kept = [tensor for tensor in self.constants.values() if tensor.name in used]
-            inputs = [value for value in self.graph.input if value.name not in self.constants or value.name in used]
-            del self.graph.node[:], self.graph.initializer[:], self.graph.value_info[:], self.graph.input[:]
-            self.graph.input.extend(inputs)
-            self.graph.node.extend(self.nodes)
-            self.graph.initializer.extend(kept)
+        if not self.count:
+            del self.graph.initializer[len(stored) :]
+            return 0
+        read = read_names(self.nodes) | self.outputs
+        self.replace_nodes(node for node in self.nodes if node.op_type != "DequantizeLinear" or node.output[0] in read)
+        self.drop_unread_constants()
+        used = {tensor.name for tensor in self.graph.initializer}
+        inputs = [value for value in self.graph.input if value.name not in stored or value.name in used]
+        del self.graph.value_info[:], self.graph.input[:]
+        self.graph.input.extend(inputs)
         return self.count
 
     # ---- what is rewritten
 
     def _product(self, node: Any) -> bool:
-        options = self.options(node)
+        options = self.attributes(node)
         if node.op_type not in ("MatMul", "Gemm") or self.height(node.input[0]) < FEWEST:
             return False
         if options.get("transA", 0) or options.get("alpha", 1.0) != 1.0 or options.get("beta", 1.0) != 1.0:
@@ -87,16 +88,16 @@ class _Rewriter(Forms):
         if not bias:
             value, bias = self._with_bias(value, channels)
         if not bias and node.input[1] not in self.constants:
-            bias = self.constant(f"{value}/bias", np.full(channels, SMALL, np.float32))
+            bias = self.add(f"{value}/bias", np.full(channels, SMALL, np.float32))
         image = f"{value}/pixels"
-        self.add("Conv", [self.pixels(node.input[0]), weight, *([bias] if bias else [])], image, node.name)
+        self.append("Conv", [self.pixels(node.input[0]), weight, *([bias] if bias else [])], image, node.name)
         self.forms[value] = Names("pixels", pixels=image)
         self.count += 1
         return True
 
     def _with_bias(self, value: str, channels: int) -> tuple[str, str]:
         """Return what a product gives with the bias that is added next, and that bias; empty when there is none."""
-        readers = self.readers.get(value, [])
+        readers = self.readers[value]
         if len(readers) == 1 and readers[0].op_type == "Add" and value not in self.outputs:
             others = [name for name in readers[0].input if name != value]
             if len(others) == 1 and self._is_vector(others[0], channels):
@@ -105,41 +106,32 @@ class _Rewriter(Forms):
         return value, ""
 
     def _is_vector(self, name: str, channels: int) -> bool:
-        tensor = self.constants.get(name)
-        return tensor is not None and list(tensor.dims) == [channels] and tensor.data_type == FLOAT
+        return self.is_weight(name) and list(self.constants[name].dims) == [channels]
 
     def _weight(self, name: str, *, output_first: bool) -> str:
-        """Return a weight (N, K, 1, 1) made of one (K, N), or (N, K); empty when the value is no weight."""
-        made = f"{name}/{'nk' if output_first else 'kn'}"
-        tensor = self.constants.get(name)
-        if tensor is not None:
-            fits = len(tensor.dims) == 2 and tensor.data_type == FLOAT
-            return self._image_of(name, made, output_first) if fits else ""
+        """Return a weight (N, K, 1, 1) made of one (K, N), or (N, K); empty when the value is not a weight."""
+        image = f"{name}/{'nk' if output_first else 'kn'}"
+        if name in self.constants:
+            return self._image_of(name, image, output_first) if self.is_weight(name, rank=2) else ""
         node = self.producers.get(name)
-        if node is None or node.op_type != "DequantizeLinear" or any(each not in self.constants for each in node.input):
+        if node is None or node.op_type != "DequantizeLinear" or any(part not in self.constants for part in node.input):
             return ""
         stored, scale = self.constants[node.input[0]], self.constants[node.input[1]]
-        axis = self.options(node).get("axis", 1) % 2
+        axis = self.attributes(node).get("axis", 1) % 2
         by_channel = len(scale.dims) == 1 and axis == (0 if output_first else 1)
         if len(stored.dims) != 2 or scale.data_type != FLOAT or not (by_channel or not scale.dims):
             return ""
-        if made not in self.shapes:
-            image = self._image_of(node.input[0], f"{made}/stored", output_first)
-            self.add(
-                "DequantizeLinear",
-                [image, *node.input[1:]],
-                made,
-                f"{node.name}/image",
-                **({"axis": 0} if by_channel else {}),
-            )
-            self.shapes[made] = ()
-        return made
+        if image not in self.shapes:
+            inputs = [self._image_of(node.input[0], f"{image}/stored", output_first), *node.input[1:]]
+            self.append("DequantizeLinear", inputs, image, f"{node.name}/image", **({"axis": 0} if by_channel else {}))
+            self.shapes[image] = ()
+        return image
 
-    def _image_of(self, name: str, made: str, output_first: bool) -> str:
-        if made in self.constants:
-            return made
+    def _image_of(self, name: str, image: str, output_first: bool) -> str:
+        if image in self.constants:
+            return image
         values = self.array(name)
-        return self.constant(made, (values if output_first else values.T)[:, :, None, None])
+        return self.add(image, (values if output_first else values.T)[:, :, None, None])
 
     def _in_pixels(self, node: Any) -> bool:
         """Write an elementwise operator after a convolution as one of pixels."""
@@ -169,31 +161,31 @@ class _Rewriter(Forms):
         leading = {self.shapes[name][:-1] for name in (*moving, value)}
         if len(leading) != 1 or not self._by_row(node, [name for name in inputs if name not in moving]):
             return False
-        made = self.padded_name(value)
-        copy = self.copy(node, [self.padded(name) if name in moving else name for name in node.input], made)
+        padded = self.padded_name(value)
+        copy = self.copy(node, [self.padded(name) if name in moving else name for name in node.input], padded)
         self._last_axis(copy)
-        self.forms[value] = Names("padded", rows=value if made == value else "", padded=made)
+        self.forms[value] = Names("padded", rows=value if padded == value else "", padded=padded)
         return True
 
     def _mixed_next(self, node: Any) -> bool:
         """Say whether a quantization serves what mixes rows: then they are dropped before it, so that it stays near."""
         if node.op_type not in ("QuantizeLinear", "DequantizeLinear"):
             return False
-        found = self.readers.get(node.output[0], [])
+        readers = self.readers[node.output[0]]
         if node.op_type == "QuantizeLinear":
-            found = [reader for each in found for reader in self.readers.get(each.output[0], [])]
-        return not any(reader.op_type in ("MatMul", "Gemm", *BY_ROW) for reader in found)
+            readers = [reader for dequantize in readers for reader in self.readers[dequantize.output[0]]]
+        return not any(reader.op_type in ("MatMul", "Gemm", *BY_ROW) for reader in readers)
 
     def _by_row(self, node: Any, others: list[str]) -> bool:
         """Say whether an operator computes each row by itself; ``others`` are inputs that are the same for all rows."""
         last = (-1, len(self.shapes.get(node.input[0], ())) - 1)
         if node.op_type == "LayerNormalization":
-            return self.options(node).get("axis", -1) in last and all(name in self.constants for name in others)
+            return self.attributes(node).get("axis", -1) in last and all(name in self.constants for name in others)
         if node.op_type == "ReduceMean":
-            axes = self.options(node).get("axes", [])
+            axes = self.attributes(node).get("axes", [])
             if len(node.input) > 1 and node.input[1] in self.constants:
                 axes = self.array(node.input[1]).tolist()
-            return len(axes) == 1 and axes[0] in last and self.options(node).get("keepdims", 1) == 1
+            return len(axes) == 1 and axes[0] in last and self.attributes(node).get("keepdims", 1) == 1
         if node.op_type not in BY_ROW:
             return False
         shapes = [self.shapes.get(name, (0, 0)) for name in others]

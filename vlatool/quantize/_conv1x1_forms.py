@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vlatool.errors import require
-from vlatool.graph.nodes import reads
-from vlatool.graph.types import static_shapes
+from vlatool.graph.onnx_graph import OnnxGraph
 
 TILE = 16
 """Rows that a matrix unit takes at a time; halves are nearly as good."""
-WORTH = 1.05
-"""Full tiles are worth this much more rows: of 113, 120 beat 128; of 50, 56 beat 64; of 197, 208 beat 200."""
+FULL_TILES = 1.05
+"""Full tiles may take this many times the rows: of 113, 120 beat 128; of 50, 56 beat 64; of 197, 208 beat 200."""
 
 
 @dataclass
@@ -38,34 +36,20 @@ class Names:
 def padded_rows(rows: int) -> int:
     """Return the number of rows that a product of so many is computed with."""
     half, whole = (-(-rows // tile) * tile for tile in (TILE // 2, TILE))
-    return whole if whole <= WORTH * half else half
+    return whole if whole <= FULL_TILES * half else half
 
 
-@dataclass
-class Forms:
+class Forms(OnnxGraph):
     """A graph that is rebuilt node by node, and the forms of its values that were needed so far.
 
     Args:
         model: An ``onnx.ModelProto``.
-        forms: Value -> its names.
-        nodes: Of the new graph.
     """
 
-    model: Any
-    forms: dict[str, Names] = field(default_factory=dict)
-    nodes: list[Any] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.onnx = require("onnx", "build")
-        self.graph = self.model.graph
-        self.constants = {tensor.name: tensor for tensor in self.graph.initializer}
-        self.shapes = static_shapes(self.model)
-        self.producers = {name: node for node in self.graph.node for name in node.output}
-        self.outputs = {value.name for value in self.graph.output}
-        self.readers: dict[str, list[Any]] = {}
-        for node in self.graph.node:
-            for name in reads(node):
-                self.readers.setdefault(name, []).append(node)
+    def __init__(self, model: Any) -> None:
+        super().__init__(model)
+        self.forms: dict[str, Names] = {}
+        self.nodes: list[Any] = []
 
     def height(self, name: str) -> int:
         """Return M of a value (..., C) of fixed shape, its leading axes multiplied; 0 for others."""
@@ -98,10 +82,10 @@ class Forms:
         if self._more(name):
             bounds = [self.numbers([number]) for number in (0, self.height(name), 1)]
             cut = name if flat else f"{name}/rows"
-            self.add("Slice", [value, *bounds], cut, f"{name}/rows")
+            self.append("Slice", [value, *bounds], cut, f"{name}/rows")
             value = cut
         if not flat:
-            self.add("Reshape", [value, self.numbers(list(shape))], name, f"{name}/shape")
+            self.append("Reshape", [value, self.numbers(list(shape))], name, f"{name}/shape")
 
     def padded(self, name: str) -> str:
         """Return the name of a value with rows added, (1, M', C); made at its first use."""
@@ -112,15 +96,15 @@ class Forms:
         height, more, channels = self.height(name), self._more(name), self.shapes[name][-1]
         if forms.native == "pixels":
             flat = f"{name}/flat"
-            self.add("Reshape", [forms.pixels, self.numbers([1, channels, height + more])], flat, flat)
-            self.add("Transpose", [flat], forms.padded, forms.padded, perm=[0, 2, 1])
+            self.append("Reshape", [forms.pixels, self.numbers([1, channels, height + more])], flat, flat)
+            self.append("Transpose", [flat], forms.padded, forms.padded, perm=[0, 2, 1])
             return forms.padded
         value = name
         if self.shapes[name][:-1] != (1, height):
             value = f"{name}/merged" if more else forms.padded
-            self.add("Reshape", [name, self.numbers([1, height, channels])], value, value)
+            self.append("Reshape", [name, self.numbers([1, height, channels])], value, value)
         if more:
-            self.add("Pad", [value, self.numbers([0, 0, 0, 0, more, 0])], forms.padded, forms.padded)
+            self.append("Pad", [value, self.numbers([0, 0, 0, 0, more, 0])], forms.padded, forms.padded)
         return forms.padded
 
     def pixels(self, name: str) -> str:
@@ -129,47 +113,30 @@ class Forms:
         if not forms.pixels:
             turned, forms.pixels = f"{name}/turned", f"{name}/pixels"
             shape = [1, self.shapes[name][-1], 1, self.height(name) + self._more(name)]
-            self.add("Transpose", [self.padded(name)], turned, turned, perm=[0, 2, 1])
-            self.add("Reshape", [turned, self.numbers(shape)], forms.pixels, forms.pixels)
+            self.append("Transpose", [self.padded(name)], turned, turned, perm=[0, 2, 1])
+            self.append("Reshape", [turned, self.numbers(shape)], forms.pixels, forms.pixels)
         return forms.pixels
 
     # ---- writing
 
-    def options(self, node: Any) -> dict[str, Any]:
-        """Return the attributes of a node."""
-        return {item.name: self.onnx.helper.get_attribute_value(item) for item in node.attribute}
-
-    def array(self, name: str) -> Any:
-        """Return the value of a constant."""
-        return self.onnx.numpy_helper.to_array(self.constants[name])
-
-    def constant(self, name: str, values: Any) -> str:
-        """Add a constant; return its name."""
-        self.constants[name] = self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name)
-        return name
-
     def number(self, name: str) -> str:
-        """Return a constant of one element without axes, which could meet those of an image."""
+        """Return a constant of one element with one axis, since its own could meet those of an image."""
         if not name or not self.constants[name].dims:
             return name
-        made = f"{name}/number"
-        return made if made in self.constants else self.constant(made, self.array(name).reshape(()))
+        return self.add(f"{name}/number", self.array(name).reshape(1))
 
     def numbers(self, values: list[int]) -> str:
         """Return the name of a constant of whole numbers, shared by all that need it."""
-        name = "pixels/" + "_".join(map(str, values))
-        return name if name in self.constants else self.constant(name, np.array(values, np.int64))
+        return self.add("pixels/" + "_".join(map(str, values)), values, np.int64)
 
-    def add(self, kind: str, inputs: list[str], output: str, name: str, **options: Any) -> None:
+    def append(self, kind: str, inputs: list[str], output: str, name: str, **options: Any) -> None:
         """Add a node."""
-        self.nodes.append(self.onnx.helper.make_node(kind, inputs, [output], name=name, **options))
+        self.nodes.append(self.node(kind, inputs, [output], name, **options))
 
     def copy(self, node: Any, inputs: list[str], output: str) -> Any:
         """Add a node like another one, with other inputs and another output; return it."""
         copy = type(node)()
         copy.CopyFrom(node)
-        del copy.input[:], copy.output[:]
-        copy.input.extend(inputs)
-        copy.output.append(output)
+        copy.input[:], copy.output[:] = inputs, [output]
         self.nodes.append(copy)
         return copy

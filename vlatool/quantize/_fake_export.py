@@ -86,14 +86,14 @@ def _locate(
         SourceError: naming the first tensor that is missing or has another shape or dtype.
     """
     state = module.state_dict(keep_vars=True)
-    found: dict[str, StoredTensor] = {}
+    places: dict[str, StoredTensor] = {}
     stored_as: dict[int, StoredTensor] = {}
     for name, value in state.items():
         tensor = (shards.get(f"{graph}.{name}") if several else None) or shards.get(name)
         if tensor is not None:
-            found[name] = stored_as[id(value)] = tensor
+            places[name] = stored_as[id(value)] = tensor
     for name, value in state.items():
-        tensor = found[name] = found.get(name) or stored_as.get(id(value)) or _missing(graph, name, shards, file)
+        tensor = places[name] = places.get(name) or stored_as.get(id(value)) or _missing(graph, name, shards, file)
         if tuple(value.shape) != tensor.shape:
             raise SourceError(
                 f"'{tensor.name}' in {tensor.file.name} has the shape {list(tensor.shape)}; the module built by the "
@@ -105,7 +105,7 @@ def _locate(
                 f"'{tensor.name}' in {tensor.file.name} is {tensor.dtype}; weights may be F32, F16 or BF16.",
                 "convert the shards (weights that are quantized already cannot be quantized again)",
             )
-    return found
+    return places
 
 
 def _missing(graph: str, name: str, shards: dict[str, StoredTensor], file: Path) -> StoredTensor:

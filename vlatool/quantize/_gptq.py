@@ -43,10 +43,10 @@ def nearest_codes(weight: Array, form: Format, choose: Choose) -> Rounded:
     meant = np.empty((columns, count * form.block), np.float32)
     scratch = Scratch()
     for number in range(count):
-        made = quantize_planes(_planes(weight, number, form), form, choose, scratch, codes[:, number])
-        scale[:, number], zero[:, number] = made.scale, made.zero
+        quantized = quantize_planes(_planes(weight, number, form), form, choose, scratch, codes[:, number])
+        scale[:, number], zero[:, number] = quantized.scale, quantized.zero
         begin = number * form.block
-        meant[:, begin : begin + form.block] = dequantize(codes[:, number], made.scale, made.zero, form)
+        meant[:, begin : begin + form.block] = dequantize(codes[:, number], quantized.scale, quantized.zero, form)
     return Rounded(codes, scale, zero, np.ascontiguousarray(meant[:, :rows]))
 
 
@@ -140,16 +140,16 @@ def awq(weight: Array, activations: Array, form: Format, choose: Choose) -> Roun
     rows = activations[::step][:SEARCH_ROWS]
     best, least = _enlarged(weight, magnitude ** EXPONENTS[0], rows, form, choose)
     for exponent in EXPONENTS[1:]:
-        made, lost = _enlarged(weight, magnitude**exponent, rows, form, choose)
+        rounded, lost = _enlarged(weight, magnitude**exponent, rows, form, choose)
         if lost < least:
-            best, least = made, lost
+            best, least = rounded, lost
     return best
 
 
 def _enlarged(weight: Array, factors: Array, rows: Array, form: Format, choose: Choose) -> tuple[Rounded, float]:
     """Return the weight rounded after its inputs were multiplied by factors, and the norm of what the product loses."""
     factors = (factors / np.sqrt(factors.max() * factors.min())).astype(np.float32)
-    made = nearest_codes(weight * factors, form, choose)
-    meant = made.meant / factors
+    rounded = nearest_codes(weight * factors, form, choose)
+    meant = rounded.meant / factors
     lost = float(np.linalg.norm(rows @ (meant - weight).T))
-    return made._replace(meant=meant, inputs=np.float32(1) / factors), lost
+    return rounded._replace(meant=meant, inputs=np.float32(1) / factors), lost

@@ -86,12 +86,12 @@ def _parsed(line: bytes) -> dict[str, Any] | None:
     return entry if line.endswith(b"\n") and isinstance(entry, dict) and {"sha256", "note"} <= set(entry) else None
 
 
-def _is_whole(reader: Reader, file: Path, offset: int, size: int, digest: Any, wanted: str) -> bool:
+def _is_whole(reader: Reader, file: Path, offset: int, size: int, digest: Any, sha256: str) -> bool:
     try:
         hash_part(reader, file, offset, size, digest)
     except SourceError:  # the file is shorter
         return False
-    return bool(digest.hexdigest() == wanted)
+    return bool(digest.hexdigest() == sha256)
 
 
 def hash_part(reader: Reader, file: Path, offset: int, size: int, digest: Any) -> None:

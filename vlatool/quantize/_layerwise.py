@@ -13,13 +13,14 @@ from vlatool.errors import GraphError
 from vlatool.quantize._compute import as_float32, stored_bytes
 from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import Tools
-from vlatool.quantize._rewrite import Layer, read_as_weight, turns_constant
+from vlatool.quantize._rewrite import Product, read_as_weight, turns_constant
 from vlatool.runtime.engines import node_session
+from vlatool.weights.shards import FLOATS
 
 Array = NDArray[Any]
 Values = dict[str, Array]
-Product = Callable[[Layer, Array, Tools], Array]
-"""Layer, activations (rows, K) of all samples, tools -> products (rows, N)."""
+Multiply = Callable[[Product, Array, Tools], Array]
+"""Product, activations (rows, K) of all samples, tools -> products (rows, N)."""
 
 
 class Layerwise:
@@ -27,14 +28,14 @@ class Layerwise:
 
     Args:
         skeleton: The graph before it is changed.
-        layers: Its products with weights that are quantized; ``product`` computes them.
-        product: Called for each such layer, in the order of the graph.
+        products: Those whose weights are quantized.
+        multiply: Computes each of them, in the order of the graph.
     """
 
-    def __init__(self, skeleton: Skeleton, layers: list[Layer], product: Product) -> None:
+    def __init__(self, skeleton: Skeleton, products: list[Product], multiply: Multiply) -> None:
         self._skeleton = skeleton
-        self._layers = {id(layer.node): layer for layer in layers}
-        self._product = product
+        self._products = {id(product.node): product for product in products}
+        self._compute = multiply
         self._sessions: dict[Any, Any] = {}
 
     def run(self, samples: list[Values], tools: Tools) -> Iterator[None]:
@@ -50,9 +51,9 @@ class Layerwise:
             yield
             if self._is_turned_weight(node):
                 continue
-            layer = self._layers.get(id(node))
-            if layer is not None:
-                self._multiply(layer, samples, tools)
+            product = self._products.get(id(node))
+            if product is not None:
+                self._multiply(product, samples, tools)
             else:
                 self._run_node(node, samples, tools)
             for value in _values(node):
@@ -66,97 +67,74 @@ class Layerwise:
 
     def _run_node(self, node: Any, samples: list[Values], tools: Tools) -> None:
         constants = self._constants(_values(node), samples[0], tools)
-        session, names = self._session(node, {**samples[0], **constants})
+        session, inputs = self._session(node, {**samples[0], **constants})
         used = [output.name for output in node.outputs if output.name]
         for values in samples:
-            feeds = {name: {**values, **constants}[name] for name in names}
+            feeds = {own: {**values, **constants}[name] for own, name in inputs.items()}
             try:
-                given = session.run(None, feeds)
+                outputs = session.run(None, feeds)
             except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
                 raise _refused(node.name, node.op_type, error) from error
-            values.update(zip(used, given, strict=True))
+            values.update(zip(used, outputs, strict=True))
 
     def _is_turned_weight(self, node: Any) -> bool:
         uses = [use for output in node.outputs for use in output.uses()]
-        return turns_constant(node) and bool(uses) and all(read_as_weight(use, self._layers) for use in uses)
+        return turns_constant(node) and bool(uses) and all(read_as_weight(use, self._products) for use in uses)
 
-    def _multiply(self, layer: Layer, samples: list[Values], tools: Tools) -> None:
-        name, out = layer.node.inputs[0].name, layer.node.outputs[0].name
+    def _multiply(self, product: Product, samples: list[Values], tools: Tools) -> None:
+        name, out, bias = product.node.inputs[0].name, product.node.outputs[0].name, product.bias
         activations = [np.ascontiguousarray(values[name], np.float32) for values in samples]
-        rows = np.concatenate([each.reshape(-1, layer.rows) for each in activations])
-        products = self._product(layer, rows, tools)
-        biases = [layer.bias] if layer.bias is not None else []
-        constants = self._constants(biases, samples[0], tools)
-        begin = 0
-        for values, each in zip(samples, activations, strict=True):
-            count = each.size // layer.rows
-            made = products[begin : begin + count].reshape(*each.shape[:-1], layer.columns)
-            for bias in biases:
-                made = made + {**values, **constants}[bias.name]
-            values[out] = made
-            begin += count
+        rows = np.concatenate([array.reshape(-1, product.rows) for array in activations])
+        ends = np.cumsum([array.size // product.rows for array in activations])
+        outputs = np.split(self._compute(product, rows, tools), ends[:-1])
+        constants = self._constants([bias] if bias is not None else [], samples[0], tools)
+        for values, array, output in zip(samples, activations, outputs, strict=True):
+            values[out] = output.reshape(*array.shape[:-1], product.columns)
+            if bias is not None:
+                values[out] = values[out] + {**values, **constants}[bias.name]
 
-    def _constants(self, wanted: Iterable[Any], given: Values, tools: Tools) -> Values:
+    def _constants(self, needed: Iterable[Any], known: Values, tools: Tools) -> Values:
         """Return those of some values that are constants, as the graph wants them."""
-        found = {}
-        for value in wanted:
-            if value.name in given or not value.is_initializer():
+        constants = {}
+        for value in needed:
+            if value.name in known or not value.is_initializer():
                 continue
             tensor = self._skeleton.tensors.get(value.name)
             if tensor is None:
-                found[value.name] = value.const_value.numpy()
+                constants[value.name] = value.const_value.numpy()
                 continue
             raw = stored_bytes(tensor, tools)
-            if tensor.dtype in ("F16", "BF16", "F32"):
-                found[value.name] = as_float32(raw, tensor.dtype).reshape(tensor.shape)
-            else:
-                found[value.name] = raw.view(value.dtype.numpy()).reshape(tensor.shape)
-        return found
+            flat = as_float32(raw, tensor.dtype) if tensor.dtype in FLOATS else raw.view(value.dtype.numpy())
+            constants[value.name] = flat.reshape(tensor.shape)
+        return constants
 
-    def _session(self, node: Any, values: Values) -> tuple[Any, list[str]]:
-        """Return a session of that node alone and the names of what it is fed, in the order of its inputs."""
-        import onnx
+    def _session(self, node: Any, values: Values) -> tuple[Any, dict[str, str]]:
+        """Return a session of a node like that one alone, and its inputs -> what is fed there."""
         import onnx_ir
 
         own = [value.name if value is not None else "" for value in node.inputs]
-        taken = [value.name for value in _values(node)[len([name for name in own if name]) :]]
+        taken = [value.name for value in _values(node)[len(list(filter(None, own))) :]]
         names = own + taken
         kinds = tuple(str(getattr(values[name], "dtype", type(values[name]))) if name else "" for name in names)
         proto = onnx_ir.to_proto(node)
-        attributes = tuple(sorted(each.SerializeToString() for each in proto.attribute))
-        given = tuple(bool(output.name) for output in node.outputs)
-        key = (node.op_type, node.domain, kinds, attributes, given, tuple(_first(names)), tuple(taken))
+        attributes = tuple(sorted(attribute.SerializeToString() for attribute in proto.attribute))
+        outputs = tuple(bool(output.name) for output in node.outputs)
+        firsts = tuple(names.index(name) for name in names)  # a repeated input is not two inputs
+        key = (node.op_type, node.domain, kinds, attributes, outputs, firsts, tuple(taken))
         if key not in self._sessions:
-            self._sessions[key] = _open(onnx, proto, names, values, self._skeleton.model)
-        session, inputs, slots = self._sessions[key]
-        return _Renamed(session, inputs, [names[slot] for slot in slots]), [names[slot] for slot in slots]
+            inputs = {name: values[name].dtype for name in names if name}
+            self._sessions[key] = _open(proto, inputs, self._skeleton.model), list(inputs)
+        session, inputs = self._sessions[key]
+        return session, dict(zip(inputs, dict.fromkeys(filter(None, names)), strict=True))
 
 
-def _first(names: list[str]) -> list[int]:
-    """Number each name by its first place, so that a repeated input is told from two inputs."""
-    return [names.index(name) for name in names]
+def _open(proto: Any, dtypes: dict[str, Any], model: Any) -> Any:
+    import onnx
 
-
-class _Renamed:
-    """A session whose inputs go by another node's names."""
-
-    def __init__(self, session: Any, inputs: list[str], names: list[str]) -> None:
-        self._session, self._names = session, dict(zip(names, inputs, strict=True))
-
-    def run(self, outputs: None, feeds: Values) -> list[Array]:
-        """Run the node."""
-        given: list[Array] = self._session.run(outputs, {self._names[name]: value for name, value in feeds.items()})
-        return given
-
-
-def _open(onnx: Any, proto: Any, names: list[str], values: Values, model: Any) -> tuple[Any, list[str], list[int]]:
-    slots = [number for number, name in enumerate(names) if name and names.index(name) == number]
     try:
-        single = _single(onnx, proto, {names[slot]: values[names[slot]].dtype for slot in slots}, model)
-        session = node_session(single.SerializeToString())
+        return node_session(_single(onnx, proto, dtypes, model).SerializeToString())
     except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
         raise _refused(proto.name, proto.op_type, error) from error
-    return session, [names[slot] for slot in slots], slots
 
 
 def _single(onnx: Any, proto: Any, dtypes: dict[str, Any], model: Any) -> Any:
@@ -187,12 +165,12 @@ def _values(node: Any) -> list[Any]:
 
 def _taken(node: Any) -> dict[str, Any]:
     """Return name -> value that the graphs inside a node take from outside."""
-    found: dict[str, Any] = {}
+    taken: dict[str, Any] = {}
     for attribute in node.attributes.values():
         if attribute.type.name not in ("GRAPH", "GRAPHS"):
             continue
         for graph in [attribute.value] if attribute.type.name == "GRAPH" else attribute.value:
-            inside = {*graph.inputs, *graph.initializers.values(), *(out for each in graph for out in each.outputs)}
-            read = [*graph.outputs, *(value for each in graph for value in _values(each))]
-            found.update({value.name: value for value in read if value not in inside})
-    return found
+            inside = {*graph.inputs, *graph.initializers.values(), *(out for inner in graph for out in inner.outputs)}
+            read = [*graph.outputs, *(value for inner in graph for value in _values(inner))]
+            taken.update({value.name: value for value in read if value not in inside})
+    return taken

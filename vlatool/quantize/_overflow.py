@@ -11,12 +11,8 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, GraphError, require
-from vlatool.graph.files import write_beside
-from vlatool.graph.types import float_values
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
-from vlatool.runtime.policy import Policy
-from vlatool.runtime.program import Program
+from vlatool.graph.onnx_graph import OnnxGraph
+from vlatool.quantize._watched import Watcher, run_watched
 from vlatool.stage.base import Context
 
 PEAKS = "vlatool.peaks"
@@ -36,23 +32,42 @@ class Beyond:
     largest: float
 
 
-class _Watching:
-    """A session of a graph that also gives the largest magnitude of every value; the values themselves are not kept."""
+class _Watching(Watcher):
+    """Notes the values that are too large, from the largest magnitude of every value."""
 
-    def __init__(self, path: Path, outputs: list[str], names: list[str], limit: float) -> None:
-        self.sample = 0
-        self.found: dict[str, Beyond] = {}
-        self._outputs, self._names, self._limit = outputs, names, limit
-        self._session = engine_class()(path, 1)
+    def __init__(self, path: Path, copy: Path, limit: float) -> None:
+        self.beyond: dict[str, Beyond] = {}
+        self._limit = limit
+        self._names: list[str] = []
+        super().__init__(path, copy, self._show)
 
-    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Run, take in the peaks, return the graph's own outputs."""
-        given = self._session.run(feeds)
-        peaks = np.asarray(given[PEAKS])
+    def _show(self, graph: OnnxGraph) -> None:
+        """Add the largest finite magnitude of each float32 value, as one output."""
+        self._names = graph.float_values()
+        peaks = [f"{PEAKS}.{number}" for number in range(len(self._names))]
+        for name, peak in zip(self._names, peaks, strict=True):
+            graph.graph.node.extend(
+                [
+                    graph.node("Abs", [name], [f"{peak}.abs"]),
+                    graph.node("IsInf", [name], [f"{peak}.inf"]),
+                    graph.node("Where", [f"{peak}.inf", ZERO, f"{peak}.abs"], [f"{peak}.finite"]),
+                    graph.node("ReduceMax", [f"{peak}.finite"], [f"{peak}.peak"], keepdims=0),
+                    graph.node("Reshape", [f"{peak}.peak", ONE], [peak]),
+                ]
+            )
+        if not peaks:
+            return
+        graph.graph.node.append(graph.node("Concat", peaks, [PEAKS], axis=0))
+        graph.add(ZERO, 0, np.float32)
+        graph.add(ONE, [1], np.int64)
+        graph.graph.output.append(graph.onnx.ValueInfoProto(name=PEAKS))
+
+    def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+        """Take in the peaks."""
+        peaks = np.asarray(values.get(PEAKS, ()))
         for index in np.flatnonzero(peaks > self._limit):
-            known = self.found.setdefault(self._names[index], Beyond(self.sample, 0.0))
+            known = self.beyond.setdefault(self._names[index], Beyond(self.sample, 0.0))
             known.largest = max(known.largest, float(peaks[index]))
-        return {name: given[name] for name in self._outputs}
 
 
 def find_beyond(
@@ -70,45 +85,8 @@ def find_beyond(
     Raises:
         DataError: when an observation does not fit the spec; names the sample.
     """
-    policy = Policy.open(bundle, engine=DEFAULT_ENGINE, threads=1, seed=0)
-    sessions: dict[str, Any] = dict(policy.program.sessions)
-    watching: dict[str, _Watching] = {}
+    files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in graphs}
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-        for graph in graphs:
-            path, names = _with_peaks(bundle.file(bundle.manifest.graphs[graph].file), Path(scratch), graph)
-            if names:
-                sessions[graph] = watching[graph] = _Watching(path, sessions[graph].outputs, names, limit)
-        policy.program = Program(policy.program.steps, sessions, seed=0)
-        for number, observation in enumerate(observations):
-            if number % 8 == 0:
-                context.tell(f"looking for large values in sample {number}", None)
-            for watcher in watching.values():
-                watcher.sample = number
-            try:
-                policy.infer(observation)
-            except (GraphError, DataError) as error:
-                raise DataError(f"Calibration sample {number}: {error.message}", error.fix) from error
-    return {graph: watcher.found for graph, watcher in watching.items()}
-
-
-def _with_peaks(path: Path, scratch: Path, graph: str) -> tuple[Path, list[str]]:
-    """Write the graph once more with the largest magnitudes of its float32 values as one output, and their names."""
-    onnx = require("onnx", "build")
-    model = onnx.load(str(path), load_external_data=False)
-    names, make = float_values(model), onnx.helper.make_node
-    for number, name in enumerate(names):
-        own = f"{PEAKS}.{number}"
-        model.graph.node.extend(
-            [
-                make("Abs", [name], [f"{own}.abs"]),
-                make("IsInf", [name], [f"{own}.inf"]),
-                make("Where", [f"{own}.inf", ZERO, f"{own}.abs"], [f"{own}.finite"]),
-                make("ReduceMax", [f"{own}.finite"], [f"{own}.peak"], keepdims=0),
-                make("Reshape", [f"{own}.peak", ONE], [own]),
-            ]
-        )
-    model.graph.node.append(make("Concat", [f"{PEAKS}.{number}" for number in range(len(names))], [PEAKS], axis=0))
-    model.graph.initializer.append(onnx.numpy_helper.from_array(np.zeros((), np.float32), ZERO))
-    model.graph.initializer.append(onnx.numpy_helper.from_array(np.ones(1, np.int64), ONE))
-    model.graph.output.append(onnx.ValueInfoProto(name=PEAKS))
-    return write_beside(model, path, scratch / f"{graph}.onnx"), names
+        watchers = {graph: _Watching(file, Path(scratch) / f"{graph}.onnx", limit) for graph, file in files.items()}
+        run_watched(bundle, watchers, observations, context, "looking for large values in")
+    return {graph: watcher.beyond for graph, watcher in watchers.items()}

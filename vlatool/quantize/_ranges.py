@@ -62,10 +62,10 @@ class Statistics:
         self.counts += np.bincount(np.clip(places, 0, BINS - 1), minlength=BINS)
 
     def _grow(self, largest: float) -> None:
-        wanted = 2.0 ** math.frexp(largest)[1]
+        radius = 2.0 ** math.frexp(largest)[1]
         if not self.radius:
-            self.radius = wanted
-        while self.radius < wanted:
+            self.radius = radius
+        while self.radius < radius:
             merged = self.counts.reshape(-1, 2).sum(1)
             self.counts = np.zeros(BINS, np.int64)
             self.counts[BINS // 4 : BINS // 4 + BINS // 2] = merged
@@ -193,9 +193,9 @@ def _divergence(counts: NDArray[np.float64], stop: int, levels: int) -> float:
     filled = np.bincount(group, weights=(kept > 0).astype(np.float64), minlength=levels)
     share = np.divide(sums, filled, out=np.zeros(levels), where=filled > 0)
     quantized = np.where(kept > 0, share[group], 0.0)
-    total, made = clipped.sum(), quantized.sum()
-    if total <= 0 or made <= 0:
+    total, rounded = clipped.sum(), quantized.sum()
+    if total <= 0 or rounded <= 0:
         return math.inf
-    p, q = clipped / total, quantized / made
+    p, q = clipped / total, quantized / rounded
     seen = p > 0
     return float(np.sum(p[seen] * np.log(p[seen] / np.maximum(q[seen], 1e-12))))

@@ -6,9 +6,10 @@ import errno
 import fcntl
 import mmap
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,14 +44,8 @@ class Tools:
         return data
 
 
-class Fill(Protocol):
-    """What computes a record."""
-
-    def __call__(self, tools: Tools, data: Array) -> dict[str, Any]:
-        """Fill the zeroed bytes of a record, (size,) uint8; return its figures as JSON values."""
-
-    def to_json(self) -> str:
-        """Return one line from which another process builds the same."""
+Fill = Callable[[Tools, Array], dict[str, Any]]
+"""Fills the zeroed bytes of a record, (size,) uint8, and returns its figures as JSON values."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +55,7 @@ class Record:
     Args:
         name: Of the tensor or layer, for progress and messages.
         size: Bytes; a multiple of the page size, so that it is written past the page cache.
-        fill: Computes it.
+        fill: Computes it; a ``Job`` when it is portable.
         weights: Parameters that it covers, for the progress.
         portable: Whether another process can compute it.
         verb: What is done to it, for the progress.

@@ -8,32 +8,28 @@ from __future__ import annotations
 
 from typing import Any
 
-from vlatool.errors import require
+from vlatool.graph.onnx_graph import OnnxGraph
 
 
 def keep_axes(model: Any) -> int:
     """Rewrite every ``Reduce*`` with ``keepdims=0`` as one that keeps its axes, and a Squeeze; return how many."""
-    onnx = require("onnx", "build")
-    nodes, count = [], 0
+    graph, nodes, count = OnnxGraph(model), [], 0
     for node in model.graph.node:
         nodes.append(node)
-        flags = {item.name: item for item in node.attribute}
-        if not node.op_type.startswith("Reduce") or "keepdims" not in flags or flags["keepdims"].i:
+        options = {item.name: item for item in node.attribute}
+        if not node.op_type.startswith("Reduce") or "keepdims" not in options or options["keepdims"].i:
             continue
-        if "noop_with_empty_axes" in flags and flags["noop_with_empty_axes"].i:
+        if "noop_with_empty_axes" in options and options["noop_with_empty_axes"].i:
             continue
         count += 1
-        flags["keepdims"].i = 1
-        given = node.output[0]
-        node.output[0] = f"{given}.kept"
+        options["keepdims"].i = 1
+        output = node.output[0]
+        node.output[0] = f"{output}.kept"
         axes = [name for name in node.input[1:2] if name]
-        if "axes" in flags:
-            axes = [f"{given}.axes"]
-            model.graph.initializer.append(
-                onnx.helper.make_tensor(axes[0], onnx.TensorProto.INT64, [len(flags["axes"].ints)], flags["axes"].ints)
-            )
-        name = f"{node.name}/drop_axes"
-        nodes.append(onnx.helper.make_node("Squeeze", [node.output[0], *axes], [given], name=name))
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
+        if "axes" in options:
+            ints = options["axes"].ints
+            kind = graph.onnx.TensorProto.INT64
+            axes = [graph.add_tensor(graph.onnx.helper.make_tensor(f"{output}.axes", kind, [len(ints)], ints))]
+        nodes.append(graph.node("Squeeze", [node.output[0], *axes], [output], f"{node.name}/drop_axes"))
+    graph.replace_nodes(nodes)
     return count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ PART_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
-class Layer:
+class Product:
     """A product with a constant weight.
 
     Args:
@@ -92,7 +93,7 @@ class Task:
         return max(piece.offset + piece.size for piece in self.pieces)
 
 
-def layers_of(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Layer]:
+def products_of(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Product]:
     """Yield the products of activations with a two-dimensional float constant, their second operand."""
     for node in model.graph:
         if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
@@ -109,7 +110,7 @@ def layers_of(model: Any, tensors: dict[str, StoredTensor]) -> Iterator[Layer]:
             continue
         rows, columns = tensor.shape[::-1] if turned else tensor.shape
         bias = node.inputs[2] if len(node.inputs) > 2 else None
-        yield Layer(node, operand.name, rows, columns, turned, bias)
+        yield Product(node, operand.name, rows, columns, turned, bias)
 
 
 def _takes_rows(operand: Any) -> bool:
@@ -130,45 +131,34 @@ def read_as_weight(use: Any, layers: Container[int]) -> bool:
 
     Args:
         use: An ``onnx_ir`` usage.
-        layers: ``id`` of the layers' nodes.
+        layers: ``id`` of the products' nodes.
     """
     if id(use.node) in layers:
         return bool(use.idx == 1)
     if not turns_constant(use.node) or use.node.outputs[0].is_graph_output():
         return False
-    return all(id(each.node) in layers and each.idx == 1 for each in use.node.outputs[0].uses())
+    return all(id(reader.node) in layers and reader.idx == 1 for reader in use.node.outputs[0].uses())
 
 
-def block_task(layer: Layer, source: StoredTensor, form: Format, scaled: bool) -> Task:
-    """Lay out codes, scales and zero points as ``com.microsoft.MatMulNBits`` takes them."""
-    count = -(-layer.rows // form.block)
-    name, bits = layer.weight, form.bits
+def weight_task(product: Product, source: StoredTensor, form: Format, layout: str, scaled: bool) -> Task:
+    """Lay out codes, scales and zero points as ``com.microsoft.MatMulNBits`` takes them (``ort``), or (``qdq``) as
+    ``DequantizeLinear`` with blocks over the first axis of (K, N) does.
+    """
+    name, rows, columns = product.weight, product.rows, product.columns
+    count = -(-rows // form.block)
+    kind: Literal["blocks", "qdq"] = "blocks" if layout == "ort" else "qdq"
+    codes: tuple[int, ...]
+    if kind == "blocks":
+        dtype, codes, zeros = "UINT8", (columns, count, form.bytes), (columns, -(-count * form.bits // 8))
+    else:
+        dtype, codes, zeros = f"{'' if form.symmetric else 'U'}INT{form.bits}", (rows, columns), (count, columns)
     pieces = _laid(
-        (f"{name}.q{bits}", "UINT8", (layer.columns, count, form.bytes)),
-        (f"{name}.scales", "FLOAT", (layer.columns, count)),
-        *([] if form.symmetric else [(f"{name}.zeros", "UINT8", (layer.columns, -(-count * bits // 8)))]),
-        *([(f"{name}.inputs", "FLOAT", (layer.rows,))] if scaled else []),
+        (f"{name}.q{form.bits}", dtype, codes),
+        (f"{name}.scales", "FLOAT", (columns, count) if kind == "blocks" else (count, columns)),
+        *([] if form.symmetric else [(f"{name}.zeros", dtype, zeros)]),
+        *([(f"{name}.inputs", "FLOAT", (rows,))] if scaled else []),
     )
-    return _layer_task(source, "blocks", pieces, layer, scaled)
-
-
-def _layer_task(
-    source: StoredTensor, kind: Literal["blocks", "qdq"], pieces: tuple[Piece, ...], layer: Layer, scaled: bool
-) -> Task:
-    return Task(source, kind, pieces, layer.node.name, layer.rows, layer.columns, layer.output_first, scaled=scaled)
-
-
-def qdq_task(layer: Layer, source: StoredTensor, form: Format, scaled: bool) -> Task:
-    """Lay out codes, scales and zero points as ``DequantizeLinear`` with blocks over the first axis of (K, N) does."""
-    count = -(-layer.rows // form.block)
-    name, kind = layer.weight, f"{'' if form.symmetric else 'U'}INT{form.bits}"
-    pieces = _laid(
-        (f"{name}.q{form.bits}", kind, (layer.rows, layer.columns)),
-        (f"{name}.scales", "FLOAT", (count, layer.columns)),
-        *([] if form.symmetric else [(f"{name}.zeros", kind, (count, layer.columns))]),
-        *([(f"{name}.inputs", "FLOAT", (layer.rows,))] if scaled else []),
-    )
-    return _layer_task(source, "qdq", pieces, layer, scaled)
+    return Task(source, kind, pieces, product.node.name, rows, columns, product.output_first, scaled=scaled)
 
 
 def copy_task(name: str, source: StoredTensor, half: bool) -> Task:
@@ -207,7 +197,7 @@ class Rewriter:
         self.model = skeleton.model
         self.graph = skeleton.model.graph
         self._file = file
-        self._made: dict[int, Any] = {}
+        self._values: dict[int, Any] = {}
 
     def place(self, task: Task, offset: int, folder: Path, weight: str) -> list[Any]:
         """Make the initializers of a weight whose record starts at ``offset`` of the data file and return them.
@@ -217,30 +207,25 @@ class Rewriter:
         values = []
         for piece in task.pieces:
             place = offset + piece.offset
-            if place not in self._made:
+            if place not in self._values:
                 name = self._free(f"{weight}.{piece.name.rpartition('.')[2]}")
                 tensor = self._external(name, piece, offset, folder)
                 value = self._ir.Value(name=name, shape=tensor.shape, type=self._ir.TensorType(tensor.dtype))
                 value.const_value = tensor
-                self._made[place] = value
-            values.append(self._made[place])
+                self._values[place] = value
+            values.append(self._values[place])
         return values
 
-    def _free(self, wanted: str) -> str:
+    def _free(self, name: str) -> str:
         """Return that name, or one like it where a weight is stored twice: for each way in which it is read."""
-        taken = {value.name for value in self._made.values()}
-        names = (wanted, *(f"{wanted}.{number}" for number in range(2, len(taken) + len(self.graph.initializers) + 3)))
-        return next(name for name in names if name not in taken and name not in self.graph.initializers)
+        taken = {*self.graph.initializers, *(value.name for value in self._values.values())}
+        names = itertools.chain([name], (f"{name}.{number}" for number in itertools.count(2)))
+        return next(name for name in names if name not in taken)
 
     def _external(self, name: str, piece: Piece, offset: int, folder: Path) -> Any:
+        dtype, shape = self._ir.DataType[piece.dtype], self._ir.Shape(piece.shape)
         return self._ir.ExternalTensor(
-            self._file,
-            offset + piece.offset,
-            piece.size,
-            self._ir.DataType[piece.dtype],
-            shape=self._ir.Shape(piece.shape),
-            name=name,
-            base_dir=str(folder),
+            self._file, offset + piece.offset, piece.size, dtype, shape=shape, name=name, base_dir=str(folder)
         )
 
     def keep(self, name: str, task: Task, offset: int, folder: Path) -> None:
@@ -253,72 +238,58 @@ class Rewriter:
                 self._cast_after(node)
 
     def _cast_after(self, node: Any) -> None:
-        given = node.outputs[0]
-        wide = self._ir.Value(name=f"{given.name}.half", shape=given.shape)
+        table = node.outputs[0]
+        wide = self._ir.Value(name=f"{table.name}.half", shape=table.shape)
         wide.type = self._ir.TensorType(self._ir.DataType.FLOAT16)
-        gather = self._ir.node("Gather", list(node.inputs), dict(_attributes(node)), outputs=[wide], name=node.name)
+        options = {name: attribute.value for name, attribute in node.attributes.items()}
+        gather = self._ir.node("Gather", list(node.inputs), options, outputs=[wide], name=node.name)
         cast = self._ir.node("Cast", [wide], {"to": self._ir.DataType.FLOAT}, name=f"{node.name}.float")
         self._replace(node, [gather, cast])
 
-    def use_blocks(self, layer: Layer, values: list[Any], form: Format, accuracy: int, scaled: bool) -> None:
-        """Replace a product by ``MatMulNBits`` (and an Add for a Gemm's bias)."""
-        activation, nodes, values = self._scaled(layer, values, scaled)
-        attributes = {"K": layer.rows, "N": layer.columns, "bits": form.bits, "block_size": form.block}
-        attributes["accuracy_level"] = accuracy
-        product = self._ir.node(
-            "MatMulNBits", [activation, *values], attributes, domain=DOMAIN, name=layer.node.name, version=1
-        )
-        self._replace(layer.node, [*nodes, product, *self._added(layer, product)])
-        self.model.opset_imports[DOMAIN] = 1
-        self.graph.opset_imports[DOMAIN] = 1
+    def quantize(self, product: Product, task: Task, values: list[Any], form: Format, accuracy: int) -> None:
+        """Replace a product by ``MatMulNBits``, or feed it from a blocked ``DequantizeLinear`` (opset 21).
 
-    def use_qdq(self, layer: Layer, values: list[Any], form: Format, scaled: bool) -> None:
-        """Feed a product from a blocked ``DequantizeLinear`` (opset 21)."""
-        activation, nodes, values = self._scaled(layer, values, scaled)
-        attributes = {"axis": 0, "block_size": form.block}
-        weight = self._ir.node("DequantizeLinear", values, attributes, name=f"{layer.node.name}.dequantize")
-        product = self._ir.node("MatMul", [activation, weight.outputs[0]], {}, name=layer.node.name)
-        self._replace(layer.node, [*nodes, weight, product, *self._added(layer, product)])
-
-    def _scaled(self, layer: Layer, values: list[Any], scaled: bool) -> tuple[Any, list[Any], list[Any]]:
-        """Divide the activations by what the weight was multiplied with."""
-        if not scaled:
-            return layer.node.inputs[0], [], values
-        smaller = self._ir.node("Mul", [layer.node.inputs[0], values[-1]], {}, name=f"{layer.node.name}.inputs")
-        return smaller.outputs[0], [smaller], values[:-1]
-
-    def _added(self, layer: Layer, product: Any) -> list[Any]:
-        if layer.bias is None:
-            return []
-        return [self._ir.node("Add", [product.outputs[0], layer.bias], {}, name=f"{layer.node.name}.bias")]
+        Args:
+            product: What is replaced; a Gemm's bias becomes an Add.
+            task: Of its weight; where that was multiplied by a vector, the activations are divided by it first.
+            values: What ``place`` made of it.
+            form: Of the weight.
+            accuracy: ``accuracy_level`` of ``MatMulNBits``.
+        """
+        make, name, activation, nodes = self._ir.node, product.node.name, product.node.inputs[0], []
+        if task.scaled:
+            nodes.append(make("Mul", [activation, values[-1]], {}, name=f"{name}.inputs"))
+            activation, values = nodes[0].outputs[0], values[:-1]
+        if task.kind == "qdq":
+            options = {"axis": 0, "block_size": form.block}
+            nodes.append(make("DequantizeLinear", values, options, name=f"{name}.dequantize"))
+            nodes.append(make("MatMul", [activation, nodes[-1].outputs[0]], {}, name=name))
+        else:
+            options = {"K": product.rows, "N": product.columns, "bits": form.bits, "block_size": form.block}
+            options["accuracy_level"] = accuracy
+            nodes.append(make("MatMulNBits", [activation, *values], options, domain=DOMAIN, name=name, version=1))
+            self.model.opset_imports[DOMAIN] = self.graph.opset_imports[DOMAIN] = 1
+        if product.bias is not None:
+            nodes.append(make("Add", [nodes[-1].outputs[0], product.bias], {}, name=f"{name}.bias"))
+        self._replace(product.node, nodes)
 
     def _replace(self, node: Any, nodes: list[Any]) -> None:
         """Put nodes in the place of one; the last gives the old name and shape."""
-        old, new = node.outputs[0], nodes[-1].outputs[0]
-        for number, each in enumerate(nodes[:-1]):
-            each.outputs[0].name = each.outputs[0].name or f"{old.name}.{number}"
-        self.graph.insert_before(node, nodes)
-        new.shape, new.type = old.shape, old.type
-        old.replace_all_uses_with(new, replace_graph_outputs=True)
-        self.graph.remove(node, safe=True)
-        new.name = old.name
+        old = node.outputs[0]
+        for number, inner in enumerate(nodes[:-1]):
+            inner.outputs[0].name = inner.outputs[0].name or f"{old.name}.{number}"
+        self._ir.convenience.replace_nodes_and_values(self.graph, node, [node], nodes, [old], nodes[-1].outputs)
 
     def finish(self) -> None:
         """Remove transpositions and constants that nobody reads, and register the new constants."""
         for node in reversed(list(self.graph)):
-            outputs = [value for value in node.outputs if value.uses() or value.is_graph_output()]
-            if not outputs:
+            if not any(value.uses() or value.is_graph_output() for value in node.outputs):
                 self.graph.remove(node, safe=True)
-        for value in self._made.values():
+        for value in self._values.values():
             self.graph.register_initializer(value)
         for name, value in list(self.graph.initializers.items()):
             if not value.uses() and not value.is_graph_output():
                 del self.graph.initializers[name]
-
-
-def _attributes(node: Any) -> Iterator[tuple[str, Any]]:
-    for name, attribute in node.attributes.items():
-        yield name, attribute.value
 
 
 def only_gathered(value: Any) -> bool:

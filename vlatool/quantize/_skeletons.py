@@ -7,7 +7,7 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
-from vlatool.graph.nodes import free_name
+from vlatool.graph.nodes import name_each
 from vlatool.module.edits import is_changed
 from vlatool.quantize._compute import as_float32
 from vlatool.quantize._fake_export import Skeleton, export_skeletons, policy_weights
@@ -32,10 +32,10 @@ def skeletons_of(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
             f"The policy {bundle.manifest.name} does not say which shards hold its weights.",
             "add 'weights: \"*.safetensors\"' to policy.yaml (see docs/concepts/large-models.md), or export it first",
         )
-    found = export_skeletons(bundle, opset)
-    for skeleton in found.values():
+    skeletons = export_skeletons(bundle, opset)
+    for skeleton in skeletons.values():
         _read_small(skeleton)
-    return found
+    return skeletons
 
 
 def takes_shards(bundle: Bundle) -> bool:
@@ -55,28 +55,15 @@ def _open(path: Path) -> Skeleton:
     ir = require("onnx_ir", "build")
     try:
         model = ir.load(str(path))
-        _name_nodes(model)
-        tensors = {}
-        for name, value in model.graph.initializers.items():
-            tensor = _stored(ir, name, value, path)
-            if tensor is not None:
-                tensors[name] = tensor
+        name_each(list(model.graph))
+        stored = {name: _stored(ir, name, value, path) for name, value in model.graph.initializers.items()}
+        tensors = {name: tensor for name, tensor in stored.items() if tensor is not None}
     except VlatoolError:
         raise
     except Exception as error:  # the seam: protobuf and onnx_ir raise many foreign types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
     return Skeleton(model, tensors, int(model.graph.opset_imports.get("", 0)))
-
-
-def _name_nodes(model: Any) -> None:
-    """Give every node a name of its own, as ``name_nodes`` does."""
-    taken = {node.name for node in model.graph}
-    seen = {"", None}
-    for number, node in enumerate(model.graph):
-        if node.name in seen:
-            node.name = free_name(node.name or node.op_type, number, taken)
-        seen.add(node.name)
 
 
 def _stored(ir: Any, name: str, value: Any, path: Path) -> StoredTensor | None:

@@ -6,10 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from vlatool.errors import require
 from vlatool.graph.layers import Layer
-from vlatool.graph.nodes import reads
-from vlatool.graph.types import FLOAT, static_shapes
+from vlatool.graph.onnx_graph import OnnxGraph
 
 NORMS = ("LayerNormalization", "RMSNormalization")
 HOMOGENEOUS = ("Relu", "LeakyRelu", "Identity", "Dropout")
@@ -70,53 +68,36 @@ def find_groups(model: Any, layers: Iterable[Layer]) -> list[Group]:
         layers: MatMul and Gemm with constant weights, from ``find_layers`` of the same model.
     """
     topology = _Topology(model)
-    flat = [layer for layer in layers if layer.weight and len(topology.constants[layer.weight].dims) == 2]
+    flat = [layer for layer in layers if layer.weight and topology.is_weight(layer.weight, rank=2)]
     roots: dict[str, list[Layer]] = {}
     for layer in flat:
         roots.setdefault(topology.root(layer.activations[0]), []).append(layer)
-    found = []
+    groups = []
     for value, members in roots.items():
         alone = topology.read_only_by(value, {layer.name for layer in members})
-        edits = topology.points(value) if alone else None
+        edits = topology.edits(value) if alone else None
         if edits:
-            found.append(Group(value, tuple(members), tuple(edits)))
+            groups.append(Group(value, tuple(members), tuple(edits)))
             continue
         names = dict.fromkeys(layer.activations[0] for layer in members)
-        found += [Group(name, tuple(layer for layer in members if layer.activations[0] == name)) for name in names]
-    return found
+        groups += [Group(name, tuple(layer for layer in members if layer.activations[0] == name)) for name in names]
+    return groups
 
 
-class _Topology:
-    """Who gives and who reads each value of a graph."""
-
-    def __init__(self, model: Any) -> None:
-        onnx = require("onnx", "build")
-        self._value = onnx.helper.get_attribute_value
-        self._array = onnx.numpy_helper.to_array
-        self.nodes = list(model.graph.node)
-        self.constants = {tensor.name: tensor for tensor in model.graph.initializer}
-        self.shapes = static_shapes(model)
-        self.outputs = {value.name for value in model.graph.output}
-        self.producers = {name: index for index, node in enumerate(self.nodes) for name in node.output if name}
-        self.readers: dict[str, list[int]] = {}
-        for index, node in enumerate(self.nodes):
-            for name in reads(node):
-                self.readers.setdefault(name, []).append(index)
+class _Topology(OnnxGraph):
+    """Which nodes a scale can pass through."""
 
     def root(self, value: str) -> str:
         """Go up from a value as long as operators leave its last axis alone."""
-        while True:
-            index = self.producers.get(value)
-            if index is None or not self._keeps_last(self.nodes[index]):
-                return value
-            value = self.nodes[index].input[0]
+        while (node := self.producers.get(value)) is not None and self._keeps_last(node):
+            value = node.input[0]
+        return value
 
     def read_only_by(self, value: str, layers: set[str]) -> bool:
         """Say whether every reader is one of the layers, operators that move the value passed through."""
         if value in self.outputs:
             return False
-        for index in self.readers.get(value, []):
-            node = self.nodes[index]
+        for node in self.readers[value]:
             if node.name in layers and node.input[0] == value and list(node.input).count(value) == 1:
                 continue
             if not self._keeps_last(node) or node.input[0] != value:
@@ -125,12 +106,12 @@ class _Topology:
                 return False
         return True
 
-    def points(self, value: str, start: int = 0) -> list[Edit] | None:
+    def edits(self, value: str, start: int = 0) -> list[Edit] | None:
         """Return the constants that divide channels of a value, from ``start`` on, or None when nothing exact does."""
-        index = self.producers.get(value)
-        if index is None or value not in self.shapes or not self.shapes[value]:
+        node = self.producers.get(value)
+        if node is None or not self.shapes.get(value):
             return None
-        node, width = self.nodes[index], self.shapes[value][-1]
+        width = self.shapes[value][-1]
         if node.op_type in NORMS:
             return self._norm(node, value, start)
         if node.op_type in ("MatMul", "Gemm"):
@@ -145,31 +126,29 @@ class _Topology:
 
     def _above(self, value: str, start: int) -> list[Edit] | None:
         """Go on with a value that only one node reads."""
-        if len(self.readers.get(value, [])) != 1 or value in self.outputs:
-            return None
-        return self.points(value, start)
+        return self.edits(value, start) if len(self.readers[value]) == 1 and value not in self.outputs else None
 
     def _norm(self, node: Any, value: str, start: int) -> list[Edit] | None:
-        axis, rank = self._attributes(node).get("axis", -1), len(self.shapes[value])
-        names = [name for name in node.input[1:] if name]
-        if axis not in (-1, rank - 1) or node.output[0] != value or not all(self._weight(name) for name in names):
+        axis, rank = self.attributes(node).get("axis", -1), len(self.shapes[value])
+        fixed = all(self.is_weight(name) for name in node.input[1:] if name)
+        if axis not in (-1, rank - 1) or node.output[0] != value or not fixed:
             return None
         return [Edit(node.output[0], place, start=start) for place, name in enumerate(node.input) if place and name]
 
     def _product(self, node: Any, start: int, width: int) -> list[Edit] | None:
-        if not self._weight(node.input[1]) or len(self.constants[node.input[1]].dims) != 2:
+        if not self.is_weight(node.input[1], rank=2):
             return None
-        axis = 0 if self._attributes(node).get("transB") else 1
+        axis = 0 if self.attributes(node).get("transB") else 1
         edits = [Edit(node.output[0], 1, axis, start)]
         if node.op_type == "Gemm" and len(node.input) > 2 and node.input[2]:
-            if not self._weight(node.input[2]):
+            if not self.is_weight(node.input[2]):
                 return None
             edits.append(Edit(node.output[0], 2, start=start, width=width))
         return edits
 
     def _elementwise(self, node: Any, start: int, width: int) -> list[Edit] | None:
         first, second = node.input[0], node.input[1]
-        fixed = [place for place, name in enumerate(node.input) if self._weight(name)]
+        fixed = [place for place, name in enumerate(node.input) if self.is_weight(name)]
         if len(fixed) > 1 or (fixed == [0] and node.op_type == "Div"):
             return None
         adds = node.op_type in SUMS
@@ -190,9 +169,8 @@ class _Topology:
     ) -> list[Edit] | None:
         wide = [name for name in (first, second) if self.shapes.get(name, ())[-1:] == (width,)]
         if adds:
-            found = [self._above(name, start) for name in wide]
-            whole = len(wide) == 2 and all(found)
-            return [edit for edits in found for edit in edits or []] if whole else None
+            both = [self._above(name, start) for name in wide]
+            return [edit for edits in both for edit in edits or []] if len(wide) == 2 and all(both) else None
         for name in wide:
             if name == second and divides:
                 continue
@@ -206,7 +184,7 @@ class _Topology:
         rank = len(self.shapes[value])
         if any(name not in self.shapes for name in node.output):
             return None
-        if self._attributes(node).get("axis", 0) not in (-1, rank - 1):
+        if self.attributes(node).get("axis", 0) not in (-1, rank - 1):
             return None
         before = sum(self.shapes[name][-1] for name in list(node.output)[: list(node.output).index(value)])
         return self._above(node.input[0], start + before)
@@ -218,7 +196,7 @@ class _Topology:
         before, after = self.shapes.get(node.input[0]), self.shapes.get(node.output[0])
         if not before or not after or before[-1] != after[-1]:
             return False
-        attributes, last = self._attributes(node), len(before) - 1
+        attributes, last = self.attributes(node), len(before) - 1
         if node.op_type == "Transpose":
             return bool(list(attributes.get("perm", range(last, -1, -1)))[-1] == last)
         if node.op_type == "Gather":
@@ -232,10 +210,4 @@ class _Topology:
         if "axes" in attributes:
             return list(attributes["axes"])
         name = node.input[place] if len(node.input) > place else ""
-        return [int(axis) for axis in self._array(self.constants[name]).reshape(-1)] if name in self.constants else None
-
-    def _attributes(self, node: Any) -> dict[str, Any]:
-        return {item.name: self._value(item) for item in node.attribute}
-
-    def _weight(self, name: str) -> bool:
-        return name in self.constants and self.constants[name].data_type == FLOAT
+        return [int(axis) for axis in self.array(name).reshape(-1)] if name in self.constants else None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import fnmatch
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -13,18 +15,20 @@ from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import padded
 from vlatool.quantize._rewrite import (
     PART_BYTES,
-    Layer,
+    Product,
     Rewriter,
     Task,
-    block_task,
     copy_task,
-    layers_of,
     only_gathered,
-    qdq_task,
+    products_of,
     read_as_weight,
+    weight_task,
 )
 from vlatool.quantize._skeletons import BLOCKED_OPSET
 from vlatool.quantize._weight_options import WeightOptions
+
+Entry = tuple[Any, Task, "Product | str"]
+"""What tells a tensor and its form from others, what becomes of it, and the product or initializer that it is for."""
 
 
 @dataclass
@@ -33,12 +37,12 @@ class GraphPlan:
 
     Args:
         skeleton: The graph as it was.
-        layers: Those that are quantized, each with the number of its task.
+        products: Those that are quantized, each with the number of its task.
         kept: Initializer -> the number of its task.
     """
 
     skeleton: Skeleton
-    layers: list[tuple[Layer, int]] = field(default_factory=list)
+    products: list[tuple[Product, int]] = field(default_factory=list)
     kept: dict[str, int] = field(default_factory=dict)
 
 
@@ -60,12 +64,8 @@ class WeightsPlan:
         ]
 
     def offsets(self) -> list[int]:
-        """Return the first byte of each task in the file."""
-        found, offset = [], 0
-        for task in self.tasks:
-            found.append(offset)
-            offset += task_bytes(task)
-        return found
+        """Return the first byte of each task in the file, and its size."""
+        return [0, *accumulate(task_bytes(task) for task in self.tasks)]
 
     def save(self, out: Path) -> dict[str, int]:
         """Rewrite every graph and write ``graphs/NAME.onnx``: graph name -> opset."""
@@ -76,13 +76,10 @@ class WeightsPlan:
         for name, graph in self.graphs.items():
             rewriter = Rewriter(graph.skeleton, PurePosixPath(self.file).name)
             folder = (out / self.file).parent
-            for layer, number in graph.layers:
+            for product, number in graph.products:
                 task = self.tasks[number]
-                values = rewriter.place(task, offsets[number], folder, layer.weight)
-                if stage.layout == "ort":
-                    rewriter.use_blocks(layer, values, stage.form, stage.accuracy_level, task.scaled)
-                else:
-                    rewriter.use_qdq(layer, values, stage.form, task.scaled)
+                values = rewriter.place(task, offsets[number], folder, product.weight)
+                rewriter.quantize(product, task, values, stage.form, stage.accuracy_level)
             for initializer, number in graph.kept.items():
                 rewriter.keep(initializer, self.tasks[number], offsets[number], folder)
             rewriter.finish()
@@ -107,36 +104,45 @@ def make_plan(skeletons: dict[str, Skeleton], stage: WeightOptions, bundle: Bund
     """
     plan = WeightsPlan(stage, file)
     known: dict[Any, int] = {}
-    layers = {name: list(layers_of(each.model, each.tensors)) for name, each in skeletons.items()}
-    chosen = _chosen(layers, stage, bundle)
-    order = list(dict.fromkeys([step.graph for step in bundle.manifest.program] + list(skeletons)))
+    chosen = _chosen(
+        {name: list(products_of(graph.model, graph.tensors)) for name, graph in skeletons.items()}, stage, bundle
+    )
+    order = dict.fromkeys([step.graph for step in bundle.manifest.program] + list(skeletons))
     for name, skeleton in ((name, skeletons[name]) for name in order if name in skeletons):
         graph = plan.graphs[name] = GraphPlan(skeleton)
         _raise_opset(name, skeleton, stage, bool(chosen[name]))
-        wanted: list[tuple[Any, Task, Layer | None, str]] = []
-        for layer in chosen[name]:
-            source = skeleton.tensors[layer.weight]
-            make = block_task if stage.layout == "ort" else qdq_task
-            task = make(layer, source, stage.form, stage.method == "awq")
-            key = (_place(name, source), layer.output_first, layer.node.name if stage.method == "awq" else "")
-            wanted.append((key, task, layer, ""))
-        for initializer in _kept(skeleton, chosen[name]):
-            source = skeleton.tensors[initializer]
-            value = skeleton.model.graph.initializers[initializer]
-            half = stage.embeddings == "float16" and len(source.shape) == 2 and only_gathered(value)
-            task = copy_task(initializer, source, half)
-            wanted.append(((_place(name, source), task.dtype), task, None, initializer))
+        entries = [*_quantized(name, skeleton, chosen[name], stage), *_kept(name, skeleton, chosen[name], stage)]
         if stage.method not in ("gptq", "awq"):
-            wanted.sort(key=lambda each: (str(each[1].source.file), each[1].source.offset))
-        for key, task, quantized, initializer in wanted:
+            entries.sort(key=lambda entry: (str(entry[1].source.file), entry[1].source.offset))
+        for key, task, product in entries:
             if key not in known:
                 known[key] = len(plan.tasks)
                 plan.tasks.append(task)
-            if quantized is not None:
-                graph.layers.append((quantized, known[key]))
+            if isinstance(product, str):
+                graph.kept[product] = known[key]
             else:
-                graph.kept[initializer] = known[key]
+                graph.products.append((product, known[key]))
     return plan
+
+
+def _quantized(graph: str, skeleton: Skeleton, products: list[Product], stage: WeightOptions) -> Iterator[Entry]:
+    """Yield what becomes of the weights of products."""
+    awq = stage.method == "awq"
+    for product in products:
+        source = skeleton.tensors[product.weight]
+        task = weight_task(product, source, stage.form, stage.layout, awq)
+        yield (_place(graph, source), product.output_first, product.node.name if awq else ""), task, product
+
+
+def _kept(graph: str, skeleton: Skeleton, products: list[Product], stage: WeightOptions) -> Iterator[Entry]:
+    """Yield what becomes of the initializers that somebody reads beside the quantized products."""
+    replaced = {id(product.node) for product in products}
+    for name, source in skeleton.tensors.items():
+        value = skeleton.model.graph.initializers[name]
+        if value.is_graph_output() or not all(read_as_weight(use, replaced) for use in value.uses()):
+            half = stage.embeddings == "float16" and len(source.shape) == 2 and only_gathered(value)
+            task = copy_task(name, source, half)
+            yield (_place(graph, source), task.dtype), task, name
 
 
 def _place(graph: str, source: Any) -> tuple[str, ...]:
@@ -146,26 +152,18 @@ def _place(graph: str, source: Any) -> tuple[str, ...]:
     return (str(source.file), str(source.offset), source.name)
 
 
-def _chosen(layers: dict[str, list[Layer]], stage: WeightOptions, bundle: Bundle) -> dict[str, list[Layer]]:
+def _chosen(products: dict[str, list[Product]], stage: WeightOptions, bundle: Bundle) -> dict[str, list[Product]]:
     for pattern in stage.graphs:
-        if not fnmatch.filter(layers, pattern):
-            raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, layers)}.")
-    wanted = {name for name in layers if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)}
-    kept = stage.selected([layer.node.name for name in sorted(wanted) for layer in layers[name]], bundle)
-    return {
-        name: [layer for layer in found if name in wanted and layer.node.name in kept] for name, found in layers.items()
+        if not fnmatch.filter(products, pattern):
+            raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, products)}.")
+    graphs = {
+        name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)
     }
-
-
-def _kept(skeleton: Skeleton, layers: list[Layer]) -> list[str]:
-    """Return the initializers that somebody reads beside the quantized layers."""
-    replaced = {id(layer.node) for layer in layers}
-    kept = []
-    for name in skeleton.tensors:
-        value = skeleton.model.graph.initializers[name]
-        if value.is_graph_output() or not all(read_as_weight(use, replaced) for use in value.uses()):
-            kept.append(name)
-    return kept
+    kept = stage.selected([product.node.name for name in sorted(graphs) for product in products[name]], bundle)
+    return {
+        name: [product for product in members if name in graphs and product.node.name in kept]
+        for name, members in products.items()
+    }
 
 
 def _raise_opset(name: str, skeleton: Skeleton, stage: WeightOptions, quantized: bool) -> None:

@@ -8,8 +8,8 @@ from typing import ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.graph.files import foreign_errors, load, read, save
-from vlatool.graph.layers import check_weights, find_layers, part_inner_gemms, split_gemm
+from vlatool.graph.files import load, save
+from vlatool.graph.layers import Layer, check_weights, part_inner_gemms, split_gemm
 from vlatool.quantize._base import Quantization, quiet_quantizer
 from vlatool.runtime.engines import build_tool
 from vlatool.stage.base import Context, source_of
@@ -33,25 +33,20 @@ class DynamicInt8(Quantization):
         """Quantize every selected graph."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
-        layers: dict[str, list[str]] = {}
-        for name in self.chosen_graphs(bundle):
-            with foreign_errors(name):
-                model = read(bundle.file(bundle.manifest.graphs[name].file), weights=False)
-                layers[name] = [layer.name for layer in find_layers(model, OPS)]
-        kept = self.selected([layer for found in layers.values() for layer in found], bundle)
+        layers = self.layers_of(bundle, OPS)
 
         def quantize(name: str, original: Path, target: Path) -> None:
-            self._quantize(original, target, kept.intersection(layers[name]))
+            self._quantize(original, target, layers[name])
 
         return self.transform(bundle, out, context, quantize)
 
-    def _quantize(self, original: Path, target: Path, kept: set[str]) -> None:
+    def _quantize(self, original: Path, target: Path, layers: list[Layer]) -> None:
         quantization = build_tool("quantization")
-        model = load(original)
-        check_weights(model, [layer for layer in find_layers(model, OPS) if layer.name in kept])
+        model, names = load(original), {layer.name for layer in layers}
+        check_weights(model, layers)
         split_gemm(model)  # ONNX Runtime's own way turns a weight in place for each of its readers
         part_inner_gemms(model)
-        excluded = [node.name for node in model.graph.node if node.op_type in OPS and node.name not in kept]
+        excluded = [node.name for node in model.graph.node if node.op_type in OPS and node.name not in names]
         with quiet_quantizer() as scratch:
             quantization.quantize_dynamic(
                 model,

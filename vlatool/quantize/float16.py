@@ -52,13 +52,13 @@ class Float16(Quantization):
         recorded = recorded_observations(bundle, self.samples, self.calibration)
         seen = samples.watch(recorded or observations_for(bundle, self.samples, self.calibration))
         beyond = find_beyond(bundle, chosen, seen, LARGEST, context)
-        told: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": []}
+        report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": []}
         for graph, values in beyond.items():
-            for value, found in values.items():
-                size = float(f"{found.largest:.4g}")
-                told["beyond"].append({"graph": graph, "value": value, "sample": found.sample, "largest": size})
+            for value, excess in values.items():
+                size = float(f"{excess.largest:.4g}")
+                report["beyond"].append({"graph": graph, "value": value, "sample": excess.sample, "largest": size})
                 context.tell(
-                    f"{value} reaches {size:g} in sample {found.sample}, beyond float16: it stays float32", None
+                    f"{value} reaches {size:g} in sample {excess.sample}, beyond float16: it stays float32", None
                 )
 
         def convert(name: str, original: Path, target: Path) -> None:
@@ -67,27 +67,26 @@ class Float16(Quantization):
             kept |= phase_nodes(model) | around(model, beyond.get(name, {}))
             weights = look_at_weights(model, kept)
             kept.update(weights.beyond)
-            told["kept"] += len(kept)
-            told["subnormal_weights"] += weights.subnormal
+            report["kept"] += len(kept)
+            report["subnormal_weights"] += weights.subnormal
             turning = {node.name for node in model.graph.node if node.op_type == "Transpose"}
             save(to_float16(model, kept), target)
             try:
                 open_apart(target, "", "float16", APART)
             except GraphError:  # with what is transposed in float32 it does not
-                told["kept"] += len(turning - kept)
+                report["kept"] += len(turning - kept)
                 save(to_float16(load(original), kept | turning), target)
                 open_apart(target, "", "float16", APART)
 
-        made_by = {**self.made_by(calibration=samples), "float16": told}
+        made_by = {**self.made_by(calibration=samples), "float16": report}
         return self.transform(bundle, out, context, convert, made_by=made_by)
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what a person wants to know about the new bundle."""
-        told = made.manifest.made_by["float16"]
-        lines = [
-            f"{told['kept']} nodes stay float32; {told['subnormal_weights']} weights are too small for all their bits"
-        ]
-        for found in told["beyond"]:
-            where = f"{found['graph']}/{found['value']} reaches {found['largest']:g} in sample {found['sample']}"
+        report = made.manifest.made_by["float16"]
+        small = report["subnormal_weights"]
+        lines = [f"{report['kept']} nodes stay float32; {small} weights are too small for all their bits"]
+        for excess in report["beyond"]:
+            where = f"{excess['graph']}/{excess['value']} reaches {excess['largest']:g} in sample {excess['sample']}"
             lines.append(f"{where}: beyond float16, so its nodes stay float32")
         return tuple(lines)

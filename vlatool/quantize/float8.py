@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, nearest, require
-from vlatool.graph.files import foreign_errors, load, save
-from vlatool.graph.layers import Layer, Style, find_layers, wanted_values
-from vlatool.quantize._base import QUANTIZED_OPS
+from vlatool.errors import require
+from vlatool.graph.files import load, save
+from vlatool.graph.layers import Style, calibrated_values
+from vlatool.quantize._base import QUANTIZED_OPS, check_ops
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._float8_qdq import Float8Writer
 from vlatool.stage.base import Context, SampleSet, source_of
@@ -38,9 +38,7 @@ class Float8(Calibrated):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The operators are ones that can be quantized, and there is calibration data."""
-        for name in self.ops:
-            if name not in QUANTIZED_OPS:
-                raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
+        check_ops(self.ops)
         super().check(source, profile)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
@@ -48,23 +46,14 @@ class Float8(Calibrated):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         require("ml_dtypes", "build")
-        with foreign_errors("main"):
-            layers = self._layers(bundle)
-        wanted = {name: wanted_values(found, Style(), {}) for name, found in layers.items()}
-        samples = SampleSet()
-        statistics = self.statistics(bundle, wanted, samples, context)
+        layers, samples = self.layers_of(bundle, self.ops, attention=self.attention), SampleSet()
+        values = {name: calibrated_values(graph, Style(), {}) for name, graph in layers.items()}
+        statistics = self.statistics(bundle, values, samples, context)
 
         def quantize(name: str, original: Path, target: Path) -> None:
             model = load(original)
-            peaks = {value: max(abs(found.low), abs(found.high)) for value, found in statistics[name].items()}
+            peaks = {value: max(abs(seen.low), abs(seen.high)) for value, seen in statistics[name].items()}
             Float8Writer(model, layers[name], peaks, self.per_channel).write()
             save(model, target)
 
         return self.transform(bundle, out, context, quantize, made_by=self.made_by(calibration=samples))
-
-    def _layers(self, bundle: Bundle) -> dict[str, list[Layer]]:
-        """Return graph -> selected layers."""
-        paths = {name: bundle.file(bundle.manifest.graphs[name].file) for name in self.chosen_graphs(bundle)}
-        found = {name: find_layers(load(path), self.ops, attention=self.attention) for name, path in paths.items()}
-        selected = self.selected([layer.name for layers in found.values() for layer in layers], bundle)
-        return {name: [layer for layer in layers if layer.name in selected] for name, layers in found.items()}

@@ -13,16 +13,17 @@ from pydantic import BeforeValidator, Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, require
+from vlatool.errors import GraphError
 from vlatool.graph.files import foreign_errors, load, save
-from vlatool.graph.layers import find_layers
 from vlatool.graph.nodes import reads
+from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._smooth_groups import Edit, Group, find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
-from vlatool.runtime.policy import load_golden, relative_error
+from vlatool.runtime.golden import load_golden
+from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
 from vlatool.stage.finish import TRIALS
 
@@ -73,15 +74,16 @@ class SmoothQuant(Calibrated):
         """Calibrate, smooth every selected graph, and compare the golden action with the source's."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
-        with foreign_errors("main"):
-            groups = self._plan(bundle)
-        wanted = {name: [value for group in found for value in group.activations] for name, found in groups.items()}
-        samples = SampleSet()
+        groups, samples = {}, SampleSet()
+        for name, layers in self.layers_of(bundle, OPS).items():
+            with foreign_errors(name):
+                groups[name] = find_groups(load(bundle.file(bundle.manifest.graphs[name].file)), layers)
+        values = {name: [value for group in members for value in group.activations] for name, members in groups.items()}
         halves = self._halves(list(zip(*self.observed(bundle, samples), strict=True)))
         peaks = []
         for half in halves:
             numbers, observations = zip(*half, strict=True)
-            peaks.append(_peaks(calibrate(bundle, wanted, observations, context, channels=True, numbers=numbers)))
+            peaks.append(_peaks(calibrate(bundle, values, observations, context, channels=True, numbers=numbers)))
         notes: list[dict[str, Any]] = []
 
         def smooth(name: str, original: Path, target: Path) -> None:
@@ -91,11 +93,11 @@ class SmoothQuant(Calibrated):
                 notes.append({"graph": name, **note})
             save(model, target)
 
-        made = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
+        smoothed = self.transform(bundle, out, context, smooth, made_by=self.made_by(calibration=samples))
         (out / REPORT).parent.mkdir(exist_ok=True)
         (out / REPORT).write_text(json.dumps({"groups": notes}, indent=1) + "\n", encoding="utf-8")
-        _check_same(bundle, made)
-        return made
+        _check_same(bundle, smoothed)
+        return smoothed
 
     def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
         """Return those of the bundle that is smoothed, whose golden action must stay."""
@@ -106,20 +108,10 @@ class SmoothQuant(Calibrated):
         groups = json.loads((made.path / REPORT).read_text(encoding="utf-8"))["groups"]
         count = {how: sum(group["how"] == how for group in groups) for how in ("folded", "inserted", "left")}
         layers = sum(len(group["layers"]) for group in groups if group["how"] != "left")
-        told = f"smoothed what {layers} layers read: {count['folded']} activations folded, {count['inserted']} inserted"
+        text = f"smoothed what {layers} layers read: {count['folded']} activations folded, {count['inserted']} inserted"
         blocked = sum(group["why"] == "only a Mul of its own could divide it" for group in groups)
         more = f" ({blocked} of them for want of --insert)" if blocked else ""
-        return (f"{told}, {count['left']} left as they are{more}",)
-
-    def _plan(self, bundle: Bundle) -> dict[str, list[Group]]:
-        """Return graph -> groups of selected layers."""
-        models = {name: load(bundle.file(bundle.manifest.graphs[name].file)) for name in self.chosen_graphs(bundle)}
-        layers = {name: find_layers(model, OPS) for name, model in models.items()}
-        selected = self.selected([layer.name for found in layers.values() for layer in found], bundle)
-        return {
-            name: find_groups(model, [layer for layer in layers[name] if layer.name in selected])
-            for name, model in models.items()
-        }
+        return (f"{text}, {count['left']} left as they are{more}",)
 
     def _halves(self, observations: list[Sample]) -> list[list[Sample]]:
         """Return all observations, or for ``auto`` every other one and the rest, whose peaks are compared."""
@@ -162,73 +154,58 @@ class SmoothQuant(Calibrated):
         return {**note, "how": how, "why": "", "alpha": alpha, "estimated_loss": float(f"{gain:.4g}")}
 
 
-class _Writer:
+class _Writer(OnnxGraph):
     """Multiplies constants of a graph in place, one reader's copy at a time."""
-
-    def __init__(self, model: Any) -> None:
-        self._onnx = require("onnx", "build")
-        self._graph = model.graph
-        self._constants = {tensor.name: tensor for tensor in model.graph.initializer}
-        self._nodes = {node.output[0]: node for node in model.graph.node}
-        self._layers = {node.name: node for node in model.graph.node}
 
     def weight(self, name: str, axis: int) -> Array:
         """Return a weight as (inputs, outputs)."""
-        values: Array = self._onnx.numpy_helper.to_array(self._constants[name])
-        return values if axis == 1 else values.T
+        return self.array(name) if axis == 1 else self.array(name).T
 
     def apply(self, group: Group, scales: Array) -> None:
         """Divide the value of a group by the scales and multiply its weights by them."""
+        names = {layer.name for layer in group.layers}
+        layers = {node.name: node for node in self.graph.node if node.name in names}
         for edit in group.edits:
             self._multiply(edit, scales)
         for layer in group.layers:
-            self._multiply(Edit(self._layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
-        if not group.edits:
-            self._insert(group, scales)
+            self._multiply(Edit(layers[layer.name].output[0], 1, 1 - layer.axis, power=1), scales)
+        if not group.edits:  # a Mul of its own before the layers
+            value, smooth = group.value, f"{group.value}.smooth"
+            factors = self.add(f"{smooth}.scale", _reciprocals(scales))
+            for node in layers.values():
+                node.input[0] = smooth
+            first = next(iter(layers.values()))
+            self.insert_before(first, self.node("Mul", [value, factors], [smooth], f"{value}/smooth"))
 
     def _multiply(self, edit: Edit, scales: Array) -> None:
-        node = self._nodes[edit.node]
+        node = self.producers[edit.node]
         name = self._own(node, edit.position)
-        values = self._onnx.numpy_helper.to_array(self._constants[name])
+        values = self.array(name)
         if edit.width and values.shape[-1:] != (edit.width,):
             values = np.broadcast_to(values, (*values.shape[:-1], edit.width))
         values = np.array(values, np.float32)
         axis = edit.axis % values.ndim
         place = (*(slice(None),) * axis, slice(edit.start, edit.start + len(scales)))
-        factors = scales if edit.power > 0 else (1 / scales.astype(np.float64)).astype(np.float32)
+        factors = scales if edit.power > 0 else _reciprocals(scales)
         values[place] *= factors.reshape(-1, *(1,) * (values.ndim - 1 - axis))
-        self._constants[name].CopyFrom(self._onnx.numpy_helper.from_array(values, name))
+        self.constants[name].CopyFrom(self.onnx.numpy_helper.from_array(values, name))
 
     def _own(self, node: Any, position: int) -> str:
         """Return the name of a constant that this node alone reads, in this place alone; copy a shared one."""
         name = str(node.input[position])
-        if sum(list(reads(each)).count(name) for each in self._graph.node) == 1:
-            return name
-        copy = f"{name}.{node.name}.{position}"
-        tensor = self._onnx.TensorProto()
-        tensor.CopyFrom(self._constants[name])
-        tensor.name = copy
-        self._graph.initializer.append(tensor)
-        self._constants[copy] = self._graph.initializer[-1]
-        node.input[position] = copy
-        return copy
+        if sum(list(reads(reader)).count(name) for reader in self.graph.node) > 1:
+            node.input[position] = self.add_tensor(self.constants[name], f"{name}.{node.name}.{position}")
+        return str(node.input[position])
 
-    def _insert(self, group: Group, scales: Array) -> None:
-        """Put a Mul before the layers of a group."""
-        value, smooth = group.value, f"{group.value}.smooth"
-        factors = (1 / scales.astype(np.float64)).astype(np.float32)
-        self._graph.initializer.append(self._onnx.numpy_helper.from_array(factors, f"{smooth}.scale"))
-        names = {layer.name for layer in group.layers}
-        places = [place for place, node in enumerate(self._graph.node) if node.name in names]
-        for place in places:
-            self._graph.node[place].input[0] = smooth
-        made = self._onnx.helper.make_node("Mul", [value, f"{smooth}.scale"], [smooth], name=f"{value}/smooth")
-        self._graph.node.insert(min(places), made)
+
+def _reciprocals(scales: Array) -> Array:
+    return (1 / scales.astype(np.float64)).astype(np.float32)
 
 
 def _peaks(statistics: dict[str, dict[str, Statistics]]) -> dict[str, dict[str, Array]]:
     return {
-        graph: {name: np.asarray(each.peaks) for name, each in found.items()} for graph, found in statistics.items()
+        graph: {name: np.asarray(seen.peaks) for name, seen in collected.items()}
+        for graph, collected in statistics.items()
     }
 
 
@@ -237,13 +214,13 @@ def _joint(peaks: list[dict[str, dict[str, Array]]], graph: str, group: Group) -
     return [np.maximum.reduce([half[graph][name] for name in group.activations]) for half in peaks]
 
 
-def _check_same(source: Bundle, made: Bundle) -> None:
+def _check_same(source: Bundle, smoothed: Bundle) -> None:
     """Refuse a bundle whose golden action is not the source's.
 
     Raises:
         GraphError: when it differs by more than float32 rounding explains.
     """
-    before, after = load_golden(source), load_golden(made)
+    before, after = load_golden(source), load_golden(smoothed)
     if before is None or after is None or not _equal(before[:2], after[:2]):
         return
     error = relative_error(after[2], before[2])

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, nearest
-from vlatool.graph.files import foreign_errors, load, read, save
+from vlatool.errors import RecipeError
+from vlatool.graph.files import load, read, save
 from vlatool.graph.layers import (
     Layer,
     Style,
+    calibrated_values,
     check_weights,
     convolved,
     find_layers,
     hoisted,
     split_gemm,
-    wanted_values,
 )
 from vlatool.graph.qdq import Range, insert_qdq
-from vlatool.quantize._base import QUANTIZED_OPS
+from vlatool.quantize._base import QUANTIZED_OPS, check_ops
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._conv1x1 import use_convolutions
 from vlatool.quantize._early import quantize_early
@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     LayoutName = str
 else:
     LayoutName = Literal[tuple(layouts())]
+
+
+FEWER = "quantize fewer: leave out --elementwise or --attention, or use --exclude"
 
 
 class StaticInt8(Calibrated):
@@ -109,8 +112,8 @@ class StaticInt8(Calibrated):
 
     def on(self, profile: Profile) -> Self:
         """Write the layout and the activations that the board's preferred engine takes."""
-        wanted = class_for(profile.engine).int8
-        return self.model_copy(update={name: how for name, how in wanted.items() if name not in self.model_fields_set})
+        options = class_for(profile.engine).int8
+        return self.model_copy(update={name: how for name, how in options.items() if name not in self.model_fields_set})
 
     def used_packages(self) -> tuple[str, ...]:
         """The engine too that the layout is for."""
@@ -118,9 +121,7 @@ class StaticInt8(Calibrated):
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The operators are ones that can be quantized, the layout can compute so, and there is calibration data."""
-        for name in self.ops:
-            if name not in QUANTIZED_OPS:
-                raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
+        check_ops(self.ops)
         library: type[Engine] = engine_class(self.engine)
         if self.compute not in library.computes:
             raise RecipeError(
@@ -140,9 +141,9 @@ class StaticInt8(Calibrated):
         """Calibrate and quantize every selected graph."""
         bundle = source_of(source, self.name())
         self.check(bundle, None)
-        layers, wanted = self.plan(bundle)
+        layers, values = self.plan(bundle)
         samples = SampleSet()
-        found = self.statistics(bundle, wanted, samples, context)
+        statistics = self.statistics(bundle, values, samples, context)
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
@@ -153,7 +154,7 @@ class StaticInt8(Calibrated):
                     pixels = fold_frames(model, {layer.name for layer in layers[name]})
             chosen = self._rewritten(model, layers[name])
             unsigned = convolved(chosen, self.style, hoisted(model, chosen, self.style))
-            insert_qdq(model, chosen, {**self.ranges(found[name], unsigned), **pixels}, self.style)
+            insert_qdq(model, chosen, {**self.ranges(statistics[name], unsigned), **pixels}, self.style)
             if self.form.integer:
                 quantize_early(model)
                 use_integer_matmul(model)
@@ -163,12 +164,7 @@ class StaticInt8(Calibrated):
                 use_convolutions(model)
             save(model, target)
             if self.form.crashes and (self.elementwise or self.attention or self.convolutions):
-                open_apart(
-                    target,
-                    self.engine,
-                    "int8",
-                    "quantize fewer: leave out --elementwise or --attention, or use --exclude",
-                )
+                open_apart(target, self.engine, "int8", FEWER)
             return "" if self.compute == "float32" else self.compute
 
         made_by = self.made_by(calibration=samples)
@@ -182,33 +178,21 @@ class StaticInt8(Calibrated):
             unsigned: Values that are written as uint8 where others are symmetric.
         """
         kind = self.style.activations
+        symmetric = {name: kind in ("int8", "symmetric") and name not in unsigned for name in statistics}
         return {
-            name: choose_range(
-                each,
-                self.method,
-                self.percentile,
-                kind in ("int8", "symmetric") and name not in unsigned,
-                kind == "symmetric",
-            )
-            for name, each in statistics.items()
+            name: choose_range(seen, self.method, self.percentile, symmetric[name], kind == "symmetric")
+            for name, seen in statistics.items()
         }
 
     def plan(self, bundle: Bundle) -> tuple[dict[str, list[Layer]], dict[str, list[str]]]:
         """Return graph -> layers that are quantized, and graph -> values whose ranges that needs."""
-        layers: dict[str, list[Layer]] = {}
-        wanted: dict[str, list[str]] = {}
-        paths = {name: bundle.file(bundle.manifest.graphs[name].file) for name in self.chosen_graphs(bundle)}
-        for name, path in paths.items():
-            with foreign_errors(name):
-                found = find_layers(read(path), self.ops, attention=self.attention, elementwise=self.elementwise)
-            layers[name] = found
-        selected = self.selected([layer.name for found in layers.values() for layer in found], bundle)
-        for name, path in paths.items():
-            layers[name] = [layer for layer in layers[name] if layer.name in selected]
-            model = read(path)
-            check_weights(model, layers[name])
-            wanted[name] = wanted_values(layers[name], self.style, hoisted(model, layers[name], self.style))
-        return layers, wanted
+        layers = self.layers_of(bundle, self.ops, attention=self.attention, elementwise=self.elementwise)
+        values = {}
+        for name, chosen in layers.items():
+            model = read(bundle.file(bundle.manifest.graphs[name].file))
+            check_weights(model, chosen)
+            values[name] = calibrated_values(chosen, self.style, hoisted(model, chosen, self.style))
+        return layers, values
 
     def _rewritten(self, model: Any, layers: list[Layer]) -> list[Layer]:
         """Return the layers as they are after Gemm became MatMul."""
@@ -221,7 +205,5 @@ class StaticInt8(Calibrated):
 
 def _other(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:
     """Return the layouts that can do something, in words."""
-    return (
-        " or ".join(name for name, (layout, engine) in layouts().items() if fits(layout, engine_class(engine)))
-        or "none"
-    )
+    names = [name for name, (layout, engine) in layouts().items() if fits(layout, engine_class(engine))]
+    return " or ".join(names) or "none"

@@ -66,7 +66,7 @@ class WeightOnly(WeightOptions):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to quantize, and calibration data for the methods that need it."""
         if self.calibration and not self.calibration.is_file():
-            raise DataError(f"There is no calibration file {self.calibration}.")
+            raise DataError(f"The calibration file {self.calibration} does not exist.")
         if source is None:
             return
         if self.method in CALIBRATED and not recorded_observations(source, 1, self.calibration):
@@ -116,7 +116,7 @@ class WeightOnly(WeightOptions):
         """Write the graphs and everything else beside the weights, and verify."""
         opsets = plan.save(out)
         carry_over(bundle, out)
-        made_by = {**self.made_by(calibration=samples), **_told(written, out / LOSSES)}
+        made_by = {**self.made_by(calibration=samples), **_summarize(written, out / LOSSES)}
         context.tell("counting", None)
         graphs = {
             name: Graph(f"graphs/{name}.onnx", precision_shares(out / f"graphs/{name}.onnx"), opset)
@@ -134,13 +134,13 @@ class WeightOnly(WeightOptions):
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what a person wants to know about the new bundle."""
-        told = json.loads((made.path / LOSSES).read_text(encoding="utf-8"))
-        again = f", {told['resumed']} of them from the run before" if told["resumed"] else ""
-        if not told["layers"]:
+        report = json.loads((made.path / LOSSES).read_text(encoding="utf-8"))
+        again = f", {report['resumed']} of them from the run before" if report["resumed"] else ""
+        if not report["layers"]:
             return ("no layer was quantized",)
         return (
-            f"{len(told['layers'])} weights in int{self.bits}, blocks of {self.block}{again}; relative L2 error: "
-            f"mean {told['mean']:.4f}, largest {told['max']:.4f} ({told['worst']})",
+            f"{len(report['layers'])} weights in int{self.bits}, blocks of {self.block}{again}; relative L2 error: "
+            f"mean {report['mean']:.4f}, largest {report['max']:.4f} ({report['worst']})",
         )
 
     def _records(self, plan: WeightsPlan, bundle: Bundle, place: Path, samples: SampleSet | None) -> list[Record]:
@@ -162,7 +162,7 @@ def _processes(records: list[Record]) -> int:
     return min(len(os.sched_getaffinity(0)), 8) + 1 if work >= WORTH_PROCESSES else 0
 
 
-def _told(written: Written, file: Path) -> dict[str, Any]:
+def _summarize(written: Written, file: Path) -> dict[str, Any]:
     """Write the loss of every layer to ``reports/weights.json``; return what the manifest says of it."""
     layers = [note for note in written.notes if "error" in note]
     errors = [note["error"] for note in layers]
@@ -170,8 +170,8 @@ def _told(written: Written, file: Path) -> dict[str, Any]:
     mean = sum(errors) / len(errors) if errors else 0.0
     summary = {"mean": round(mean, 6), "max": round(max(errors, default=0.0), 6), "worst": worst}
     file.parent.mkdir(exist_ok=True)
-    told = {**summary, "resumed": written.resumed, "layers": layers}
-    file.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    report = {**summary, "resumed": written.resumed, "layers": layers}
+    file.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     identity = sorted(f"{note['tensor']}:{note.get('first', 0)}:{note['sha256']}" for note in written.notes)
     digest = hashlib.sha256("\n".join(identity).encode()).hexdigest()
     return {"weights_sha256": digest, "weight_error": summary}

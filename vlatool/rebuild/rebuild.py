@@ -17,17 +17,17 @@ from vlatool.files.writing import writing
 from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
-from vlatool.optimize.differences import Compared, compare_bundles
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
+from vlatool.rebuild.differences import Compared, compare_bundles
 from vlatool.sources import source_stage
 from vlatool.stage.base import Context, Transform, build_stage, installed_version, source_of, stage_class
-from vlatool.stage.finish import DECIDED, HANDED_OUT, history, reseal
+from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
 Entry = dict[str, Any]
-TOLD_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
-"""How an option that is a file is told in a record."""
+RECORDED_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
+"""How a record names a file that an option gives."""
 
 
 @dataclass(frozen=True)
@@ -68,20 +68,20 @@ class _Start:
     source: str
     bundle: Bundle | None
     stages: tuple[tuple[Entry, Transform | None], ...]
-    """An entry without a stage is the one in which ``optimize`` hands a candidate out."""
+    """An entry without a stage is the one in which ``optimize`` finalizes a candidate."""
 
 
 @dataclass
 class _Places:
     """Where files that an option names are looked for."""
 
-    given: tuple[Path, ...]
+    files: tuple[Path, ...]
     folders: list[Path] = field(default_factory=list)
 
     def find(self, name: str, digest: str, stage: str) -> Path:
         """Return the file of that name, which the record holds too, whose SHA-256 begins with ``digest``."""
         others = []
-        for path in (*self.given, *(folder / name for folder in self.folders)):
+        for path in (*self.files, *(folder / name for folder in self.folders)):
             if path.is_file():
                 got = hash_file(path)
                 if path.name == name and got.startswith(digest):
@@ -98,26 +98,22 @@ def build_record(bundle: Bundle) -> tuple[Entry, ...]:
     """Return the entries of a bundle's build record, checked.
 
     Raises:
-        BundleError: when there is none (made by an older vlatool), or an entry makes no sense.
+        BundleError: when there is none (made by an older vlatool), or an entry is invalid.
     """
     entries = history(bundle)
     if not entries:
-        made = bundle.manifest.made_by.get("vlatool", "an unknown version")
+        version = bundle.manifest.made_by.get("vlatool", "an unknown version")
         raise BundleError(
-            f"{bundle.path} has no build record; vlatool {made} made it before there was one, or not by a stage.",
+            f"{bundle.path} has no build record; vlatool {version} did not write one yet, or no stage made it.",
             "make the bundle again, with the command that made it",
         )
     for number, entry in enumerate(entries):
-        stage = entry.get("stage")
+        where, stage = f"Entry {number} of the build record of {bundle.path}", entry.get("stage")
         mappings = all(isinstance(entry.get(name, {}), Mapping) for name in ("options", "versions", "files", "graphs"))
         if not (isinstance(stage, str) and mappings and isinstance(entry.get("input", ""), str)):
-            raise BundleError(
-                f"Entry {number} of the build record of {bundle.path} makes no sense: {json.dumps(entry)[:200]}."
-            )
+            raise BundleError(f"{where} is invalid: {json.dumps(entry)[:200]}.")
         if number and stage.startswith("sources."):
-            raise BundleError(
-                f"Entry {number} of the build record of {bundle.path} is a source; only the first may be."
-            )
+            raise BundleError(f"{where} is a source; only the first may be.")
     return entries
 
 
@@ -151,7 +147,7 @@ def rebuild(
 
     Args:
         bundle: The bundle to make again; verified.
-        context: Whom to tell.
+        context: For progress.
         source: Policy directory, ``path.py:make``, ONNX file, or a bundle that is the input of a recorded stage; where
             the policy was when the bundle was made, if not given.
         files: Files that options name and that are not beside the source.
@@ -168,20 +164,24 @@ def rebuild(
     start = _start(bundle, entries, source, files, cache)
     same: list[tuple[str, bool]] = []
     with tempfile.TemporaryDirectory(prefix="vlatool-rebuild-") as scratch:
-        made = start.bundle
+        product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
-            before, place = made, Path(scratch) / f"{number}-{entry['stage']}"
-            made = _hand_out(entry, before, place) if stage is None else run_transform(stage, before, place, context)
-            same.append((entry["stage"], _graphs_as_recorded(entry, made)))
+            before, place = product, Path(scratch) / f"{number}-{entry['stage']}"
+            product = (
+                _finalized(entry, before, place) if stage is None else run_transform(stage, before, place, context)
+            )
+            same.append((entry["stage"], _graphs_as_recorded(entry, product)))
             if before is not None and before is not start.bundle:
                 shutil.rmtree(before.path)
-        made = source_of(made, "rebuild")
+        product = source_of(product, "rebuild")
         left_out = ("accuracy",) if "candidate" in bundle.manifest.made_by else ()
-        compared = compare_bundles(bundle, made, left_out)
+        compared = compare_bundles(bundle, product, left_out)
         if out is not None:
             with writing(out, force=force) as draft:
-                shutil.copytree(made.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER))
-        return Rebuilt(bundle, made.hash, start.source, compared, tuple(same), left_out)
+                shutil.copytree(
+                    product.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER)
+                )
+        return Rebuilt(bundle, product.hash, start.source, compared, tuple(same), left_out)
 
 
 def _start(
@@ -205,7 +205,7 @@ def _start(
         policy = getattr(first, "model", None) or getattr(first, "policy", None)
         if policy is not None:
             places.folders.insert(0, policy if policy.is_dir() else policy.parent)
-    stages = [(entry, None if entry["stage"] == HANDED_OUT else _stage(entry, places)) for entry in later]
+    stages = [(entry, None if entry["stage"] == FINALIZED else _stage(entry, places)) for entry in later]
     beginning = [] if first is None else [(entries[0], first)]
     return _Start(str(source), begin, (*beginning, *stages))
 
@@ -215,9 +215,9 @@ def _from_bundle(begin: Bundle, entries: tuple[Entry, ...], bundle: Bundle) -> t
     for number, entry in enumerate(entries):
         if entry.get("input") == begin.hash:
             return entries[number:]
-    wanted = ", ".join(f"{entry['stage']} from {entry['input'][:19]}" for entry in entries if entry.get("input"))
+    inputs = ", ".join(f"{entry['stage']} from {entry['input'][:19]}" for entry in entries if entry.get("input"))
     raise BundleError(
-        f"{begin.path} is {begin.hash[:19]}, from which no stage of {bundle.path} started; recorded: {wanted}.",
+        f"{begin.path} is {begin.hash[:19]}, from which no stage of {bundle.path} started; recorded: {inputs}.",
         "pass the bundle of one of these hashes, or the policy",
     )
 
@@ -228,15 +228,13 @@ def _stage(entry: Entry, places: _Places) -> Transform:
     fields = stage_class(name).model_fields
     for key, value in options.items():
         if key in fields and Path in (fields[key].annotation, *get_args(fields[key].annotation)) and value is not None:
-            told = TOLD_FILE.fullmatch(str(value))
-            if told is None:
+            match = RECORDED_FILE.fullmatch(str(value))
+            if match is None:
                 raise BundleError(f"The build record names the file '{value}' of {name} without its hash.")
-            options[key] = places.find(told["name"], told["hash"], name)
+            options[key] = places.find(match["name"], match["hash"], name)
     stage = build_stage(name, options)
     if not isinstance(stage, Transform):
-        raise BundleError(
-            f"The build record names the stage {name}, which measures; only stages that make a bundle do."
-        )
+        raise BundleError(f"The build record names {name}, which measures; it may only name stages that make bundles.")
     return stage
 
 
@@ -269,7 +267,7 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
     stage.check(None, None)
     got, recorded = stage.input_hashes(), entry.get("files", {})
     wrong = [
-        f"{name}: got {_told(got.get(name))}, recorded {_told(recorded.get(name))}"
+        f"{name}: got {_short_hash(got.get(name))}, recorded {_short_hash(recorded.get(name))}"
         for name in dict.fromkeys([*recorded, *got])
         if got.get(name) != recorded.get(name)
     ]
@@ -282,7 +280,7 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
     return stage
 
 
-def _told(digest: str | None) -> str:
+def _short_hash(digest: str | None) -> str:
     return f"sha256:{digest[:16]}" if digest else "no such file"
 
 
@@ -290,31 +288,30 @@ def _noted_places(bundle: Bundle, entries: tuple[Entry, ...], cache: Path) -> It
     """Yield where the source may be: as the bundle or the cached source bundle notes.
 
     Raises:
-        SourceError: when the user neither named nor trusted that folder.
+        SourceError: when the user has neither named nor trusted that folder.
     """
     description = next(iter(entries[0].get("files", {})), "policy.yaml")
-    wanted = entries[1].get("input") if len(entries) > 1 else bundle.hash
+    source_hash = entries[1].get("input") if len(entries) > 1 else bundle.hash
     cached = [path.parent for path in sorted((cache / "stages").glob(f"{entries[0]['stage']}-*/{MANIFEST}"))]
     refused: SourceError | None = None
-    for noted in [bundle.path, *(path for path in cached if f"sha256:{hash_file(path / MANIFEST)}" == wanted)]:
-        if (noted / LOCATION).is_file():
-            try:
-                folder = read_location(noted)
-            except SourceError:
-                continue
-            try:
-                trust.require(folder, "the policy's code")
-            except SourceError as error:
-                refused = refused or error
-                continue
-            yield str(folder / description)
+    for noted in [bundle.path, *(path for path in cached if f"sha256:{hash_file(path / MANIFEST)}" == source_hash)]:
+        try:
+            folder = read_location(noted)
+        except SourceError:
+            continue
+        try:
+            trust.require(folder, "the policy's code")
+        except SourceError as error:
+            refused = refused or error
+            continue
+        yield str(folder / description)
     if refused:
         raise SourceError(refused.message, f"name the policy: --source DIR; or {refused.fix}")
 
 
-def _hand_out(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
+def _finalized(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
     """Seal a candidate as ``optimize`` does; what it measured and decided is taken from the record."""
-    bundle = source_of(bundle, HANDED_OUT)
+    bundle = source_of(bundle, FINALIZED)
     out.mkdir()
     manifest = replace(
         bundle.manifest,
@@ -327,6 +324,6 @@ def _hand_out(entry: Entry, bundle: Bundle | None, out: Path) -> Bundle:
     return reseal(bundle, out, manifest, ROBOT_FOLDERS)
 
 
-def _graphs_as_recorded(entry: Entry, made: Bundle) -> bool:
-    files = {name: record.sha256 for name, record in made.manifest.files.items()}
+def _graphs_as_recorded(entry: Entry, bundle: Bundle) -> bool:
+    files = {name: record.sha256 for name, record in bundle.manifest.files.items()}
     return all(files.get(name) == digest for name, digest in entry.get("graphs", {}).items())

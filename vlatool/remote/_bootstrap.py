@@ -62,8 +62,8 @@ class Line:
         """Return exactly so many bytes."""
         while len(self._pending) < count:
             self._more(count - len(self._pending))
-        found, self._pending = self._pending[:count], self._pending[count:]
-        return found
+        taken, self._pending = self._pending[:count], self._pending[count:]
+        return taken
 
     def message(self) -> dict[str, Any]:
         """Return the next line of JSON; empty lines are signs of life."""
@@ -75,10 +75,10 @@ class Line:
             line, _, self._pending = self._pending.partition(b"\n")
             if line.strip():
                 try:
-                    found: dict[str, Any] = json.loads(line)
+                    message: dict[str, Any] = json.loads(line)
                 except ValueError as error:
                     raise Refused("corrupt", "a line that is no message") from error
-                return found
+                return message
 
     def listen(self) -> None:
         """Take signs of life; ends the run when the other side is gone."""
@@ -88,10 +88,10 @@ class Line:
     def _more(self, count: int) -> None:
         if not select.select([0], [], [], QUIET_S)[0]:
             raise Stop
-        found = os.read(0, min(max(count, BLOCK), 1 << 20))
-        if not found:
+        received = os.read(0, min(max(count, BLOCK), 1 << 20))
+        if not received:
             raise Stop
-        self._pending += found
+        self._pending += received
 
 
 def unpack(packed: bytes, root: Path) -> None:
@@ -152,29 +152,29 @@ def run(line: Line, place: Place, guard: Guard, message: dict[str, Any]) -> dict
 
 def _follow(line: Line, agent: subprocess.Popen[bytes]) -> bytes:
     """Tell what the agent says until it has ended, and return the end of what it logged."""
-    said, logged = cast(IO[bytes], agent.stdout).fileno(), cast(IO[bytes], agent.stderr).fileno()
-    streams, rest, log = [said, logged], b"", b""
-    heard, ended = time.monotonic(), 0.0
+    output, logged = cast(IO[bytes], agent.stdout).fileno(), cast(IO[bytes], agent.stderr).fileno()
+    streams, rest, log = [output, logged], b"", b""
+    last_sign, ended = time.monotonic(), 0.0
     while streams or agent.poll() is None:
         ready = select.select([0, *streams], [], [], 1 if streams else 0.02)[0]
         now = time.monotonic()
         if 0 in ready:
             line.listen()
-            heard = now
-        if now - heard > QUIET_S:
+            last_sign = now
+        if now - last_sign > QUIET_S:
             raise Stop
         for handle in set(ready) & set(streams):
-            found = os.read(handle, 1 << 16)
-            streams = [other for other in streams if found or other != handle]
+            received = os.read(handle, 1 << 16)
+            streams = [other for other in streams if received or other != handle]
             if handle == logged:
-                log = (log + found)[-LOG:]
+                log = (log + received)[-LOG:]
                 continue
-            *lines, rest = (rest + found).split(b"\n") if b"\n" in found or not found else (rest + found,)
-            for each in [*lines, *([rest] if not found else [])]:
-                if each.lstrip().startswith(b"{"):
-                    line.say(agent=each.decode("utf-8", "replace"))
+            *lines, rest = (rest + received).split(b"\n") if b"\n" in received or not received else (rest + received,)
+            for text in [*lines, *([rest] if not received else [])]:
+                if text.lstrip().startswith(b"{"):
+                    line.say(agent=text.decode("utf-8", "replace"))
                 else:
-                    log = (log + each + b"\n" * bool(each))[-LOG:]
+                    log = (log + text + b"\n" * bool(text))[-LOG:]
         if agent.poll() is not None:
             kill(agent.pid)
             ended = ended or now

@@ -236,10 +236,10 @@ class Connection:
     def _hear(self) -> None:
         """Take what ssh and the target's standard error say; its end is kept."""
         with contextlib.suppress(BlockingIOError, ValueError):
-            found = os.read(self._err.fileno(), BLOCK)
-            self._said = (self._said + found)[-SAID:]
-            self._count(len(found))
-            if not found:
+            received = os.read(self._err.fileno(), BLOCK)
+            self._said = (self._said + received)[-SAID:]
+            self._count(len(received))
+            if not received:
                 self._err.close()
 
     def _count(self, count: int) -> None:
@@ -261,11 +261,11 @@ class Connection:
 
     def _take(self) -> bool:
         """Take what has come; False at the end."""
-        found = os.read(self._out.fileno(), BLOCK)
-        self._count(len(found))
-        self._buffer += found
+        received = os.read(self._out.fileno(), BLOCK)
+        self._count(len(received))
+        self._buffer += received
         mark = self.marker.encode()
-        if b"\n" in found:
+        if b"\n" in received:
             *lines, self._buffer = self._buffer.split(b"\n")
             for line in lines:
                 _, marked, rest = line.partition(mark)
@@ -277,4 +277,4 @@ class Connection:
             check("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
         elif len(self._buffer) > NOISE:
             self._buffer = self._buffer[-len(mark) :]
-        return bool(found)
+        return bool(received)

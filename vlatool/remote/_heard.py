@@ -5,18 +5,59 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from vlatool.errors import TargetError
+from vlatool.files.messages import from_json
 from vlatool.files.printable import one_line, printable
 
+T = TypeVar("T")
 DEEPEST = 32
 LARGEST = 1e18
 """Largest number that a measurement can be; bytes and nanoseconds of a day are far below."""
-FACTS: dict[str, type | tuple[type, ...]] = {
-    "command": str, "version": list, "packages": dict, "errors": dict, "architecture": str, "kernel": str,
-    "free": (int, type(None)),
-}  # fmt: skip
+MOST_PACKAGES = 64
+
+
+@dataclass(frozen=True)
+class Python:
+    """What a Python of the target says of itself.
+
+    Args:
+        command: As ``sh`` there finds it.
+        version: Major, minor, micro.
+        packages: Name -> version, of those asked for that it can import.
+        errors: Name -> why it cannot.
+        architecture, kernel: Of the machine.
+        free: Bytes where its cache directory is; None when it cannot tell.
+        managed: Whether it is one that pip must not change (PEP 668).
+    """
+
+    command: str
+    version: tuple[int, int, int]
+    packages: dict[str, str]
+    errors: dict[str, str]
+    architecture: str
+    kernel: str
+    free: int | None
+    managed: bool = False
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How the agent on the target ended, and the last that it logged."""
+
+    code: int
+    log: str
+
+
+@dataclass(frozen=True)
+class NoRoom:
+    """What the target says when its disk is too full for what is sent."""
+
+    free: int
+    need: int
+    path: str
 
 
 def parsed(text: bytes | str, target: str) -> dict[str, Any]:
@@ -26,12 +67,12 @@ def parsed(text: bytes | str, target: str) -> dict[str, Any]:
         TargetError: when it is no mapping of plain values with finite numbers.
     """
     try:
-        found = json.loads(text, parse_constant=_no_number)
+        message = json.loads(text, parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
         raise nonsense(target, one_line(str(error), 200)) from error
-    if not isinstance(found, dict):
-        raise nonsense(target, f"a message is a {type(found).__name__}")
-    checked: dict[str, Any] = sane(found, target)
+    if not isinstance(message, dict):
+        raise nonsense(target, f"a message is a {type(message).__name__}")
+    checked: dict[str, Any] = sane(message, target)
     return checked
 
 
@@ -48,58 +89,43 @@ def sane(value: Any, target: str, depth: int = 0) -> Any:
     if isinstance(value, (int, float)) and not (math.isfinite(value) and abs(value) <= LARGEST):
         raise nonsense(target, "a number is too large")
     if isinstance(value, list):
-        return [sane(each, target, depth + 1) for each in value]
+        return [sane(item, target, depth + 1) for item in value]
     if isinstance(value, dict):
-        return {printable(name): sane(each, target, depth + 1) for name, each in value.items()}
+        return {printable(name): sane(item, target, depth + 1) for name, item in value.items()}
     return value
 
 
-def facts_of(heard: Mapping[str, Any], target: str) -> dict[str, Any]:
-    """Return what the target says of a Python; empty when the message is of something else.
+def told(kind: type[T], value: Any, target: str, where: str) -> T:
+    """Return what the target says, as an object of a type.
+
+    Raises:
+        TargetError: when it is not of that type.
+    """
+    try:
+        return from_json(kind, value, where)
+    except ValueError as error:
+        raise nonsense(target, one_line(str(error), 200)) from error
+
+
+def python_of(facts: Any, target: str) -> Python:
+    """Return what the target says of a Python, each text on a line of its own.
 
     Raises:
         TargetError: when something of it is missing or of another type.
     """
-    if "python" not in heard:
-        return {}
-    found = heard["python"]
-    if not isinstance(found, dict):
-        raise nonsense(target, "the facts of a Python are no mapping")
-    for name, kind in FACTS.items():
-        if not isinstance(found.get(name), kind) or isinstance(found.get(name), bool):
-            raise nonsense(target, f"'{name}' of a Python is {one_line(repr(found.get(name)), 80)}")
-    if len(found["version"]) != 3 or not all(type(each) is int for each in found["version"]):
-        raise nonsense(target, f"the version of a Python is {one_line(repr(found['version']), 80)}")
-    if not all(isinstance(each, str) for each in (*found["packages"].values(), *found["errors"].values())):
-        raise nonsense(target, "a package of a Python is no text")
-    told = {name: one_line(value) if isinstance(value, str) else value for name, value in found.items()}
-    return {**told, **{name: _lines(found[name]) for name in ("packages", "errors")}}
+    python = told(Python, facts, target, "python")
+    return replace(
+        python,
+        command=one_line(python.command),
+        architecture=one_line(python.architecture),
+        kernel=one_line(python.kernel),
+        packages=_lines(python.packages),
+        errors=_lines(python.errors),
+    )
 
 
 def _lines(texts: Mapping[str, str]) -> dict[str, str]:
-    return {one_line(name, 80): one_line(text) for name, text in list(texts.items())[:64]}
-
-
-def text_of(heard: Mapping[str, Any], name: str, target: str) -> str:
-    """Return a text of a message.
-
-    Raises:
-        TargetError: when there is none.
-    """
-    if not isinstance(heard.get(name), str):
-        raise nonsense(target, f"'{name}' is {one_line(repr(heard.get(name)), 80)}, no text")
-    return str(heard[name])
-
-
-def number_of(heard: Mapping[str, Any], name: str, target: str) -> int:
-    """Return a whole number of a message.
-
-    Raises:
-        TargetError: when there is none.
-    """
-    if type(heard.get(name)) is not int:
-        raise nonsense(target, f"'{name}' is {one_line(repr(heard.get(name)), 80)}, no whole number")
-    return int(heard[name])
+    return {one_line(name, 80): one_line(text) for name, text in list(texts.items())[:MOST_PACKAGES]}
 
 
 def nonsense(target: str, what: str) -> TargetError:
@@ -111,4 +137,4 @@ def nonsense(target: str, what: str) -> TargetError:
 
 
 def _no_number(text: str) -> float:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")

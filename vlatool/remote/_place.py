@@ -90,8 +90,8 @@ class Place:
 
     def room(self) -> int:
         """Return how many bytes are free."""
-        found = os.statvfs(self.path)
-        return found.f_bavail * found.f_frsize
+        disk = os.statvfs(self.path)
+        return disk.f_bavail * disk.f_frsize
 
     def remove(self) -> str:
         """Remove the directory and the parents that are empty and vlatool's, and return what is left."""
@@ -109,12 +109,12 @@ class Place:
         if self._shared is None:
             return
         with contextlib.suppress(OSError):
-            made = self._shared / MADE
-            found = os.listdir(self._shared)
+            record = self._shared / MADE
+            left = os.listdir(self._shared)
             parents = [self._shared, self._shared.parent]
-            if found == [MADE]:
-                parents += map(Path, made.read_text(encoding="utf-8", errors="surrogateescape").split("\0"))
-                made.unlink()
+            if left == [MADE]:
+                parents += map(Path, record.read_text(encoding="utf-8", errors="surrogateescape").split("\0"))
+                record.unlink()
             for parent in parents:
                 parent.rmdir()
 
@@ -165,10 +165,10 @@ def _guard(waits: int, place: Place) -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     for handle in (0, 1, 2):
         os.dup2(nothing, handle)
-    told = b""
-    while found := os.read(waits, BLOCK):
-        told += found
-    words = told.decode().split()
+    received = b""
+    while block := os.read(waits, BLOCK):
+        received += block
+    words = received.decode().split()
     if "done" not in words:
         for word in words:
             kill(int(word))

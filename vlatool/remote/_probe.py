@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from vlatool.errors import MissingExtra, TargetError, VlatoolError
+from vlatool.remote._heard import Python
 from vlatool.runtime.engine import engine_class
 
 OLDEST = (3, 10)
@@ -79,13 +79,13 @@ def script(marker: str, python: str, packages: Sequence[str]) -> bytes:
     """Return what ``sh`` on the target runs: it finds a Python, which then runs ``_bootstrap``."""
     values = {
         "marker": shlex.quote(marker),
-        "candidates": " ".join(_word(each) for each in ([python] if python else CANDIDATES)),
+        "candidates": " ".join(map(_word, [python] if python else CANDIDATES)),
         "question": shlex.quote(QUESTION),
         "packages": " ".join(map(shlex.quote, packages)),
         "incomplete": str(INCOMPLETE),
         "program": shlex.quote(program()),
     }
-    return re.sub("@(" + "|".join(values) + r")\b", lambda found: values[found[1]], SCRIPT).encode()
+    return re.sub("@(" + "|".join(values) + r")\b", lambda name: values[name[1]], SCRIPT).encode()
 
 
 def program() -> str:
@@ -102,43 +102,47 @@ def _word(python: str) -> str:
     return '"$HOME"/' + shlex.quote(python[2:]) if python.startswith("~/") else shlex.quote(python)
 
 
-def refusal(target: str, python: str, told: Sequence[Mapping[str, Any]], packages: Sequence[str]) -> VlatoolError:
+def dotted(version: Iterable[int]) -> str:
+    """Return ``3.11.2``."""
+    return ".".join(map(str, version))
+
+
+def refusal(
+    target: str, python: str, pythons: Sequence[Python], codes: Sequence[int], packages: Sequence[str]
+) -> VlatoolError:
     """Return the error for a target none of whose Pythons can measure.
 
     Args:
         target: As ``ssh`` takes it.
         python: The one that the user named, or empty.
-        told: What the probe said: facts of Pythons, and codes of those that broke.
+        pythons: Those that answered.
+        codes: With what those ended that broke.
         packages: What must be importable.
     """
-    facts = [each["python"] for each in told if "python" in each]
-    new = [each for each in facts if tuple(each["version"][:2]) >= OLDEST]
+    new = [other for other in pythons if other.version[:2] >= OLDEST]
     if new:
-        return _lacking(target, min(new, key=lambda each: len(each["errors"])))
-    oldest = ".".join(map(str, OLDEST))
-    fix = f"install Python {oldest} or later there, or name one: --remote-python /path/to/venv/bin/python"
-    if facts:
-        found = ", ".join(f"{each['command']} is {'.'.join(map(str, each['version']))}" for each in facts)
-        return TargetError(f"The Python of {target} is too old: {found}; {oldest} or later is needed.", fix)
-    for each in told:
-        if "broken" in each:
-            which = python or "python3"
-            names = " and ".join(packages)
-            command = f"{which} -c 'import {', '.join(packages)}'"
-            return TargetError(
-                f"{which} on {target} ended with code {each['broken']} when it was to import {names}.",
-                f'see what it says: ssh {target} "{command}"',
-            )
+        return _lacking(target, min(new, key=lambda other: len(other.errors)))
+    fix = f"install Python {dotted(OLDEST)} or later there, or name one: --remote-python /path/to/venv/bin/python"
+    if pythons:
+        versions = ", ".join(f"{other.command} is {dotted(other.version)}" for other in pythons)
+        return TargetError(f"The Python of {target} is too old: {versions}; {dotted(OLDEST)} or later is needed.", fix)
+    if codes:
+        which = python or "python3"
+        names = " and ".join(packages)
+        return TargetError(
+            f"{which} on {target} ended with code {codes[0]} when it was to import {names}.",
+            f"see what it says: ssh {target} \"{which} -c 'import {', '.join(packages)}'\"",
+        )
     named = f"{python}: no such program" if python else f"none of {', '.join(CANDIDATES)} is found"
     return TargetError(f"{target} has no Python to measure with ({named}).", fix)
 
 
-def _lacking(target: str, facts: Mapping[str, Any]) -> MissingExtra:
-    command, errors = facts["command"], facts["errors"]
+def _lacking(target: str, python: Python) -> MissingExtra:
+    command, errors = python.command, python.errors
     reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
     lacking = " ".join(errors)
     fix = f"ssh {target} {command} -m pip install {lacking}"
-    if facts.get("managed"):
+    if python.managed:
         venv = "vlatool-venv/bin/python"
         fix = (
             f"ssh {target} '{command} -m venv --system-site-packages vlatool-venv && {venv} -m pip install {lacking}', "
@@ -146,7 +150,7 @@ def _lacking(target: str, facts: Mapping[str, Any]) -> MissingExtra:
         fix += f"then --remote-python '~/{venv}'"
     else:
         fix += "; or name a Python that has them: --remote-python /path/to/venv/bin/python"
-    version = ".".join(map(str, facts["version"]))
+    version = dotted(python.version)
     return MissingExtra(
         f"{command} on {target} (Python {version}) cannot import {' and '.join(errors)}: {reasons}.", fix
     )

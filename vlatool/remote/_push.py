@@ -138,8 +138,8 @@ def _bundle(bundle: Bundle, folder: str) -> Iterator[Item]:
             )
         yield Item(f"{folder}/{name}", record.bytes, path, sha256=record.sha256)
     content = manifest_bytes(bundle.manifest)
-    for name, told in ((MANIFEST, content), (DIGEST, digest_of(content))):
-        yield Item(f"{folder}/{name}", len(told), content=told)
+    for name, text in ((MANIFEST, content), (DIGEST, digest_of(content))):
+        yield Item(f"{folder}/{name}", len(text), content=text)
 
 
 def _tar(pieces: Sequence[tuple[str, bytes]]) -> bytes:

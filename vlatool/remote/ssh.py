@@ -17,10 +17,10 @@ import vlatool
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.files.printable import one_line
-from vlatool.measurement.child import SAID, message, raise_said, signal_name
+from vlatool.measurement.child import Progress, Raised, Result, error_of, read_line, signal_name
 from vlatool.remote import _probe, _push
 from vlatool.remote._connection import AGAIN, Connection
-from vlatool.remote._heard import facts_of, nonsense, number_of, parsed, sane, text_of
+from vlatool.remote._heard import Ended, NoRoom, Python, nonsense, parsed, python_of, sane, told
 from vlatool.stage.base import Tell
 
 AGENT = "vlatool.measurement.agent"
@@ -78,22 +78,22 @@ def measure_on(
     connection.allow(float(job.get("duration") or 0))
     try:
         connection.send(_probe.script(connection.marker, python, packages))
-        facts = _find_python(connection, target, python, packages, connect_timeout_s)
-        tell(_about(target, facts), None)
+        there = _find_python(connection, target, python, packages, connect_timeout_s)
+        tell(_about(target, there), None)
         place = _send(connection, target, load, tell)
         connection.doing = "while it measured"
-        there = {f"{place}/{name}": str(path) for name, path in zip(load.bundles, bundles, strict=True)}
+        paths = {f"{place}/{name}": str(path) for name, path in zip(load.bundles, bundles, strict=True)}
         connection.tell({"module": AGENT, "job": {**job, "bundles": []}, "bundles": load.bundles})
-        result = _follow(connection, target, there, tell)
+        result = _follow(connection, target, paths, tell)
     finally:
         connection.dispose()
-    known = {name: facts[name] for name in ("architecture", "kernel", "packages")}
-    return {**result, "target": {"python": ".".join(map(str, facts["version"])), **known}}
+    known = {name: getattr(there, name) for name in ("architecture", "kernel", "packages")}
+    return {**result, "target": {"python": _probe.dotted(there.version), **known}}
 
 
 def _check(target: str, python: str) -> None:
     """Refuse what ssh would take for an option, or a shell for more than a name."""
-    if not target or target.startswith("-") or any(each.isspace() or not each.isprintable() for each in target):
+    if not target or target.startswith("-") or any(letter.isspace() or not letter.isprintable() for letter in target):
         raise UsageError(
             f"The target {target!r} is not a machine that ssh can reach.",
             "give user@host, or a Host of ~/.ssh/config",
@@ -104,32 +104,31 @@ def _check(target: str, python: str) -> None:
 
 def _find_python(
     connection: Connection, target: str, python: str, packages: Sequence[str], connect_timeout_s: float
-) -> dict[str, Any]:
-    """Return the facts of the Python that runs on the target from now on."""
+) -> Python:
+    """Return the Python that runs on the target from now on."""
     connection.receive(connect_timeout_s + SHELL_S)
     connection.doing = "while it looked for a Python"
-    told: list[dict[str, Any]] = []
-    while True:
-        told.append(heard := connection.receive(PROBE_S))
+    pythons: list[Python] = []
+    codes: list[int] = []
+    for _ in range(MOST_PYTHONS):
+        heard = connection.receive(PROBE_S)
         if "none" in heard:
-            raise _probe.refusal(target, python, told, packages)
-        if len(told) > MOST_PYTHONS:
-            raise nonsense(target, f"it has more than {MOST_PYTHONS} Pythons")
-        facts = facts_of(heard, target)
-        if facts:
-            told[-1] = {"python": facts}
+            raise _probe.refusal(target, python, pythons, codes, packages)
+        if "python" in heard:
+            pythons.append(python_of(heard["python"], target))
+            if set(packages) == set(pythons[-1].packages):
+                return pythons[-1]
         elif "broken" in heard:
-            told[-1] = {"broken": number_of(heard, "broken", target)}
-        if facts and set(packages) == set(facts["packages"]):
-            return facts
+            codes.append(told(int, heard["broken"], target, "broken"))
+    raise nonsense(target, f"it has more than {MOST_PYTHONS} Pythons")
 
 
-def _about(target: str, facts: Mapping[str, Any]) -> str:
+def _about(target: str, python: Python) -> str:
     """Say what the target is."""
-    packages = [f"{name} {version}" for name, version in facts["packages"].items()]
-    room = [] if facts["free"] is None else [f"{facts['free'] / 1e9:.1f} GB free"]
-    version = ".".join(map(str, facts["version"]))
-    return f"{target}: " + ", ".join([f"Python {version}", facts["architecture"], *packages, *room])
+    packages = [f"{name} {version}" for name, version in python.packages.items()]
+    room = [] if python.free is None else [f"{python.free / 1e9:.1f} GB free"]
+    version = f"Python {_probe.dotted(python.version)}"
+    return f"{target}: " + ", ".join([version, python.architecture, *packages, *room])
 
 
 def _send(connection: Connection, target: str, load: _push.Load, tell: Tell) -> str:
@@ -139,7 +138,7 @@ def _send(connection: Connection, target: str, load: _push.Load, tell: Tell) -> 
     answer = connection.receive(PLACE_S)
     if "ready" not in answer:
         raise _refused(target, answer)
-    place = text_of(answer, "ready", target)
+    place = told(str, answer["ready"], target, "ready")
     sent = 0
     for packed, size in load.packed():
         connection.doing = f"while files were sent ({sent / 1e6:.1f} of {load.size / 1e6:.1f} MB)"
@@ -159,12 +158,10 @@ def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:
             f"{target} has no directory to write to: {text}.", "set TMPDIR or XDG_CACHE_HOME there to one that has room"
         )
     if word == "no room":
-        found = parsed(str(answer["text"]), target)
-        need, free = (number_of(found, name, target) for name in ("need", "free"))
-        numbers = f"{need / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free"
+        disk = told(NoRoom, parsed(str(answer["text"]), target), target, "room")
+        numbers = f"{disk.need / 1e6:.1f} MB are needed, {disk.free / 1e6:.1f} MB are free"
         return OutputError(
-            f"The disk of {target} is too full: {numbers} below {one_line(str(found.get('path')))}.",
-            "free some space there",
+            f"The disk of {target} is too full: {numbers} below {one_line(disk.path)}.", "free some space there"
         )
     if word == "full":
         return OutputError(f"The disk of {target} became full: {text}.", "free some space there")
@@ -173,45 +170,39 @@ def _refused(target: str, answer: Mapping[str, Any]) -> VlatoolError:
     return TargetError(f"{target} could not run the benchmark: {text or one_line(str(answer))}.", AGAIN)
 
 
-def _follow(connection: Connection, target: str, there: Mapping[str, str], tell: Tell) -> dict[str, Any]:
-    """Pass on what the agent tells until it has ended, and return its result."""
-    answer: dict[str, Any] = {}
+def _follow(connection: Connection, target: str, paths: Mapping[str, str], tell: Tell) -> dict[str, Any]:
+    """Pass on what the agent tells until it has ended, and return its result.
+
+    Args:
+        connection, target: To whom.
+        paths: Directory there -> the bundle's directory here, which messages name in its place.
+        tell: For progress.
+    """
+    answer: Result | Raised | None = None
     while True:
         heard = connection.receive(alive=True)
         if "agent" in heard:
-            said = _said(text_of(heard, "agent", target), there, target)
-            if "progress" in said:
-                _pass_on(said["progress"], tell)
-            elif "result" in said or SAID in said:
-                answer = said
+            line = told(str, heard["agent"], target, "agent")
+            for there, here in paths.items():
+                line = line.replace(json.dumps(there)[1:-1], json.dumps(here)[1:-1])
+            match read_line(line, lambda values: sane(values, target)):
+                case Progress(what, share):
+                    tell(one_line(what), share)
+                case (Result() | Raised()) as last:
+                    answer = last
         elif "ended" in heard or "refused" in heard:
             if heard.get("left"):
                 tell(f"{target} could not remove {one_line(str(heard['left']))}", None)
             if "refused" in heard:
                 raise _refused(target, heard)
-            return _result(target, answer, sane(heard["ended"], target))
+            return _result(target, answer, told(Ended, heard["ended"], target, "ended"))
 
 
-def _said(line: str, there: Mapping[str, str], target: str) -> dict[str, Any]:
-    """Return a line of the agent, with the bundles under their local names; empty for anything else."""
-    for remote, local in there.items():
-        line = line.replace(json.dumps(remote)[1:-1], json.dumps(local)[1:-1])
-    found: dict[str, Any] = sane(message(line), target)
-    return found
-
-
-def _pass_on(progress: Any, tell: Tell) -> None:
-    match progress:
-        case [str(what), (int() | float() | None) as share]:
-            tell(one_line(what), share)
-
-
-def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) -> dict[str, Any]:
+def _result(target: str, answer: Result | Raised | None, ended: Ended) -> dict[str, Any]:
     """Return the agent's result, or raise what it raised or why there is none."""
-    raise_said(answer, otherwise=TargetError)
-    if not isinstance(ended, Mapping):
-        raise nonsense(target, "how it ended is no mapping")
-    code, log = number_of(ended, "code", target), text_of(ended, "log", target)
+    if isinstance(answer, Raised):
+        raise error_of(answer, otherwise=TargetError)
+    code, log = ended.code, ended.log
     last = next((line.strip() for line in reversed(log.splitlines()) if line.strip()), "it logged nothing")
     last = last[-LOG_CHARACTERS:]
     if code == -signal.SIGKILL:
@@ -221,9 +212,8 @@ def _result(target: str, answer: Mapping[str, Any], ended: Mapping[str, Any]) ->
         )
     if code < 0:
         raise TargetError(f"The benchmark on {target} was ended by {signal_name(code)}; its last line: {last}")
-    if code or not isinstance(answer.get("result"), dict):
+    if code or answer is None or not isinstance(answer.value, dict):
         raise TargetError(
             f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}"
         )
-    result = dict(answer["result"])
-    return {**result, "log": f"{log}{result.get('log', '')}"}
+    return {**answer.value, "log": f"{log}{answer.value.get('log', '')}"}

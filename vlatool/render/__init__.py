@@ -1,8 +1,8 @@
 """Show a report: on a terminal, as one HTML page, as Markdown for a pull request, as JSON.
 
-Every format is one file with one class that has ``render(report) -> str``. A number never changes its nature on
-the way: what was measured and what was predicted stand in separate blocks, each with its place, its count and its
-interval.
+Every section is one file (``sections``), every format another one, with one class that has ``render(report) -> str``
+(``formats``), and between them is a document of blocks (``document``). A number never changes its nature on the way:
+what was measured and what was predicted stand in separate sections, each with its place, its count and its interval.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["FILES", "Renderer", "render", "write_reports"]
 
 
 class Renderer(Protocol):
-    """What a file of this folder defines."""
+    """What a file of ``formats`` defines."""
 
     def render(self, report: Report) -> str:
         """Return the report as text of the format."""
@@ -32,6 +32,7 @@ def render(report: Report, format: str) -> str:
 
     Raises:
         UsageError: when there is no such format; names the nearest one.
+        MissingExtra: for HTML, when jinja2 is not installed.
 
     Example:
         >>> render(Report("benchmark", "Latency"), "markdown").splitlines()[0]

@@ -46,7 +46,9 @@ NOT_SHARES = re.compile(r"^error|^skill|^variation|(^|_)p(_?value)?$|ratio")
 
 def plain(text: object) -> str:
     """Return text on one line without control characters, so that a name cannot steer a terminal or break a table."""
-    spaced = re.sub(r"[^\S\xa0\u202f]+", " ", str(text))
+    if (shown := str(text)).isprintable() and "  " not in shown:
+        return shown
+    spaced = re.sub(r"[^\S\xa0\u202f]+", " ", shown)
     return "".join(char for char in spaced if unicodedata.category(char) not in ("Cc", "Cf", "Cs", "Co", "Cn"))
 
 
@@ -128,25 +130,18 @@ def is_points(measurement: Measurement) -> bool:
     return is_share(measurement) and measurement.name.endswith(POINTS)
 
 
-def _factor(measurement: Measurement) -> float:
+def _scale(measurement: Measurement) -> tuple[float, str]:
+    """Return what the number is multiplied by, and the unit beside it; action errors in metres are in millimetres."""
     if is_share(measurement):
-        return 100.0
-    return 1000.0 if _in_millimetres(measurement) else 1.0
-
-
-def _in_millimetres(measurement: Measurement) -> bool:
-    return measurement.unit == "m" and measurement.name.startswith("error")
+        return 100.0, "points" if is_points(measurement) else "%"
+    if measurement.unit == "m" and measurement.name.startswith("error"):
+        return 1000.0, "mm"
+    return 1.0, {"1": "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
 
 
 def unit(measurement: Measurement) -> str:
-    """Return the unit as it is printed beside the number; action errors in metres are shown in millimetres."""
-    if is_points(measurement):
-        return "points"
-    if is_share(measurement):
-        return "%"
-    if _in_millimetres(measurement):
-        return "mm"
-    return {"1": "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
+    """Return the unit as it is printed beside the number."""
+    return _scale(measurement)[1]
 
 
 def _decimals(measurement: Measurement, value: float) -> int:
@@ -163,7 +158,7 @@ def value(measurement: Measurement) -> str:
     """Return the number without its unit, shares in per cent."""
     if not measurement.known:
         return UNMEASURED
-    shown = measurement.value * _factor(measurement)
+    shown = measurement.value * _scale(measurement)[0]
     if not is_share(measurement) and _scientific(shown):
         return number(shown)
     return fixed(shown, _decimals(measurement, shown) if shown or is_share(measurement) else 0)
@@ -174,22 +169,18 @@ def interval(measurement: Measurement) -> str:
 
     Nothing when there is no bound.
     """
-    low, high = measurement.low, measurement.high
     if not measurement.known:
         return ""
-    factor = _factor(measurement)
-    if low is None or high is None:
-        ends = [f"{sign} {fixed(bound * factor, _decimals(measurement, measurement.value * factor))}"
-                for sign, bound in (("≥", low), ("≤", high)) if bound is not None]  # fmt: skip
-        return "".join(ends)
-    low, high = low * factor, high * factor
+    factor = _scale(measurement)[0]
     decimals = _decimals(measurement, measurement.value * factor)
+    low, high = (None if bound is None else bound * factor for bound in (measurement.low, measurement.high))
+    if low is None or high is None:
+        alone = ((sign, bound) for sign, bound in (("≥", low), ("≤", high)) if bound is not None)
+        return "".join(f"{sign} {fixed(bound, decimals)}" for sign, bound in alone)
     while decimals < 6 and low != high and round(low, decimals) == round(high, decimals):
         decimals += 1
-    if not is_share(measurement) and (_scientific(measurement.value * factor) or math.isinf(low) or math.isinf(high)):
-        ends = [number(low), number(high)]
-    else:
-        ends = [fixed(low, decimals), fixed(high, decimals)]
+    rough = _scientific(measurement.value * factor) or math.isinf(low) or math.isinf(high)
+    ends = [number(end) if rough and not is_share(measurement) else fixed(end, decimals) for end in (low, high)]
     return " to ".join(ends) if low < 0 else "–".join(ends)
 
 
@@ -200,8 +191,8 @@ def is_usual(measurement: Measurement) -> bool:
 
 def span(measurement: Measurement) -> str:
     """Return the interval, marked with its coverage when that is not 95 %."""
-    found = interval(measurement)
-    return found if is_usual(measurement) or not found else f"{number(measurement.confidence * 100)} %: {found}"
+    ends = interval(measurement)
+    return ends if is_usual(measurement) or not ends else f"{number(measurement.confidence * 100)} %: {ends}"
 
 
 def aside(measurement: Measurement) -> str:
@@ -230,15 +221,15 @@ def full(measurement: Measurement) -> str:
     return f"{quantity(measurement)} ({brackets})" if brackets else quantity(measurement)
 
 
-def limit(name: str, wanted: Any) -> tuple[str, str]:
+def limit(name: str, value: Any) -> tuple[str, str]:
     """Return a limit's name as words and its value with the unit that ends the name."""
     if name == "hz":
-        return "rate", f"{cell(wanted)} Hz"
+        return "rate", f"{cell(value)} Hz"
     words, _, last = name.rpartition("_")
     if words and last in LIMIT_UNITS:
-        unit = "point" if last == "points" and wanted == 1 else LIMIT_UNITS[last]
-        return plain(words.replace("_", " ")), f"{cell(wanted)} {unit}"
-    return plain(name.replace("_", " ")), cell(wanted)
+        unit = "point" if last == "points" and value == 1 else LIMIT_UNITS[last]
+        return plain(words.replace("_", " ")), f"{cell(value)} {unit}"
+    return plain(name.replace("_", " ")), cell(value)
 
 
 def cell(content: Any) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from vlatool.render._format import plain
-from vlatool.report import EFFECTS, Finding, Report
+from vlatool.report import EFFECTS, Report
 
-MARKS = {"valid": "✅", "suspect": "⚠️", "invalid": "⛔"}
 SENTENCES = {
     "": "",
     "valid": "The measurement is valid.",
@@ -14,29 +13,22 @@ SENTENCES = {
 }
 
 
-def findings(report: Report) -> list[Finding]:
-    """Return what was found, the worst first."""
-    return sorted(report.findings, key=lambda found: -EFFECTS.index(found.effect))
-
-
 def sentence(report: Report) -> str:
     """Return whether the measurement can be trusted, as a sentence; nothing when nobody judged it."""
-    said = SENTENCES[report.validity]
-    return said.replace("measurement", "comparison") if report.kind == "compare" else said
+    judgement = SENTENCES[report.validity]
+    return judgement.replace("measurement", "comparison") if report.kind == "compare" else judgement
 
 
-def reason(found: Finding) -> str:
-    """Return the reason as a sentence."""
-    return ended(plain(found.reason))
+def reasons(report: Report) -> list[tuple[str, str, str]]:
+    """Return (effect, reason, remedy) of each finding, the worst first; sentences, the remedy may be empty."""
+    worst_first = sorted(report.findings, key=lambda finding: -EFFECTS.index(finding.effect))
+    remedies = (plain(finding.remedy).strip() for finding in worst_first)
+    return [
+        (finding.effect, _ended(plain(finding.reason)), _ended(f"Remedy: {remedy}") if remedy else "")
+        for finding, remedy in zip(worst_first, remedies, strict=True)
+    ]
 
 
-def remedy(found: Finding) -> str:
-    """Return the remedy as a sentence; nothing when there is none."""
-    text = plain(found.remedy).strip()
-    return ended(f"Remedy: {text}") if text else ""
-
-
-def ended(text: str) -> str:
-    """Return text that ends with a full stop."""
+def _ended(text: str) -> str:
     text = text.strip()
     return text if not text or text[-1] in ".!?" else f"{text}."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
@@ -17,38 +17,30 @@ ROLES = {"subject": "measured", "within": "within limits", "outside": "outside l
 ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
 PERCENTILES = ("latency_p50", "latency_p90", "latency_p95", "latency_p99", "latency_p99.9", "latency_max")
 ORDER = (
-    *(
-        "speedup",
-        "throughput",
-        "jitter",
-        "deadline_misses",
-        "age_p50",
-        "age_p99",
-        "age_max",
-        "wakeup_p50",
-        "wakeup_p99",
-    ),
-    *("latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu"),
-    *("size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max"),
-)
+    "speedup", "throughput", "jitter", "deadline_misses", "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99",
+    "latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu",
+    "size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max",
+)  # fmt: skip
 """The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
 ABSENT = "unmeasured"
 """The details table that says what could not be had; shown with the numbers that are NaN."""
+BOARDS = "hwselect"
+"""The kind of a report that ranks boards: its rows are no variants."""
 SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
 
 
 @dataclass(frozen=True)
 class Latency:
-    """The latency that a chart shows, and the limit on it when one was asked for."""
+    """The latency that a chart shows, the limit on it when one was asked for, and what a drawing calls that."""
 
     name: str
     limit: float | None
-    limit_name: str = ""
+    word: str = "limit"
 
-    @property
-    def word(self) -> str:
-        """What the limit is called in a drawing."""
-        return "deadline" if "deadline" in self.limit_name else "limit"
+
+def ranks_boards(report: Report) -> bool:
+    """Return whether the rows are boards, not variants."""
+    return report.kind == BOARDS
 
 
 def measured(report: Report, name: str) -> list[Measurement | None]:
@@ -56,40 +48,42 @@ def measured(report: Report, name: str) -> list[Measurement | None]:
     return [row.get(name) for row in report.rows]
 
 
+def of_origin(report: Report, origin: str, where: str | None = None) -> Iterator[Measurement]:
+    """Return the measurements of an origin, those of one place when it is given."""
+    for row in report.rows:
+        yield from (item for item in row.measurements if item.origin == origin and where in (None, item.where))
+
+
 def names(report: Report, origin: str = "measured", where: str | None = None) -> list[str]:
     """Return the names of measurements in the order of their first appearance."""
-    found: dict[str, None] = {}
-    for row in report.rows:
-        for item in row.measurements:
-            if item.origin == origin and where in (None, item.where):
-                found[item.name] = None
-    return list(found)
+    return list(dict.fromkeys(item.name for item in of_origin(report, origin, where)))
+
+
+def places(report: Report, origin: str) -> list[str]:
+    """Return where the numbers of an origin were measured, or what they were predicted for."""
+    return list(dict.fromkeys(item.where for item in of_origin(report, origin)))
 
 
 def headline(report: Report) -> list[str]:
     """Return the names of the few measured numbers that decide."""
     present = names(report)
     accuracy = ["success", "success_drop"] if "success" in present else [*ACCURACY[1:], *ERRORS]
-    wanted = ["latency_p50", "deadline_misses", "speedup", *accuracy, "size", "peak_rss"]
-    return [name for name in wanted if name in present]
+    deciding = ["latency_p50", "deadline_misses", "speedup", *accuracy, "size", "peak_rss"]
+    return [name for name in deciding if name in present]
 
 
 def other_names(report: Report) -> list[str]:
     """Return the measured names that neither the headline nor the error table shows."""
     shown = {*headline(report), *percentile_names(report)}
-    return in_order(name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name))
+    others = [name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name)]
+    return sorted(others, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
 
 
 def percentile_names(report: Report) -> list[str]:
     """Return the measured percentiles of the latency when there are enough of them for a table of their own."""
     present = names(report)
-    found = [name for name in PERCENTILES if name in present]
-    return found if len(found) > 2 else []
-
-
-def in_order(found: Iterable[str]) -> list[str]:
-    """Return names of measurements in the order in which a reader asks for them."""
-    return sorted(found, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
+    percentiles = [name for name in PERCENTILES if name in present]
+    return percentiles if len(percentiles) > 2 else []
 
 
 def short(name: str) -> str:
@@ -101,27 +95,17 @@ def error_groups(report: Report) -> dict[str, list[str]]:
     """Return ``error_baseline`` -> the full names of its measured dimensions."""
     groups: dict[str, list[str]] = {}
     for name in names(report):
-        if found := ERROR_OF_DIMENSION.match(name):
-            groups.setdefault(found[1], []).append(name)
+        if group := ERROR_OF_DIMENSION.match(name):
+            groups.setdefault(group[1], []).append(name)
     return groups
-
-
-def dimension(name: str) -> str:
-    """Return ``dx`` of ``error_baseline.dx``."""
-    return plain(name.partition(".")[2])
-
-
-def places(report: Report, origin: str) -> list[str]:
-    """Return where the numbers of an origin were measured, or what they were predicted for."""
-    return list(dict.fromkeys(item.where for row in report.rows for item in row.measurements if item.origin == origin))
 
 
 def processor(report: Report) -> str:
     """Return the processor of the machine that made the report, or nothing."""
-    found = report.environment.get("cpu") or report.environment.get("processor") or ""
-    if isinstance(found, Mapping):
-        found = next((found[key] for key in ("model", "name", "brand") if found.get(key)), "")
-    return plain(found)
+    cpu = report.environment.get("cpu") or report.environment.get("processor") or ""
+    if isinstance(cpu, Mapping):
+        cpu = next((cpu[key] for key in ("model", "name", "brand") if cpu.get(key)), "")
+    return plain(cpu)
 
 
 def place(report: Report, where: str) -> str:
@@ -131,19 +115,14 @@ def place(report: Report, where: str) -> str:
 
 
 def measured_where(report: Report) -> str:
-    """Return the heading of the measured block."""
-    found = places(report, "measured")
-    return "Measured on " + "; ".join(place(report, where) for where in found) if found else "Nothing was measured"
+    """Return where the numbers were measured, in words."""
+    where = places(report, "measured")
+    return "Measured on " + "; ".join(place(report, host) for host in where) if where else "Nothing was measured"
 
 
 def brackets(report: Report, origin: str, where: str | None = None) -> str:
     """Return a sentence on what the ranges are; nothing when there are none of the usual coverage."""
-    spans = [
-        item
-        for row in report.rows
-        for item in row.measurements
-        if item.origin == origin and where in (None, item.where) and interval(item)
-    ]
+    spans = [item for item in of_origin(report, origin, where) if interval(item)]
     usual = sum(is_usual(item) for item in spans)
     if not usual:
         return ""
@@ -151,63 +130,45 @@ def brackets(report: Report, origin: str, where: str | None = None) -> str:
     return f"Ranges are {what}{'' if usual == len(spans) else ' unless marked'}."
 
 
-def notes(
-    report: Report, origin: str, chosen: Callable[[Measurement], bool] = lambda item: True, where: str | None = None
-) -> dict[str, list[str]]:
-    """Return note -> the labels of the measurements that carry it."""
-    found: dict[str, list[str]] = {}
-    for row in report.rows:
-        for item in row.measurements:
-            if item.note and item.origin == origin and where in (None, item.where) and chosen(item):
-                labels = found.setdefault(plain(item.note), [])
-                group = ERROR_OF_DIMENSION.match(item.name)
-                words = f"{label(group[1])} by dimension" if group else label(item.name)
-                if words not in labels:
-                    labels.append(words)
-    return found
+def notes(report: Report, origin: str, where: str | None = None) -> list[str]:
+    """Return a line for each note: the labels of the numbers that carry it, and the note.
+
+    Notes of measured numbers that could not be had are the reasons why, and stand elsewhere.
+    """
+    by_note: dict[str, dict[str, None]] = {}
+    for item in of_origin(report, origin, where):
+        if item.note and (item.known or origin == "predicted"):
+            group = ERROR_OF_DIMENSION.match(item.name)
+            words = f"{label(group[1])} by dimension" if group else label(item.name)
+            by_note.setdefault(plain(item.note), {})[words] = None
+    return [f"{', '.join(labels)}: {note}" for note, labels in by_note.items()]
 
 
-def matrix(
-    report: Report, shown: Sequence[str], origin: str, where: str | None
-) -> tuple[list[str], list[list[Measurement | None]]]:
-    """Return the names of the variants that have such numbers, and for each number what each of them has."""
-    found = [
-        {item.name: item for item in row.measurements if item.origin == origin and where in (None, item.where)}
-        for row in report.rows
-    ]
-    kept = [index for index, items in enumerate(found) if any(name in items for name in shown)]
-    cells = [[found[index].get(name) for index in kept] for name in shown]
-    return [report.rows[index].name for index in kept], cells
-
-
-def unmeasured(report: Report, passed_over: Iterable[str] = ()) -> list[str]:
+def unmeasured(report: Report, shown: Callable[[str], bool], *, further: bool = False) -> list[str]:
     """Return a sentence for each reason for which numbers could not be had; variants are named unless it holds for all.
 
     Args:
         report: The report.
-        passed_over: Names of measurements whose reason stands elsewhere.
+        shown: Says of the name of a measurement whether its reason is asked for.
+        further: Add what is no measurement of a row, from its details.
     """
-    left = set(passed_over)
-    found: dict[tuple[str, str], list[str]] = {}
-    for row in report.rows:
-        missing = [
-            (
-                f"{label(item.name)}{f', predicted for {plain(item.where)}' if item.origin == 'predicted' else ''}",
-                item.note,
-            )
-            for item in row.measurements
-            if not item.known and item.name not in left
-        ]
-        told = [(record.get("what", ""), record.get("why", "")) for record in row.details.get(ABSENT, ())]
-        for what, why in [*missing, *told]:
-            rows = found.setdefault((plain(what), plain(why)), [])
-            if row.name not in rows:
-                rows.append(row.name)
+    missing = [(row, _missing(item), plain(item.note)) for row in report.rows for item in row.measurements
+               if not item.known and shown(item.name)]  # fmt: skip
+    for row in report.rows if further else ():
+        records = row.details.get(ABSENT, ())
+        missing += [(row, plain(record.get("what", "")), plain(record.get("why", ""))) for record in records]
+    rows_of: dict[tuple[str, str], dict[str, None]] = {}
+    for row, what, why in missing:
+        rows_of.setdefault((what, why), {})[plain(row.name)] = None
     grouped: dict[tuple[str, str], list[str]] = {}
-    for (what, why), rows in found.items():
-        whose = "" if len(rows) == len(report.rows) else f"{', '.join(plain(name) for name in rows)}, "
+    for (what, why), rows in rows_of.items():
+        whose = "" if len(rows) == len(report.rows) else f"{', '.join(rows)}, "
         grouped.setdefault((whose, why), []).append(what)
     return [f"{whose}{', '.join(what)}{f': {why}' if why else ''}" for (whose, why), what in grouped.items()]
+
+
+def _missing(item: Measurement) -> str:
+    return label(item.name) + (f", predicted for {plain(item.where)}" if item.origin == "predicted" else "")
 
 
 def role(row: Row) -> str:
@@ -222,21 +183,21 @@ def latency(report: Report) -> Latency:
     What ``optimize`` was asked for is no limit on this host when it is for another board.
     """
     present = names(report)
-    foretold = names(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
-    for name, wanted in () if foretold else report.limits.items():
-        if _number(wanted) and name.endswith("_ms") and ("latency" in name or "deadline" in name):
-            hit = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
-            chosen = f"latency_{hit[0]}" if hit else "latency_p50"
-            if chosen in present:
-                return Latency(chosen, float(wanted), plain(name))
+    for_board = names(report, "predicted") and report.kind == "optimize" and ON_BOARD not in report.environment
+    for name, limit in () if for_board else report.limits.items():
+        if _is_number(limit) and name.endswith("_ms") and ("latency" in name or "deadline" in name):
+            percentile = re.search(r"p\d+(\.\d+)?|max(?=_)", name.removeprefix("max_"))
+            limited = f"latency_{percentile[0]}" if percentile else "latency_p50"
+            if limited in present:
+                return Latency(limited, float(limit), "deadline" if "deadline" in name else "limit")
     rate = report.limits.get("hz")
-    if report.kind in ("benchmark", "compare") and _number(rate) and rate > 0:
+    if report.kind in ("benchmark", "compare") and _is_number(rate) and rate > 0:
         return Latency("latency_p50", 1e3 / rate, "deadline")
     return Latency("latency_p50", None)
 
 
-def _number(wanted: Any) -> TypeGuard[int | float]:
-    return isinstance(wanted, int | float) and not isinstance(wanted, bool)
+def _is_number(value: Any) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def accuracy(report: Report) -> str:
@@ -249,25 +210,22 @@ def accuracy(report: Report) -> str:
 
 def floor(report: Report, name: str) -> float | None:
     """Return the least success that the limits allow: given, or the baseline's less the allowed drop."""
-    for key, wanted in report.limits.items():
-        if name != "success" or "success" not in key or isinstance(wanted, bool) or not isinstance(wanted, int | float):
+    for key, limit in report.limits.items():
+        if name != "success" or "success" not in key or not _is_number(limit):
             continue
-        share = wanted / 100 if key.endswith(("_points", "_percent")) else float(wanted)
+        share = limit / 100 if key.endswith(("_points", "_percent")) else float(limit)
         if "drop" not in key:
             return share
         for row in report.rows:
-            if row.role == "baseline" and (found := row.get(name)) and found.known:
-                return found.value - share
+            if row.role == "baseline" and (success := row.get(name)) and success.known:
+                return success.value - share
     return None
 
 
 def facts(environment: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
     """Return the environment as (dotted name, text) pairs."""
-    found: list[tuple[str, str]] = []
+    pairs: list[tuple[str, str]] = []
     for key, content in environment.items():
         name = f"{prefix}{plain(key)}"
-        if isinstance(content, Mapping):
-            found += facts(content, f"{name}.")
-        else:
-            found.append((name, cell(content)))
-    return found
+        pairs += facts(content, f"{name}.") if isinstance(content, Mapping) else [(name, cell(content))]
+    return pairs

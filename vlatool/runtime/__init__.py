@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 
+from vlatool.errors import refuse_two_distributions
 from vlatool.runtime.arguments import check_load
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Action, Policy, refuse_findings
@@ -40,7 +41,7 @@ def load(
             graphs give it and in physical units; what was measured of each when the bundle was made when None.
         accept: Names of findings in the manifest that are overruled, see ``vlatool inspect``.
         first_run_s: Seconds that an inference of the warm-up may take before it is stopped. Inside this process ONNX
-            Runtime can be stopped between two nodes of a graph alone: one node that takes hours is waited for, by
+            Runtime can only be stopped between two nodes of a graph: one node that takes hours is waited for, by
             Ctrl-C as well. OpenVINO is not waited for, but may compute on until the process ends. The opening of a
             graph cannot be stopped.
         memory_mb: Most that inputs and outputs of a graph may declare, and that the probe may take, in 10^6 bytes;
@@ -54,8 +55,9 @@ def load(
         SpecError: normalisation statistics or a tokenizer are missing or do not fit.
         GraphError: the engine refuses a graph, the graph does not take and give what the spec declares, it computes
             something else than the graph says, a stage found the bundle to be wrong, or a limit is reached.
-        UsageError: an argument makes no sense.
+        UsageError: an argument is invalid.
         MissingExtra: the engine is not installed.
+        InstallationError: vlatool and vlatool-runtime are installed side by side.
 
     Example:
         >>> policy = load("out/vln-babyai")                                            # doctest: +SKIP
@@ -64,14 +66,15 @@ def load(
     """
     from vlatool.bundle.bundle import Bundle
 
+    refuse_two_distributions()
     check_load(path, threads, seed, warmup, golden_tolerance, first_run_s, memory_mb)
     bundle = Bundle.described(path)
     refuse_findings(bundle, accept)
     bundle.verify("data/")
     if probe:
-        from vlatool.runtime.probe import probe as tried
+        from vlatool.runtime.probe import probe as run_once
 
-        tried(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
+        run_once(bundle.path, engine=engine, threads=threads, first_run_s=first_run_s, memory_mb=memory_mb)
     policy = Policy.open(bundle, engine=engine, threads=threads, seed=seed, memory_mb=memory_mb)
     bundle.verify()
     policy.warm_up(warmup, golden_tolerance, first_run_s)

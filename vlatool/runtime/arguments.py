@@ -1,4 +1,4 @@
-"""What a caller passes to ``load``: each value is what it is documented to be, or a sentence says so."""
+"""What a caller passes to ``load``: each value is as documented, or a one-sentence error says what is wrong."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_THREADS = 1024
 
 
 def check_path(path: Any) -> None:
-    """Refuse what is no path.
+    """Refuse anything but a path.
 
     Raises:
         UsageError: naming what it is.
@@ -23,7 +23,7 @@ def check_path(path: Any) -> None:
 
 
 def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, optional: bool = False) -> None:
-    """Refuse what is no whole number from ``least`` to ``most``; None too, unless it is optional.
+    """Refuse anything but a whole number from ``least`` to ``most``; None too, unless it is optional.
 
     Raises:
         UsageError: naming the argument, what it is and what is allowed.
@@ -33,12 +33,11 @@ def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, op
     whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     if not whole or not least <= value <= most:
         upto = "" if most == math.inf else f" to {most:.0f}"
-        other = ", or None" if optional else ""
-        raise UsageError(f"{name} is {value!r}; allowed: a whole number from {least}{upto}{other}.")
+        raise _refused(name, value, f"a whole number from {least}{upto}", optional)
 
 
 def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, zero: bool = False) -> None:
-    """Refuse what is no number above 0 (from 0 where ``zero``); None too, unless it is optional.
+    """Refuse anything but a number above 0 (from 0 where ``zero``); None too, unless it is optional.
 
     Raises:
         UsageError: naming the argument, what it is and what is allowed.
@@ -47,8 +46,11 @@ def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, 
         return
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not number or not (value > 0 or (zero and value == 0)):
-        other = ", or None" if optional else ""
-        raise UsageError(f"{name} is {value!r}; allowed: {unit} {'from' if zero else 'above'} 0{other}.")
+        raise _refused(name, value, f"{unit} {'from' if zero else 'above'} 0", optional)
+
+
+def _refused(name: str, value: Any, allowed: str, optional: bool) -> UsageError:
+    return UsageError(f"{name} is {value!r}; allowed: {allowed}{', or None' if optional else ''}.")
 
 
 def check_load(
@@ -57,7 +59,7 @@ def check_load(
     """Check all arguments of ``load``.
 
     Raises:
-        UsageError: for the first that makes no sense.
+        UsageError: for the first invalid one.
     """
     check_path(path)
     check_whole("threads", threads, 1, MOST_THREADS, optional=True)

@@ -1,9 +1,9 @@
 """Whether integer products are exact on this machine, or saturate: asked of an engine by a product that would.
 
 x86 without VNNI multiplies uint8 with int8 in pairs and adds both products in 16 bits. Two times 255 x 127 is 64,770
-and becomes 32,767: an int8 policy computes other actions there, in silence. ONNX Runtime has an option that is exact on
+and becomes 32,767: an int8 policy silently computes other actions there. ONNX Runtime has an option that is exact on
 such processors, for uint8 activations and at a cost; int8 activations are exact without it. The option is a rewriting
-of the graph (of its weights to uint8), so that a session that rewrites nothing saturates all the same.
+of the graph (of its weights to uint8), so that a session that rewrites nothing saturates regardless.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.manifest import Manifest
+from vlatool.runtime.engine import UNKNOWN as UNKNOWN
 from vlatool.runtime.engine import engine_class
 
 MODEL = (
@@ -38,13 +39,12 @@ PRECISE = ("session.x64quantprecision", "1")
 """The option of ONNX Runtime (``onnxruntime_session_options_config_keys.h``)."""
 SIGNED = ("session.qdqisint8allowed", "1")
 """The option of ONNX Runtime that leaves int8 activations of quantize/dequantize pairs int8: on x86 it rewrites them to
-uint8 else, with which convolutions saturate where those of int8 are exact."""
+uint8 otherwise, with which convolutions saturate where those of int8 are exact."""
 UNFUSED = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
 EXACT = "exact"
 EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
 SATURATING = "saturating: they are added in pairs of 16 bits"
-UNKNOWN = "not known: the engine does not compute the product that would show it"
 
 
 def model(written: bool = False) -> bytes:
@@ -76,19 +76,27 @@ def ort_product(ort: Any, precise: bool = False, written: bool = False) -> float
             options.add_session_config_entry(*PRECISE)
         session = ort.InferenceSession(model(written), options, providers=["CPUExecutionProvider"])
         return float(session.run(None, {"x": operand()})[0].min())
-    except Exception:  # the seam: a build without these operators runs float32 all the same
+    except Exception:  # the seam: a build without these operators still runs float32
         return math.nan
 
 
-def said(product: float) -> str:
-    """Say what a smallest element of the product means."""
+def ort_exactness(ort: Any, written: bool = False) -> str:
+    """Return whether integer products are exact in ONNX Runtime on this machine, or saturate; see ``ort_product``."""
+    plain = exactness(ort_product(ort, written=written))
+    if plain != SATURATING:
+        return plain
+    return EXACT_BY_OPTION if ort_product(ort, precise=True, written=written) == WANTED else plain
+
+
+def exactness(product: float) -> str:
+    """Return what a smallest element of the product means."""
     if math.isnan(product):
         return UNKNOWN
     return EXACT if product == WANTED else SATURATING
 
 
 def as_written(ort: Any, options: Any, precise: bool) -> None:
-    """Set the options of a session that shall compute the operators of a graph as they are written.
+    """Set the options of a session that is to compute the operators of a graph as they are written.
 
     Args:
         ort: The module.
@@ -103,12 +111,12 @@ def as_written(ort: Any, options: Any, precise: bool) -> None:
 
 
 def is_int8(manifest: Manifest) -> bool:
-    """Say whether a graph of a bundle has int8 products."""
+    """Return whether a graph of a bundle has int8 products."""
     return any("int8" in graph.precision for graph in manifest.graphs.values())
 
 
-def told(manifest: Manifest, engine: str) -> tuple[str, str]:
-    """Say how an engine computes the int8 products of a bundle on this machine, and what to do about it.
+def int8_trouble(manifest: Manifest, engine: str) -> tuple[str, str]:
+    """Return how an engine computes the int8 products of a bundle on this machine, and what to do about it.
 
     Returns:
         A sentence and a remedy; both are empty where the bundle has no such products, and where they are exact.
@@ -119,10 +127,10 @@ def told(manifest: Manifest, engine: str) -> tuple[str, str]:
     if not is_int8(manifest):
         return "", ""
     library = engine_class(engine)
-    found = str(library.arithmetic())
-    if found == EXACT:
+    products = str(library.arithmetic())
+    if products == EXACT:
         return "", ""
-    return f"Its int8 products are {found}.", library.remedy if found == SATURATING else ""
+    return f"Its int8 products are {products}.", library.remedy if products == SATURATING else ""
 
 
 def machine(engine: str) -> str:

@@ -12,7 +12,7 @@ from vlatool.files.sealed import open_regular, read_all
 from vlatool.files.typed import outside, shown
 
 Assets = Path | Bundle
-"""A folder, or a bundle, of which its ``assets/`` are meant."""
+"""A folder, or a bundle, which stands for its ``assets/``."""
 
 
 def read_asset(assets: Assets, name: str, allowed: str) -> bytes:

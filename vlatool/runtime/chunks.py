@@ -24,7 +24,7 @@ class ChunkQueue:
         execute: Actions taken from each chunk; the spec's ``execute`` (or the whole chunk) when 0.
 
     Raises:
-        UsageError: when ``execute`` is no whole number from 0.
+        UsageError: when ``execute`` is not a whole number from 0.
     """
 
     def __init__(self, policy: Policy, execute: int = 0) -> None:

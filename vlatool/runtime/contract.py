@@ -1,4 +1,4 @@
-"""What the graphs give and take, held against the spec: when a policy is opened, and at every inference."""
+"""What the graphs give and take, checked against the spec: when a policy is opened, and at every inference."""
 
 from __future__ import annotations
 
@@ -34,10 +34,12 @@ class Port(NamedTuple):
     dtype: str
 
     def __str__(self) -> str:
-        return self.dtype if self.axes is None else f"{self.dtype} [{', '.join(_axis(axis) for axis in self.axes)}]"
+        if self.axes is None:
+            return self.dtype
+        return f"{self.dtype} [{', '.join('?' if axis is None else str(axis) for axis in self.axes)}]"
 
     def fits(self, other: Port) -> bool:
-        """Say whether both can be the same array."""
+        """Return whether both can be the same array."""
         if self.dtype != other.dtype:
             return False
         if self.axes is None or other.axes is None:
@@ -57,7 +59,7 @@ class Port(NamedTuple):
 
 
 def port(axes: Sequence[Any], dtype: str) -> Port:
-    """Return a port; whatever is no whole number stands for a free axis."""
+    """Return a port; anything but a whole number stands for a free axis."""
     return Port(tuple(axis if isinstance(axis, int) else None for axis in axes), dtype)
 
 
@@ -90,7 +92,7 @@ def allowed_mb(manifest: Manifest, memory_mb: float | None) -> float:
 
 
 def check_sizes(manifest: Manifest, limit_mb: float) -> None:
-    """Check what the manifest alone says before anything of that size is made.
+    """Check the sizes in the manifest before anything of that size is allocated.
 
     Raises:
         GraphError: when inputs, outputs, noise and kept values would be larger than ``limit_mb`` (10^6 bytes).
@@ -98,35 +100,35 @@ def check_sizes(manifest: Manifest, limit_mb: float) -> None:
     spec = manifest.spec
     named = {tensor.name: _declared(tensor) for tensor in (*spec.inputs, *spec.outputs)}
     for step in manifest.program:
-        named |= _sources(step)
+        named |= sources_of(step)
     _check_total(named, "The program", limit_mb)
 
 
 def check_graphs(manifest: Manifest, sessions: Mapping[str, Any], limit_mb: float) -> None:
-    """Hold what the open graphs declare against the spec, and against each other along the program.
+    """Check what the open graphs declare against the spec, and against each other along the program.
 
     Args:
         manifest: With spec and program.
-        sessions: Graph name -> session; one that does not tell ``takes`` and ``gives`` is believed.
+        sessions: Graph name -> session; one without ``takes`` and ``gives`` is believed.
         limit_mb: Of what one graph takes and gives together, in 10^6 bytes.
 
     Raises:
         GraphError: naming graph and tensor, what it is and what is declared.
     """
     for name, session in sessions.items():
-        told = {**getattr(session, "takes", {}), **getattr(session, "gives", {})}
-        _check_total(told, f"The graph '{name}'", limit_mb)
+        ports = {**getattr(session, "takes", {}), **getattr(session, "gives", {})}
+        _check_total(ports, f"The graph '{name}'", limit_mb)
     values: dict[str, tuple[str, Port]] = {
         tensor.name: ("the spec declares", _declared(tensor)) for tensor in manifest.spec.inputs
     }
     for step in manifest.program:
         _follow(step, sessions[step.graph], values)
     for tensor in manifest.spec.outputs:
-        origin, found = values.get(tensor.name, ("", _declared(tensor)))
-        if not found.fits(_declared(tensor)):
+        origin, actual = values.get(tensor.name, ("", _declared(tensor)))
+        if not actual.fits(_declared(tensor)):
             raise GraphError(
-                f"The output '{tensor.name}' is declared as {_declared(tensor)} in the spec, but {origin} {found}.",
-                _remedy(found.dtype, tensor.dtype),
+                f"The output '{tensor.name}' is declared as {_declared(tensor)} in the spec, but {origin} {actual}.",
+                _remedy(actual.dtype, tensor.dtype),
             )
 
 
@@ -138,7 +140,7 @@ def _follow(step: ProgramStep, session: Any, values: dict[str, tuple[str, Port]]
             values.pop(name, None)
         return
     _check_names(step, takes, gives)
-    values.update({name: ("the program makes", found) for name, found in _sources(step).items()})
+    values.update({name: ("the program makes", drawn) for name, drawn in sources_of(step).items()})
     for turn in range(min(step.repeat, 2)):
         for name, value in step.feeds.items():
             _check_feed(step.graph, name, takes[name], value, values, turn)
@@ -149,13 +151,13 @@ def _follow(step: ProgramStep, session: Any, values: dict[str, tuple[str, Port]]
 
 
 def _check_feed(
-    graph: str, name: str, wanted: Port, value: str, values: Mapping[str, tuple[str, Port]], turn: int
+    graph: str, name: str, expected: Port, value: str, values: Mapping[str, tuple[str, Port]], turn: int
 ) -> None:
-    origin, found = values.get(value, ("", wanted))
-    if not found.fits(wanted):
+    origin, actual = values.get(value, ("", expected))
+    if not actual.fits(expected):
         when = " in the next repeat" if turn else ""
         raise GraphError(
-            f"The graph '{graph}' takes '{name}' as {wanted}, but {origin} '{value}' as {found}{when}.", AGAIN
+            f"The graph '{graph}' takes '{name}' as {expected}, but {origin} '{value}' as {actual}{when}.", AGAIN
         )
 
 
@@ -169,17 +171,17 @@ def _check_names(step: ProgramStep, takes: Mapping[str, Port], gives: Mapping[st
             raise GraphError(f"The graph '{step.graph}' takes '{name}', which the program does not feed.", AGAIN)
 
 
-def _sources(step: ProgramStep) -> dict[str, Port]:
-    """Return what a step brings into being: noise, kept values and schedules."""
-    found = {name: port(noise["shape"], "float32") for name, noise in step.noise.items()}
-    found |= {name: port(kept["shape"], str(kept.get("dtype", "float32"))) for name, kept in step.keep.items()}
+def sources_of(step: ProgramStep) -> dict[str, Port]:
+    """Return what a step creates: noise, kept values and schedules."""
+    ports = {name: port(noise["shape"], "float32") for name, noise in step.noise.items()}
+    ports |= {name: port(kept["shape"], str(kept.get("dtype", "float32"))) for name, kept in step.keep.items()}
     for name, numbers in step.schedule.items():
-        found[name] = Port((1,), "int64" if all(isinstance(number, int) for number in numbers) else "float32")
-    return found
+        ports[name] = Port((1,), "int64" if all(isinstance(number, int) for number in numbers) else "float32")
+    return ports
 
 
 def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
-    total = sum(each.bytes for each in named.values())
+    total = sum(tensor.bytes for tensor in named.values())
     if total > limit_mb * 1e6:
         largest = max(named, key=lambda name: named[name].bytes)
         raise GraphError(
@@ -190,45 +192,45 @@ def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
 
 
 def written_as_declared(manifest: Manifest, sessions: Mapping[str, Any]) -> set[str]:
-    """Return the outputs that an engine writes into arrays of the declared shape and dtype, and cannot give otherwise.
+    """Return the outputs that an engine writes into arrays of the declared shape and dtype: it can give nothing else.
 
-    Those are what one graph gives, and nothing else makes, where its session has ``bound`` (``check_graphs`` has held
-    what it gives against the spec).
+    Those are what one graph gives, and nothing else makes, where its session has ``bound`` (``check_graphs`` has
+    checked what it gives against the spec).
     """
     makers: dict[str, list[bool]] = {}
     for step in manifest.program:
         bound = getattr(sessions[step.graph], "bound", False)
         for name in step.gives.values():
             makers.setdefault(name, []).append(bound)
-        for name in (*step.carry.values(), *_sources(step)):
+        for name in (*step.carry.values(), *sources_of(step)):
             makers.setdefault(name, []).append(False)
     return {tensor.name for tensor in manifest.spec.outputs if makers.get(tensor.name) == [True]}
 
 
 class Outputs:
-    """Holds the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
+    """Checks the values of an inference against the outputs that a spec declares: shape, dtype, finite numbers.
 
     Args:
         outputs: What is declared.
-        action: Whether the first is looked at for finite numbers, too; a policy does that in physical units.
-        certain: Names of outputs whose shape and dtype need not be looked at.
+        action: Whether the first is checked for finite numbers, too; a policy does that in physical units.
+        certain: Names of outputs whose shape and dtype need no check.
     """
 
     def __init__(self, outputs: Iterable[TensorSpec], *, action: bool = True, certain: Collection[str] = ()) -> None:
         self.names = []
-        self._wanted = []
+        self._checked = []
         for number, tensor in enumerate(outputs):
             dtype = np.dtype(tensor.dtype)
             fixed = tensor.shape if all(isinstance(axis, int) for axis in tensor.shape) else None
             floating = dtype.kind == "f" and (action or number > 0)
             self.names.append(tensor.name)
             if floating or tensor.name not in certain:
-                self._wanted.append((tensor.name, fixed, dtype, floating, tensor))
+                self._checked.append((tensor.name, fixed, dtype, floating, tensor))
 
     @property
     def certain(self) -> bool:
-        """Whether there is nothing to look at."""
-        return not self._wanted
+        """Whether there is nothing to check."""
+        return not self._checked
 
     def __call__(self, values: Mapping[str, Any], who: str = "The policy") -> dict[str, Array]:
         """Return the outputs by name.
@@ -236,7 +238,7 @@ class Outputs:
         Raises:
             GraphError: naming the output, what it is and what is declared.
         """
-        for name, shape, dtype, floating, tensor in self._wanted:
+        for name, shape, dtype, floating, tensor in self._checked:
             array = values[name]
             if array.dtype != dtype or (array.shape != shape and (shape or not _fits(array, tensor))):
                 raise _misfit(array, tensor, who)
@@ -270,7 +272,3 @@ def _remedy(got: str, declared: str) -> str:
 
 def _declared(tensor: TensorSpec) -> Port:
     return port(tensor.shape, tensor.dtype)
-
-
-def _axis(axis: int | None) -> str:
-    return "?" if axis is None else str(axis)

@@ -1,7 +1,7 @@
-"""What every engine says of itself: the build side asks, and names none.
+"""What every engine declares about itself, so that the build side names no engine.
 
-A file in ``vlatool/runtime/engines/`` (or one that another package brings, see ``vlatool.registry``) defines one class
-that opens a graph (``vlatool.runtime.program.Session``) and overrides what it does otherwise than said here.
+A file in ``vlatool/runtime/engines/`` (or one that another package adds, see ``vlatool.registry``) defines one class
+that opens a graph (``vlatool.runtime.program.Session``) and overrides what differs from the defaults here.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ MOVES = frozenset({
 """Operators that compute nothing."""
 QUANTIZES = frozenset(("QuantizeLinear", "DequantizeLinear", "DynamicQuantizeLinear", "FakeQuantize"))
 STANDARD_LAYOUT = "qdq"
+UNKNOWN = "not known: the engine does not compute the product that would show it"
+"""How an engine computes integer products, where that is not measured."""
 Stages = tuple[dict[str, dict[str, Any]], ...]
 """Names of stages, each with its options, as a recipe lists them."""
 Node = tuple[str, str, str]
@@ -72,7 +74,7 @@ class Engine:
     package: ClassVar[str] = ""
     """What is imported; also the name of the distribution."""
     extra: ClassVar[str] = ""
-    """The extra of vlatool that brings it."""
+    """The extra of vlatool that installs it."""
     substitutes: ClassVar[tuple[str, ...]] = ()
     """Distributions of other names that bring the same package."""
     advice: ClassVar[str] = ""
@@ -100,8 +102,27 @@ class Engine:
         return require(cls.package, cls.extra)
 
     @classmethod
+    def version(cls) -> str:
+        """Return the release of the library, without its build; empty where it does not tell.
+
+        Raises:
+            MissingExtra: when it is not installed.
+        """
+        return str(getattr(cls.library(), "__version__", "")).partition("-")[0]
+
+    @classmethod
+    def arithmetic(cls) -> str:
+        """Return how integer products are computed on this machine; not known, unless the engine measures it.
+
+        Raises:
+            MissingExtra: when the library is not installed.
+        """
+        cls.library()
+        return UNKNOWN
+
+    @classmethod
     def execution_providers(cls) -> list[str] | None:
-        """Return what the installed library runs on, None where it does not say so.
+        """Return what the installed library runs on, None where it does not tell.
 
         Raises:
             MissingExtra: when it cannot be imported.
@@ -135,7 +156,7 @@ class Engine:
 
     @classmethod
     def slow(cls, node: Node, computed: str, product: bool, zero_points: int) -> str:
-        """Say why an int8 node of a profile is not the fast kernel; nothing where it is.
+        """Return why an int8 node of a profile is not the fast kernel; nothing where it is.
 
         Args:
             node: Of the profile.
@@ -150,13 +171,13 @@ def engine_class(name: str = "") -> Any:
     """Return the class of an engine, of the default one when empty.
 
     Raises:
-        UsageError: when there is none of that name.
+        UsageError: for an unknown engine.
     """
     return registry.load("engines", name or DEFAULT_ENGINE)
 
 
 def class_for(name: str) -> type[Engine]:
-    """Return the class of an engine of a board; what is said of any engine for one that vlatool does not run."""
+    """Return the class of a board's engine; the base class for an engine that vlatool does not run."""
     return engine_class(name) if name in engine_names() else Engine
 
 
@@ -202,6 +223,6 @@ def computing(dtype: str) -> str:
 
 
 def installed(name: str) -> bool:
-    """Say whether the library of an engine is installed; not, where another package's engine cannot be imported."""
+    """Return whether the library of an engine is installed; not, where another package's engine cannot be imported."""
     library = usable_engines().get(name)
     return library is not None and importlib.util.find_spec(library.package) is not None

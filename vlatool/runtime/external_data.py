@@ -62,13 +62,13 @@ MayHold = Callable[[bytes | OpenFile, int, int], bool]
 
 
 def external_files(model: bytes | OpenFile) -> set[str]:
-    """Return the locations of all external data that a serialized ``ModelProto`` names, as they stand there.
+    """Return the locations of all external data that a serialized ``ModelProto`` names, as written there.
 
     Initialisers, attributes, subgraphs, functions and training graphs are gone through, as far as the key stands in
     them. Time is linear in the number of parts, and in the size of those that name weights beside the graph.
 
     Raises:
-        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth`` or have more parts
+        GraphError: for bytes that are not such a message, are deeper than the limit ``graph_depth`` or have more parts
             than ``graph_fields``.
 
     Example:
@@ -87,7 +87,7 @@ def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, 
         may_hold: Of the bytes and the place of a message, whether to go into it.
 
     Raises:
-        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth`` or have more parts
+        GraphError: for bytes that are not such a message, are deeper than the limit ``graph_depth`` or have more parts
             than ``graph_fields``.
     """
     seen, most = 0, limit("graph_fields")
@@ -108,7 +108,7 @@ def messages(model: bytes | OpenFile, may_hold: MayHold) -> Iterator[tuple[str, 
 
 
 def _may_name(model: bytes | OpenFile, start: int, end: int) -> bool:
-    """Say whether a message may hold the key, which stands in every such entry as it is: a large one may."""
+    """Return whether a message may hold the key, which stands in every such entry as it is: a large one may."""
     return end - start > SMALL or LOCATION in model[start:end]
 
 
@@ -120,7 +120,7 @@ def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
     try:
         return {value.decode("utf-8") for field, value in pairs if field == 2} or {""}
     except UnicodeDecodeError:
-        raise GraphError("The graph names external data by bytes that are no UTF-8.") from None
+        raise GraphError("The graph names external data by bytes that are not UTF-8.") from None
 
 
 def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -133,7 +133,7 @@ def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int
             size, used = varint(head, used, 10)
             at += used
             if size > end - at:
-                raise GraphError("The graph is no ONNX model: a part of it is longer than the whole.")
+                raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.")
             yield field, at, at + size
             at += size
         elif kind == VARINT:
@@ -141,18 +141,18 @@ def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int
         elif kind in (FIXED32, FIXED64):
             at += used + (4 if kind == FIXED32 else 8)
         if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or at > end or tag >> 32:
-            raise GraphError("The graph is no ONNX model: it has a field of an unknown kind.")
+            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.")
 
 
 def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
-    """Return a number of at most so many bytes, and where it ends."""
+    """Return a number of at most ``longest`` bytes, and where it ends."""
     value = 0
     for number in range(longest):
         if at >= len(head):
-            raise GraphError("The graph is no ONNX model: it ends within a number.")
+            raise GraphError("The graph is not an ONNX model: it ends within a number.")
         byte = head[at]
         at += 1
         value |= (byte & 0x7F) << (7 * number)
         if byte < 0x80:
             return value, at
-    raise GraphError("The graph is no ONNX model: a number in it is too long.")
+    raise GraphError("The graph is not an ONNX model: a number in it is too long.")

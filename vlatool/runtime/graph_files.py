@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
@@ -16,7 +15,7 @@ from vlatool.files.typed import outside, shown
 from vlatool.runtime.external_data import OpenFile, external_files
 
 WHOLE = 4 * MIB
-"""Bytes of a graph up to which the engine gets its content; a larger one would be in the memory twice."""
+"""Bytes of a graph up to which the engine gets its content; a larger one would be in memory twice."""
 
 
 def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None) -> Any:
@@ -38,27 +37,19 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
     """
     folder, _, name = graph.file.rpartition("/")
     path = bundle.path / graph.file
-    if _size(bundle, graph.file) <= WHOLE:
+    record = bundle.manifest.files.get(graph.file)
+    if record is None or record.bytes <= WHOLE:
         content = bundle.read(graph.file)
         if not external_files(content):
             return engine(path, threads, graph.compute, content)
         del content
     with contextlib.ExitStack() as stack:
         place = stack.enter_context(bundle.held(folder, [graph.file]))
-        beside = recorded(bundle, graph.file, _beside(place, name))
-        if beside:
+        with open_inside(place, name) as handle:
+            locations = external_files(OpenFile(handle))
+        if beside := recorded(bundle, graph.file, locations):
             stack.enter_context(bundle.held(folder, beside))
         return engine(path, threads, graph.compute, place / name)
-
-
-def _size(bundle: Bundle, file: str) -> int:
-    record = bundle.manifest.files.get(file)
-    return record.bytes if record else 0
-
-
-def _beside(place: Path, name: str) -> set[str]:
-    with open_inside(place, name) as handle:
-        return external_files(OpenFile(handle))
 
 
 def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
@@ -68,7 +59,7 @@ def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
         BundleError: when one is not inside, or not recorded.
     """
     folder = file.rpartition("/")[0]
-    found = []
+    files = []
     for location in sorted(locations):
         name = f"{folder}/{location}" if folder else location
         reason = outside(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
@@ -77,5 +68,5 @@ def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
                 f"The graph {file} of {bundle.path} keeps weights in {shown(location)}: {reason}.",
                 "export the policy again",
             )
-        found.append(name)
-    return found
+        files.append(name)
+    return files

@@ -48,8 +48,8 @@ class ObservationEncoder:
         for name, encode in self._encoders:
             try:
                 value = observation[name]
-            except Exception:  # the seam: a mapping says KeyError, anything else what it likes
-                raise self._lacking(observation, name) from None
+            except Exception:  # the seam: a mapping raises KeyError, anything else may raise anything
+                raise self._missing_input(observation, name) from None
             try:
                 values[name] = encode(value)
             except (RuntimeWarning, FloatingPointError):  # where the caller lets numpy raise
@@ -58,7 +58,7 @@ class ObservationEncoder:
                 ) from None
         return values
 
-    def _lacking(self, observation: Any, name: str) -> DataError:
+    def _missing_input(self, observation: Any, name: str) -> DataError:
         takes = f"the policy takes {', '.join(self.names)}."
         if not isinstance(observation, Mapping):
             return DataError(
@@ -69,7 +69,7 @@ class ObservationEncoder:
         return DataError(f"The observation has no '{name}' (it has: {has}); {takes}")
 
     def _example(self) -> str:
-        """Say how an observation is written."""
+        """Return how an observation is written."""
         written = ", ".join(f'"{name}": ...' for name in self.names)
         only = "the policy has one input: " if len(self.names) == 1 else ""
         return f"{only}pass {{{written}}}"
@@ -88,10 +88,10 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         try:
             array = value if isinstance(value, np.ndarray) else np.asarray(value)
         except ValueError as error:
-            raise DataError(f"The input '{tensor.name}' is no array: its rows have different lengths.") from error
+            raise DataError(f"The input '{tensor.name}' is not an array: its rows have different lengths.") from error
         except Exception as error:  # the seam: numpy asks the object for an array, a tensor on a GPU has none
             raise DataError(
-                f"The input '{tensor.name}' is a {type(value).__name__}, which gives no numpy array.",
+                f"The input '{tensor.name}' is a {type(value).__name__}, which cannot be converted to a numpy array.",
                 "pass numpy arrays; tensors as tensor.detach().cpu().numpy()",
             ) from error
         if array.dtype != dtype:
@@ -160,7 +160,7 @@ def _batched(array: Array, tensor: TensorSpec) -> Array:
 
 
 def all_finite(array: Array) -> bool:
-    """Say whether no element is NaN or infinite.
+    """Return whether no element is NaN or infinite.
 
     Few elements are summed without numpy: right after an inference, whose weights have filled the processor's caches,
     that takes half as long as a numpy reduction (``vlatool benchmark overhead``).

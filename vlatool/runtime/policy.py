@@ -14,34 +14,21 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
-from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.errors import BundleError, DataError, GraphError, UsageError, nearest
-from vlatool.files.limits import check
-from vlatool.files.npz import open_npz
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import BundleError, GraphError, UsageError
 from vlatool.files.printable import printable
-from vlatool.runtime.arithmetic import machine, told
-from vlatool.runtime.assets import Assets
-from vlatool.runtime.contract import (
-    Outputs,
-    allowed_mb,
-    check_chunk,
-    check_graphs,
-    check_sizes,
-    not_finite,
-    written_as_declared,
-)
+from vlatool.runtime.arithmetic import int8_trouble, machine
+from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, written_as_declared
+from vlatool.runtime.decoder import Decoder
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
-from vlatool.runtime.observation import ObservationEncoder, all_finite
+from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
-from vlatool.runtime.statistics import Normaliser, load_normaliser
 
 FIRST_RUN_S = 60.0
 """How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
-GOLDEN_STEPS = 2
-"""Golden observations in a row that a program with kept values needs: the first alone does not show what was kept."""
 Array = NDArray[Any]
-Golden = tuple[dict[str, Any], dict[str, Array], Array]
 
 
 class Action(NamedTuple):
@@ -68,7 +55,7 @@ class Policy:
     It may be opened in one thread and used in another. Calls from several threads at once take turns, so that each gets
     the answer to its own observation: an error instead would hit a control loop at random, whenever calls happen to
     overlap, and a lock costs it less than a microsecond. Calls that overlap on a policy that keeps values from step to
-    step are refused all the same: they would mix two episodes, which no order makes right. One policy for each thread
+    step are refused nevertheless: they would mix two episodes, which no order makes right. One policy for each thread
     also spares them the waiting.
     """
 
@@ -78,7 +65,7 @@ class Policy:
         self.spec: PolicySpec = bundle.manifest.spec
         self.program = program
         self.encode = ObservationEncoder(self.spec, bundle)
-        self._decode = _Decoder(self.spec, bundle)
+        self._decode = Decoder(self.spec, bundle)
         certain = written_as_declared(bundle.manifest, program.sessions)
         self._outputs = Outputs(self.spec.outputs, action=False, certain=certain)
         self._action = self.spec.action.name
@@ -99,7 +86,7 @@ class Policy:
         seed: int | None = None,
         memory_mb: float | None = None,
     ) -> Policy:
-        """Open every graph of a verified bundle and hold it against the spec; see ``vlatool.runtime.load``."""
+        """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
             raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
@@ -122,7 +109,7 @@ class Policy:
 
         Args:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
-            noise: Value name -> float32 array, in the place of what the program would draw.
+            noise: Value name -> float32 array, instead of what the program would draw.
 
         Raises:
             DataError: when the observation or the noise does not fit.
@@ -161,10 +148,12 @@ class Policy:
         if self._turn.acquire(blocking=False):  # this thread has the turn already, or it has just become free
             self._turn.release()
             if self._busy:
-                raise UsageError("The policy is called while it infers, in the same thread (a signal handler?).", fix)
+                raise UsageError(
+                    "The policy is called again during an inference, in the same thread (a signal handler?).", fix
+                )
         elif self.program.keeps:
             raise UsageError(
-                "Two threads call a policy at once that keeps values from step to step; it would mix their episodes.",
+                "Two threads call a policy that keeps values between steps at once; that would mix their episodes.",
                 fix,
             )
 
@@ -205,7 +194,7 @@ class Policy:
         """Run the golden observations one after the other, as they were recorded, and compare the actions.
 
         Args:
-            inferences: At least so many, and each golden observation once; none when 0.
+            inferences: At least this many, and each golden observation once; none when 0.
             tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
             first_run_s: Seconds that each may take.
 
@@ -214,8 +203,8 @@ class Policy:
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
         """
-        stored = _stored(self.bundle)
-        steps = _goldens(self.bundle, stored)
+        stored = golden_arrays(self.bundle)
+        steps = golden_steps(self.bundle, stored)
         if self.program.keeps and steps and len(steps) < GOLDEN_STEPS:
             raise BundleError(
                 f"The golden file of {self.bundle.path} has one step; a policy that keeps values needs {GOLDEN_STEPS}.",
@@ -225,7 +214,7 @@ class Policy:
             return
         errors: list[float] = []
         of_chunks: list[float] = []
-        chunks = _golden_chunks(self.spec.action, stored, len(steps))
+        chunks = golden_chunks(self.spec.action, stored, len(steps))
         for number in range(max(inferences, len(steps))):
             observation, noise, expected = steps[number % len(steps)]
             if not number % len(steps):
@@ -240,7 +229,7 @@ class Policy:
         self.check_golden(tolerance)
 
     def check_golden(self, tolerance: float | None = None) -> None:
-        """Hold what the warm-up found against what is allowed.
+        """Check the differences of the warm-up against what is allowed.
 
         Args:
             tolerance: Largest relative L2 difference, of outputs and of chunks; those in the manifest when None.
@@ -249,26 +238,26 @@ class Policy:
             GraphError: when a difference is larger or not a number.
         """
         limits = self.golden_tolerances if tolerance is None else (tolerance, tolerance)
-        found = zip((self.golden_error, self.golden_chunk_error), limits, ("", " in physical units"), strict=True)
-        for error, allowed, where in found:
+        measured = zip((self.golden_error, self.golden_chunk_error), limits, ("", " in physical units"), strict=True)
+        for error, allowed, where in measured:
             if error is not None and not error <= allowed:
-                cause, remedy = told(self.bundle.manifest, self.engine)
+                cause, remedy = int8_trouble(self.bundle.manifest, self.engine)
                 raise GraphError(
-                    f"This {machine(self.engine)} computes another golden action{where} than recorded: relative error "
-                    f"{error:.3g}, allowed {allowed:g}.{cause and ' ' + cause}",
+                    f"This {machine(self.engine)} computes a different golden action{where} than recorded: "
+                    f"relative error {error:.3g}, allowed {allowed:g}.{cause and ' ' + cause}",
                     remedy
                     or self._made_for()
                     or "the engine or processor may lack what this precision needs; run: vlatool doctor",
                 )
 
     def _made_for(self) -> str:
-        """Say which engine the bundle was made for, when another one runs it."""
-        wanted = self.bundle.manifest.engine or DEFAULT_ENGINE
-        if wanted == self.engine:
+        """Return which engine the bundle was made for, when another one runs it."""
+        engine = self.bundle.manifest.engine or DEFAULT_ENGINE
+        if engine == self.engine:
             return ""
-        return f"the bundle was made for {wanted}: load it with engine={wanted!r}, or make one for {self.engine}"
+        return f"the bundle was made for {engine}: load it with engine={engine!r}, or make one for {self.engine}"
 
-    def chunk_error(self, got: Array, wanted: Array) -> float:
+    def chunk_error(self, got: Array, expected: Array) -> float:
         """Return the relative L2 difference of two chunks in physical units; infinite for other sizes.
 
         Each element counts from the offset of its statistics, in units of their spread: a gripper near zero is a large
@@ -277,13 +266,15 @@ class Policy:
 
         Args:
             got: (T, A) in the units of the spec.
-            wanted: What was recorded of it, the same.
+            expected: What was recorded of it, the same.
         """
         normaliser = self._decode.normaliser
-        if normaliser is None or got.shape != wanted.shape:
-            return relative_error(got, wanted)
+        if normaliser is None or got.shape != expected.shape:
+            return relative_error(got, expected)
         with np.errstate(over="ignore", invalid="ignore"):
-            spread = [(np.asarray(each, np.float64) - normaliser.offset) / normaliser.scale for each in (got, wanted)]
+            spread = [
+                (np.asarray(chunk, np.float64) - normaliser.offset) / normaliser.scale for chunk in (got, expected)
+            ]
             return relative_error(*spread)
 
     @property
@@ -310,103 +301,14 @@ def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:
             name, message = printable(finding["name"]), printable(finding["message"])
             raise GraphError(
                 f"{bundle.path} was found to be wrong when it was made ({name}): {message}",
-                f"make it in another way; to use it all the same, accept the finding by name: {name}",
+                f"make it differently; to use it anyway, accept the finding by name: {name}",
             )
 
 
-class _Decoder:
-    """The action output -> a chunk in physical units, or indices of discrete actions."""
-
-    def __init__(self, spec: PolicySpec, assets: Assets) -> None:
-        self.tensor: TensorSpec = spec.action
-        self.normaliser: Normaliser | None = load_normaliser(spec.action, assets)
-        self._floating = np.dtype(spec.action.dtype).kind == "f"
-        self._half = spec.action.dtype == "float16"
-
-    def __call__(self, raw: Array) -> tuple[Array, tuple[str, ...]]:
-        tensor = self.tensor
-        physical = raw.astype(np.float32) if self._half else raw
-        if self.normaliser is not None:
-            try:
-                physical = self.normaliser.inverse(physical)
-            except (RuntimeWarning, FloatingPointError):  # an overflow, where the caller lets numpy raise
-                raise not_finite(tensor.name) from None
-        if self._floating and not all_finite(physical):
-            raise not_finite(tensor.name)
-        if tensor.kind == "discrete":
-            chunk = raw.argmax(-1).reshape(-1)
-            return chunk, tuple([tensor.labels[index] for index in chunk.tolist()])
-        return physical.reshape(-1, physical.shape[-1]), tensor.labels
-
-
-def load_golden(bundle: Bundle) -> Golden | None:
-    """Return the first golden (observation, noise, raw action output), or None when the bundle has none.
-
-    Raises:
-        BundleError: when the file is not the one that the manifest records.
-        DataError: when the file cannot be read or does not fit the spec.
-    """
-    return next(iter(load_goldens(bundle)), None)
-
-
-def load_goldens(bundle: Bundle) -> list[Golden]:
-    """Return every golden (observation, noise, raw action output), in the order in which they follow a reset.
-
-    Raises:
-        BundleError: when the file is not the one that the manifest records.
-        DataError: when the file cannot be read or does not fit the spec.
-    """
-    return _goldens(bundle, _stored(bundle))
-
-
-def _stored(bundle: Bundle) -> Mapping[str, Array]:
-    """Return the arrays of the golden file; none when there is no such file."""
-    name = bundle.manifest.golden
-    if not name:
-        return {}
-    return open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=f"The golden file {bundle.path / name}")
-
-
-def _goldens(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
-    name, spec = bundle.manifest.golden, bundle.manifest.spec
-    if not name:
-        return []
-    where = f"The golden file {bundle.path / name}"
-    noise = [key for key in stored if key.startswith("noise.")]
-    action = f"out.{spec.action.name}"
-    needed = [*(f"in.{tensor.name}" for tensor in spec.inputs), *noise, action]
-    for key in needed:
-        if key not in stored:
-            raise DataError(f"{where} cannot be read: it has no '{key}'; {nearest(key, stored)}.")
-        numbers = stored[key].dtype.kind in "fiu" or (key not in noise and key != action)
-        if not stored[key].ndim or not len(stored[key]) or not numbers:
-            raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.")
-    counts = {len(stored[key]) for key in needed}
-    if len(counts) > 1:
-        raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.")
-    check("golden_steps", max(counts), where, DataError)
-    return [
-        (
-            {tensor.name: stored[f"in.{tensor.name}"][step] for tensor in spec.inputs},
-            {key.removeprefix("noise."): stored[key][step] for key in noise},
-            stored[action][step],
-        )
-        for step in range(counts.pop())
-    ]
-
-
-def _golden_chunks(action: TensorSpec, stored: Mapping[str, Array], steps: int) -> list[Array]:
-    """Return the recorded actions in physical units; none for indices, and where they were not recorded."""
-    chunks = stored.get(f"chunk.{action.name}")
-    if chunks is None or action.kind == "discrete" or not chunks.ndim or chunks.dtype.kind not in "fiu":
-        return []
-    return list(chunks) if len(chunks) == steps else []
-
-
 def _worst(errors: Iterable[float]) -> float | None:
-    """Return the largest; one that is no number before all others, None when there is none."""
-    found = list(errors)
-    return next(filter(math.isnan, found), max(found, default=None))
+    """Return the largest (NaN counts as larger than all), None when there is none."""
+    known = list(errors)
+    return next(filter(math.isnan, known), max(known, default=None))
 
 
 def relative_error(got: Array, expected: Array) -> float:

@@ -56,13 +56,13 @@ def probe(
         VlatoolError: what the bundle raises, of the same class.
     """
     allowed = allowed_mb(Bundle.open(path, verify=False).manifest, memory_mb)
-    asked = {
+    job = {
         "path": str(path), "engine": engine, "threads": threads, "first_run_s": first_run_s, "memory_mb": allowed,
     }  # fmt: skip
     try:
         done = subprocess.run(
             [sys.executable, "-I", "-c", CHILD.format(path=_search_path())],
-            input=json.dumps(asked), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
+            input=json.dumps(job), capture_output=True, text=True, check=False, timeout=START_S + first_run_s,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise _too_long(path, START_S + first_run_s) from None
@@ -71,14 +71,14 @@ def probe(
 
 def main() -> None:
     """Answer one question: the child's side."""
-    asked = json.loads(sys.stdin.readline())
-    size = int(asked["memory_mb"] * 1e6)
+    job = json.loads(sys.stdin.readline())
+    size = int(job["memory_mb"] * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = math.ceil((START_S + asked["first_run_s"]) * len(os.sched_getaffinity(0)))
+    seconds = math.ceil((START_S + job["first_run_s"]) * len(os.sched_getaffinity(0)))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))  # should the parent not live to end this process
     try:
-        answer = _run(**asked)
+        answer = _run(**job)
     except VlatoolError as error:
         answer = {"error": type(error).__name__, "message": error.message, "fix": error.fix}
     except MemoryError:
@@ -108,25 +108,25 @@ def _search_path() -> list[str]:
 
 
 def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) -> dict[str, Any]:
-    """Return what the child found, or raise what it raised."""
-    told: dict[str, Any] = {}
+    """Return the child's answer, or raise its error."""
+    answer: dict[str, Any] = {}
     with contextlib.suppress(ValueError):
-        told = json.loads(done.stdout.rstrip("\n").rpartition("\n")[2])
-    said = str(told.get("message", "")) or done.stderr[-2000:]
-    if ("error" in told or done.returncode) and any(sign in said for sign in NO_MEMORY):
+        answer = json.loads(done.stdout.rstrip("\n").rpartition("\n")[2])
+    message = str(answer.get("message", "")) or done.stderr[-2000:]
+    if ("error" in answer or done.returncode) and any(sign in message for sign in NO_MEMORY):
         raise GraphError(
             f"{path}: the first run needs more than {allowed:,.0f} MB of memory.",
             "allow more with load(..., memory_mb=...) or vlatool inspect --probe --memory MB",
         )
-    if "error" in told:
-        kind = getattr(errors, str(told["error"]), GraphError)
-        raise kind(said, str(told.get("fix", "")))
+    if "error" in answer:
+        kind = getattr(errors, str(answer["error"]), GraphError)
+        raise kind(message, str(answer.get("fix", "")))
     if done.returncode < 0:
         raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
-    if done.returncode or not told:
-        last = (said.strip() or f"exit code {done.returncode}").splitlines()[-1]
+    if done.returncode or not answer:
+        last = (message.strip() or f"exit code {done.returncode}").splitlines()[-1]
         raise GraphError(f"{path} cannot be run in a process of its own: {last}")
-    return told
+    return answer
 
 
 def _too_long(path: Path, seconds: float) -> GraphError:

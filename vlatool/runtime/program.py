@@ -87,14 +87,14 @@ class Program:
 
         Args:
             values: Value name -> array.
-            noise: Value name -> floating array, in the place of what the program would draw.
+            noise: Value name -> floating array, instead of what the program would draw.
             finish: Makes the result from all values.
 
         Raises:
             DataError: when the noise does not fit.
             GraphError: when a graph fails, or a kept value is not finite or of another shape or dtype than declared.
         """
-        given = self._given(noise) if noise is not None else {}
+        drawn = self._caller_noise(noise) if noise is not None else {}
         if self._plain is not None:
             run, feeds, gives = self._plain
             results = run({name: values[value] for name, value in feeds})
@@ -103,23 +103,23 @@ class Program:
             return values if finish is None else finish(values)
         before = self._random.bit_generator.state if self._noisy else None
         try:
-            self._run_steps(values, given)
+            self._run_steps(values, drawn)
             kept = {name: _checked(name, values[name], zero) for name, zero in self._kept.items()}
-            found = values if finish is None else finish(values)
+            result = values if finish is None else finish(values)
         except BaseException as error:
             if before is not None:
                 self._random.bit_generator.state = before
             if isinstance(error, VlatoolError) and (before or self._kept):
-                _tell_rolled_back(error)
+                _note_rollback(error)
             raise
         self._kept = kept
-        return found
+        return result
 
-    def _run_steps(self, values: dict[str, Any], given: Mapping[str, Array]) -> None:
+    def _run_steps(self, values: dict[str, Any], drawn: Mapping[str, Array]) -> None:
         values.update(self._kept)
         for step, schedules in zip(self.steps, self._schedules, strict=True):
-            for name, wanted in step.noise.items():
-                values[name] = given[name] if name in given else draw(wanted, self._random)
+            for name, noise in step.noise.items():
+                values[name] = drawn[name] if name in drawn else draw(noise, self._random)
             self._run_step(step, schedules, values)
 
     def _run_step(self, step: ProgramStep, schedules: dict[str, list[Array]], values: dict[str, Any]) -> None:
@@ -127,18 +127,18 @@ class Program:
         for turn in range(step.repeat):
             for name, numbers in schedules.items():
                 values[name] = numbers[turn]
-            given = session.run({name: values[value] for name, value in step.feeds.items()})
+            outputs = session.run({name: values[value] for name, value in step.feeds.items()})
             for name, value in step.gives.items():
-                values[value] = given[name]
+                values[value] = outputs[name]
             for source, target in step.carry.items():
                 values[target] = values[source]
 
-    def _given(self, noise: Mapping[str, Array]) -> dict[str, Array]:
+    def _caller_noise(self, noise: Mapping[str, Array]) -> dict[str, Array]:
         """Return the noise of the caller as float32."""
-        known = {name: wanted for step in self.steps for name, wanted in step.noise.items()}
+        known = {name: entry for step in self.steps for name, entry in step.noise.items()}
         if not isinstance(noise, Mapping):
             raise DataError(f"The noise is a {type(noise).__name__}; it must be a mapping of names to arrays.")
-        found = {}
+        arrays = {}
         for name, value in noise.items():
             if name not in known:
                 raise DataError(f"The program draws no noise '{name}'; {nearest(str(name), known)}.")
@@ -147,14 +147,14 @@ class Program:
                 raise DataError(f"The noise '{name}' is {array.dtype}; wanted float32.", "cast it to float32")
             if array.shape != shape:
                 raise DataError(f"The noise '{name}' has the shape {list(array.shape)}; wanted {list(shape)}.")
-            found[name] = array.astype(np.float32, copy=False)
-        return found
+            arrays[name] = array.astype(np.float32, copy=False)
+        return arrays
 
 
-def draw(wanted: Mapping[str, Any], random: np.random.Generator) -> Array:
+def draw(noise: Mapping[str, Any], random: np.random.Generator) -> Array:
     """Draw float32 noise as a program asks for it: ``normal`` N(0, 1), ``uniform`` on [-1, 1) or ``zeros``."""
-    shape = tuple(wanted["shape"])
-    distribution = wanted.get("distribution", "normal")
+    shape = tuple(noise["shape"])
+    distribution = noise.get("distribution", "normal")
     if distribution == "zeros":
         return np.zeros(shape, np.float32)
     if distribution == "uniform":
@@ -163,11 +163,11 @@ def draw(wanted: Mapping[str, Any], random: np.random.Generator) -> Array:
 
 
 def _schedules(step: ProgramStep) -> dict[str, list[Array]]:
-    found = {}
+    schedules = {}
     for name, numbers in step.schedule.items():
         whole = all(isinstance(number, int) for number in numbers)
-        found[name] = [np.array([number], np.int64 if whole else np.float32) for number in numbers]
-    return found
+        schedules[name] = [np.array([number], np.int64 if whole else np.float32) for number in numbers]
+    return schedules
 
 
 def _checked(name: str, value: Array, zero: Array) -> Array:
@@ -183,7 +183,7 @@ def _checked(name: str, value: Array, zero: Array) -> Array:
     return value
 
 
-def _tell_rolled_back(error: VlatoolError) -> None:
-    """Say in an error that the inference counts as if it had never been."""
+def _note_rollback(error: VlatoolError) -> None:
+    """Add to an error that the inference counts as if it had never been."""
     error.message += " The state that the policy keeps is as it was before this inference."
-    error.fix = "; ".join(filter(None, [error.fix, "go on with a good observation, or start anew with reset()"]))
+    error.fix = "; ".join(filter(None, [error.fix, "continue with a good observation, or start over with reset()"]))

@@ -57,9 +57,9 @@ class Normaliser:
         Right after an inference the processor's caches hold the network, and broadcasting then takes 20 us longer
         (``vlatool benchmark overhead``).
         """
-        found = np.broadcast_to(self.offset, shape).copy(), np.broadcast_to(self.scale, shape).copy()
-        self._rows[shape] = found
-        return found
+        operands = np.broadcast_to(self.offset, shape).copy(), np.broadcast_to(self.scale, shape).copy()
+        self._rows[shape] = operands
+        return operands
 
 
 def load_normaliser(tensor: TensorSpec, assets: Assets) -> Normaliser | None:
@@ -118,6 +118,6 @@ def _checked(values: object, tensor: TensorSpec, where: str) -> Array:
 
 
 def _numbers(values: object) -> bool:
-    """Say whether a value may be numbers or lists of them: text and truth values would become numbers, too."""
+    """Return whether a value may be numbers or lists of them: text and truth values would become numbers, too."""
     inner = values if isinstance(values, list) else [values]
     return not any(isinstance(item, str | bool | dict) for item in inner)

@@ -1,4 +1,4 @@
-"""Whether an ONNX graph holds tensors of a type that an engine must be told of: its bytes are walked, as for files."""
+"""Whether an ONNX graph holds tensors of a type that needs other options: its bytes are walked, as for files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ MARKS = tuple(bytes([DATA_TYPE << 3 | VARINT, code]) for code in FLOAT8)
 
 
 def has_float8(model: Path | bytes) -> bool:
-    """Say whether a serialized ``ModelProto``, or the file of one, holds a float8 tensor anywhere.
+    """Return whether a serialized ``ModelProto``, or the file of one, holds a float8 tensor anywhere.
 
     A zero point in float8 is such a tensor, so that every QuantizeLinear to float8 is found (but for one whose type is
     an attribute alone, opset 21).
 
     Raises:
-        GraphError: when the bytes are no such message, or are deeper than the limit ``graph_depth`` or have more parts
+        GraphError: for bytes that are not such a message, are deeper than the limit ``graph_depth`` or have more parts
             than ``graph_fields``.
         OSError: when there is no such file.
 
@@ -45,7 +45,7 @@ def _holds(model: bytes | OpenFile) -> bool:
 
 
 def _may_hold(model: bytes | OpenFile, start: int, end: int) -> bool:
-    """Say whether a message may have such a tensor in it: a large one may."""
+    """Return whether a message may have such a tensor in it: a large one may."""
     return end - start > SMALL or any(mark in model[start:end] for mark in MARKS)
 
 

@@ -1,4 +1,4 @@
-"""How much longer a ``tokenizer.json`` can make a text: told from the file, before the library opens it.
+"""How much longer a ``tokenizer.json`` can make a text: read from the file, before the library opens it.
 
 Forty steps that write two letters for one make a terabyte of a word, inside of a library that ends the process when
 memory runs out. Lengths are counted in characters, and in tokens from the model on.
@@ -48,14 +48,14 @@ def growth(data: Mapping[str, Any], where: str) -> int:
         times, added = _processed(step, where)
         factor, more = factor * times, more * times + added
         _checked(factor + more, where)
-    found = int(_checked(factor + more, where))
+    times_longer = int(_checked(factor + more, where))
     check(
         "text_characters",
-        _added_tokens(data) * found,
+        _added_tokens(data) * times_longer,
         f"{where}: its added tokens, as it may lengthen them,",
         SpecError,
     )
-    return found
+    return times_longer
 
 
 def _checked(factor: float, where: str) -> float:
@@ -74,7 +74,7 @@ def _steps(step: Any, where: str) -> Iterator[Mapping[str, Any]]:
         seen += 1
         check("steps", seen, where, SpecError)
         if not isinstance(step, dict):
-            raise SpecError(f"{where} is no file of the tokenizers library: a step of it is no mapping.")
+            raise SpecError(f"{where} is not a file of the tokenizers library: one of its steps is not a mapping.")
         if step.get("type") == "Sequence":
             for inner in (step.get(key) for key in INNER):
                 pending += reversed(inner) if isinstance(inner, list) else []
@@ -104,10 +104,10 @@ def _replaced(pattern: Any, length: int) -> float:
     return max(1.0, length / len(text)) if isinstance(text, str) and text else 1 + 2 * length
 
 
-def _precompiled(told: Any) -> int:
+def _precompiled(charsmap: Any) -> int:
     """The longest text in a table of SentencePiece: its size, a trie of that size, and texts that end in a zero."""
     try:
-        table = base64.b64decode(told or "")
+        table = base64.b64decode(charsmap or "")
         texts = table[4 + int.from_bytes(table[:4], "little") :]
     except (ValueError, TypeError):
         return 1  # the library does not open it
@@ -132,9 +132,9 @@ def _processed(step: Mapping[str, Any], where: str) -> tuple[int, int]:
     special = step.get("special_tokens")
     tokens = special if isinstance(special, dict) else {}
     template = step.get("single")
-    pieces = [each for each in (template if isinstance(template, list) else []) if isinstance(each, dict)]
-    added = sum(_ids(tokens.get(str(_id(each)))) for each in pieces if "SpecialToken" in each)
-    return max(1, sum("Sequence" in each for each in pieces)), added
+    pieces = [piece for piece in (template if isinstance(template, list) else []) if isinstance(piece, dict)]
+    added = sum(_ids(tokens.get(str(_id(piece)))) for piece in pieces if "SpecialToken" in piece)
+    return max(1, sum("Sequence" in piece for piece in pieces)), added
 
 
 def _id(piece: Mapping[str, Any]) -> Any:
@@ -151,7 +151,9 @@ def _added_tokens(data: Mapping[str, Any]) -> int:
     """The library takes added tokens through the normalizer when it opens the file."""
     added = data.get("added_tokens")
     return (
-        sum(_length(each.get("content")) for each in added if isinstance(each, dict)) if isinstance(added, list) else 0
+        sum(_length(token.get("content")) for token in added if isinstance(token, dict))
+        if isinstance(added, list)
+        else 0
     )
 
 
@@ -161,6 +163,6 @@ def _length(text: Any) -> int:
 
 def _unknown(kind: Any, where: str) -> SpecError:
     return SpecError(
-        f"{where} has a step of the type {str(kind)[:40]!r}, of which is not known how long it makes a text.",
+        f"{where} has a step of the type {str(kind)[:40]!r}, whose effect on the length of a text is not known.",
         f"use other steps; known: {', '.join(sorted({*STEPS, *ADDED, 'TemplateProcessing'}))}",
     )

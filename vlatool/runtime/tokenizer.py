@@ -71,14 +71,14 @@ class Tokenizer:
             f"The {self.name}, as its tokenizer may lengthen it,",
             DataError,
         )
-        found = self._encode(text)
-        if len(found) > self.max_tokens:
+        ids = self._encode(text)
+        if len(ids) > self.max_tokens:
             warnings.warn(
-                f"the {self.name} has {len(found)} tokens; the last {len(found) - self.max_tokens} are cut",
+                f"the {self.name} has {len(ids)} tokens; the last {len(ids) - self.max_tokens} are cut",
                 stacklevel=4,
             )
         row = np.full((1, self.max_tokens), self.pad, np.int64)
-        row[0, : len(found)] = found[: self.max_tokens]
+        row[0, : len(ids)] = ids[: self.max_tokens]
         return row
 
 
@@ -114,7 +114,7 @@ def _is_id(value: object) -> bool:
 
 def _library(content: bytes, path: Path, name: str) -> tuple[int, Encode]:
     library = require("tokenizers", "text")
-    with _foreign(SpecError, f"{path} is no file of the tokenizers library"):
+    with _foreign(SpecError, f"{path} is not a file of the tokenizers library"):
         tokenizer = library.Tokenizer.from_buffer(content)
         tokenizer.no_truncation()
         padding = tokenizer.padding or {}

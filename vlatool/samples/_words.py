@@ -36,17 +36,7 @@ PHRASES = (
     "in front of", "next to", "to the left of", "to the right of", "on top of", "away from", "between", "towards",
 )  # fmt: skip
 JOINTS = ("and", "then", "and then", "before you", "after that")
-MANNERS = (
-    "slowly",
-    "carefully",
-    "gently",
-    "quickly",
-    "again",
-    "twice",
-    "with your left arm",
-    "with the gripper",
-    "now",
-)
+MANNERS = (*_words("slowly carefully gently quickly again twice"), "with your left arm", "with the gripper", "now")
 OTHERS = _words(
     "go forward backward up down stop wait stay walk drive enter leave follow pass cross corner hallway corridor "
     "room kitchen bathroom bedroom office entrance exit stairs elevator wall floor ceiling please robot arm both "

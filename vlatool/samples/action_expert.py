@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vlatool.samples._entries import numbers
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -12,14 +14,8 @@ DESCRIPTION = (
     "of width 960 (all float32), gives the flow's velocity; 127 M parameters, 12 layers of width 768."
 )
 SPEC: dict[str, object] = {
-    "inputs": [
-        {"name": "actions", "shape": [1, 50, 32], "dtype": "float32", "unit": "1"},
-        {"name": "time", "shape": [1], "dtype": "float32", "unit": "1"},
-        {"name": "context", "shape": [1, 113, 960], "dtype": "float32", "unit": "1"},
-    ],
-    "outputs": [
-        {"name": "velocity", "shape": [1, 50, 32], "dtype": "float32", "unit": "1"},
-    ],
+    "inputs": [numbers("actions", 50, 32), numbers("time"), numbers("context", 113, 960)],
+    "outputs": [numbers("velocity", 50, 32)],
     "control_hz": 30,
     "chunk": 50,
 }
@@ -28,12 +24,7 @@ RANGES = {"time": (0.1, 1.0)}
 
 
 def make(seed: int = 0, device: str | None = None) -> nn.Module:
-    """Return the policy in eval mode.
-
-    Args:
-        seed: Seed of the weights.
-        device: Where it lives, the CPU when None; ``"meta"`` costs no memory.
-    """
+    """Return the policy in eval mode; the arguments are those of ``build``."""
     from vlatool.samples._build import build
     from vlatool.samples._expert import ActionExpert, ExpertShape
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vlatool.samples._entries import arm_action, camera, instruction
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -13,27 +15,8 @@ DESCRIPTION = (
     "float32 in [-1, 1]; 7.5 B parameters: 30 GB in float32, 15 GB in float16."
 )
 SPEC: dict[str, object] = {
-    "inputs": [
-        {"name": "image", "shape": [1, 224, 224, 3], "dtype": "uint8", "unit": "rgb"},
-        {
-            "name": "instruction",
-            "kind": "text",
-            "shape": [1, 32],
-            "dtype": "int64",
-            "tokenizer": "vocabulary.json",
-            "max_tokens": 32,
-        },
-    ],
-    "outputs": [
-        {
-            "name": "action",
-            "shape": [1, 1, 7],
-            "dtype": "float32",
-            "labels": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
-            "unit": ["m", "m", "m", "rad", "rad", "rad", "1"],
-            "mode": "delta",
-        },
-    ],
+    "inputs": [camera(), instruction(32)],
+    "outputs": [arm_action(1)],
     "control_hz": 5,
     "chunk": 1,
 }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vlatool.samples._entries import numbers
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -12,12 +14,8 @@ DESCRIPTION = (
     "315 M parameters in 32 layers with 15 query and 5 key/value heads, SwiGLU 2560."
 )
 SPEC: dict[str, object] = {
-    "inputs": [
-        {"name": "embeddings", "shape": [1, 113, 960], "dtype": "float32", "unit": "1"},
-    ],
-    "outputs": [
-        {"name": "hidden", "shape": [1, 113, 960], "dtype": "float32", "unit": "1"},
-    ],
+    "inputs": [numbers("embeddings", 113, 960)],
+    "outputs": [numbers("hidden", 113, 960)],
     "control_hz": 10,
     "chunk": 113,
     "execute": 1,
@@ -25,12 +23,7 @@ SPEC: dict[str, object] = {
 
 
 def make(seed: int = 0, device: str | None = None) -> nn.Module:
-    """Return the policy in eval mode.
-
-    Args:
-        seed: Seed of the weights.
-        device: Where it lives, the CPU when None; ``"meta"`` costs no memory.
-    """
+    """Return the policy in eval mode; the arguments are those of ``build``."""
     from vlatool.samples._build import build
     from vlatool.samples._language import SMOLLM2_360M, Prefill
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vlatool.samples._entries import features
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -11,25 +13,11 @@ DESCRIPTION = (
     "ResNet-18 over one raw 224x224 camera image (uint8 NHWC) with a linear head to 1000 float32 features; "
     "11.7 M parameters, 1.8 G multiply-adds."
 )
-SPEC: dict[str, object] = {
-    "inputs": [
-        {"name": "image", "shape": [1, 224, 224, 3], "dtype": "uint8", "unit": "rgb"},
-    ],
-    "outputs": [
-        {"name": "features", "shape": [1, 1000], "dtype": "float32", "unit": "1"},
-    ],
-    "control_hz": 30,
-    "chunk": 1,
-}
+SPEC = features()
 
 
 def make(seed: int = 0, device: str | None = None) -> nn.Module:
-    """Return the policy in eval mode.
-
-    Args:
-        seed: Seed of the weights.
-        device: Where it lives, the CPU when None; ``"meta"`` costs no memory.
-    """
+    """Return the policy in eval mode; the arguments are those of ``build``."""
     from vlatool.samples._build import build
     from vlatool.samples._convolution import ResNetFeatures
 

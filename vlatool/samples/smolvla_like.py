@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vlatool.samples._entries import camera, instruction, numbers
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -13,21 +15,8 @@ DESCRIPTION = (
     "parameters as in the checkpoint, 394 M of which the graphs use."
 )
 SPEC: dict[str, object] = {
-    "inputs": [
-        {"name": "image", "shape": [1, 512, 512, 3], "dtype": "uint8", "unit": "rgb"},
-        {
-            "name": "instruction",
-            "kind": "text",
-            "shape": [1, 48],
-            "dtype": "int64",
-            "tokenizer": "vocabulary.json",
-            "max_tokens": 48,
-        },
-        {"name": "state", "shape": [1, 32], "dtype": "float32", "unit": "1"},
-    ],
-    "outputs": [
-        {"name": "action", "shape": [1, 50, 32], "dtype": "float32", "unit": "1", "mode": "absolute"},
-    ],
+    "inputs": [camera(side=512), instruction(48), numbers("state", 32)],
+    "outputs": [{**numbers("action", 50, 32), "mode": "absolute"}],
     "control_hz": 30,
     "chunk": 50,
 }
@@ -52,12 +41,7 @@ RANGES = {"state": (-1.0, 1.0)}
 
 
 def make(seed: int = 0, device: str | None = None) -> dict[str, nn.Module]:
-    """Return the policy in eval mode.
-
-    Args:
-        seed: Seed of the weights.
-        device: Where it lives, the CPU when None; ``"meta"`` costs no memory.
-    """
+    """Return the policy in eval mode; the arguments are those of ``build``."""
     from vlatool.samples._build import build
     from vlatool.samples._smolvla import Prefix, SmolShape
     from vlatool.samples._smolvla_step import Step

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from vlatool.samples._entries import arm_action, camera, instruction
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -12,40 +14,15 @@ DESCRIPTION = (
     "width 384, one 16x7 action chunk (float32) in one pass; 45 M parameters."
 )
 SPEC: dict[str, object] = {
-    "inputs": [
-        {"name": "image_front", "shape": [1, 224, 224, 3], "dtype": "uint8", "unit": "rgb"},
-        {"name": "image_wrist", "shape": [1, 224, 224, 3], "dtype": "uint8", "unit": "rgb"},
-        {
-            "name": "instruction",
-            "kind": "text",
-            "shape": [1, 80],
-            "dtype": "int64",
-            "tokenizer": "vocabulary.json",
-            "max_tokens": 80,
-        },
-    ],
-    "outputs": [
-        {
-            "name": "action",
-            "shape": [1, 16, 7],
-            "dtype": "float32",
-            "labels": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"],
-            "unit": ["m", "m", "m", "rad", "rad", "rad", "1"],
-            "mode": "delta",
-        },
-    ],
+    "inputs": [camera("image_front"), camera("image_wrist"), instruction(80)],
+    "outputs": [arm_action(16)],
     "control_hz": 20,
     "chunk": 16,
 }
 
 
 def make(seed: int = 0, device: str | None = None) -> nn.Module:
-    """Return the policy in eval mode.
-
-    Args:
-        seed: Seed of the weights.
-        device: Where it lives, the CPU when None; ``"meta"`` costs no memory.
-    """
+    """Return the policy in eval mode; the arguments are those of ``build``."""
     from vlatool.samples._build import build
     from vlatool.samples._fusion import FusionPolicy, FusionShape
 

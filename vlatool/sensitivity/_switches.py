@@ -8,13 +8,14 @@ the branch that is not taken cost nothing.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import GraphError, require
+from vlatool.errors import GraphError
 from vlatool.graph.files import load
-from vlatool.graph.layers import Layer, Style, hoisted, wanted_values
+from vlatool.graph.layers import Layer, Style, calibrated_values, hoisted
+from vlatool.graph.onnx_graph import FLOAT, OnnxGraph
 from vlatool.graph.qdq import Range, insert_qdq
 
 FLAG = "int8."
@@ -29,8 +30,8 @@ def add_switches(
     Args:
         path: A float32 ONNX file.
         layers: From ``find_layers`` of that file.
-        ranges: Value name -> (low, high), of every value that ``wanted_values`` names; when None, ranges are taken from
-            the values at run time (uint8, DynamicQuantizeLinear).
+        ranges: Value name -> (low, high), of every value that ``calibrated_values`` names; when None, ranges are taken
+            from the values at run time (uint8, DynamicQuantizeLinear).
         style: How the int8 graph writes its layers.
 
     Raises:
@@ -41,12 +42,10 @@ def add_switches(
     moved = hoisted(written, chosen, style)
     plain = replace(style, hoist=False)
     known: dict[str, Range] = {}
-    for name in wanted_values(chosen, plain, {}):
+    for name in calibrated_values(chosen, plain, {}):
         source = moved.get(name, name)
         if ranges is not None and source not in ranges:
-            raise GraphError(
-                f"There is no range for the value '{source}' of {path.name}.", "calibrate with the same stage"
-            )
+            raise GraphError(f"The value '{source}' of {path.name} has no range.", "calibrate with the same stage")
         known[name] = (0.0, 1.0) if ranges is None else ranges[source]
     insert_qdq(written, chosen, known, plain)
     pairs = _Pairs(written, dynamic=ranges is None)
@@ -54,16 +53,13 @@ def add_switches(
     return model, _Writer(model, {layer.name: layer for layer in chosen}, pairs, plain).write()
 
 
-class _Pairs:
-    """The quantize-dequantize nodes of an int8 graph, copied to where they are wanted."""
+class _Pairs(OnnxGraph):
+    """The quantize-dequantize nodes of an int8 graph, copied to where they are needed."""
 
     def __init__(self, model: Any, *, dynamic: bool) -> None:
-        self.onnx = require("onnx", "build")
+        super().__init__(model)
         self.dynamic = dynamic
-        self.producers = {name: node for node in model.graph.node for name in node.output}
         self.nodes = {node.name: node for node in model.graph.node}
-        self.quantizers = {node.input[0]: node for node in model.graph.node if node.op_type == "QuantizeLinear"}
-        self.tensors = {tensor.name: tensor for tensor in model.graph.initializer}
         self.used: dict[str, Any] = {}
 
     def of_input(self, layer: str, index: int, source: str, suffix: str) -> tuple[list[Any], str]:
@@ -83,66 +79,56 @@ class _Pairs:
         if first is not None and first.op_type == "QuantizeLinear":
             return self._pair(first, last, source, suffix)
         self._use(last.input)
-        made = self._copy(last, list(last.input), f"{last.output[0]}{suffix}")
-        return [made], made.output[0]
+        copy = self._copy(last, list(last.input), f"{last.output[0]}{suffix}")
+        return [copy], copy.output[0]
 
     def of_output(self, name: str, suffix: str) -> tuple[list[Any], str]:
         """Return the pair that quantizes what a convolution gives, and the name it gives."""
-        first = self.quantizers[name]
-        last = next(node for node in self.producers.values() if first.output[0] in node.input)
-        return self._pair(first, last, name, suffix)
+        first = next(node for node in self.readers[name] if node.op_type == "QuantizeLinear")
+        return self._pair(first, self.readers[first.output[0]][0], name, suffix)
 
     def _pair(self, first: Any, last: Any, source: str, suffix: str) -> tuple[list[Any], str]:
-        middle, given = f"{first.output[0]}{suffix}", f"{last.output[0]}{suffix}"
+        middle, end = f"{first.output[0]}{suffix}", f"{last.output[0]}{suffix}"
         if self.dynamic:
-            made = self.onnx.helper.make_node
             parts = [middle, f"{middle}.scale", f"{middle}.zero"]
-            return [made("DynamicQuantizeLinear", [source], parts), made("DequantizeLinear", parts, [given])], given
+            return [
+                self.node("DynamicQuantizeLinear", [source], parts),
+                self.node("DequantizeLinear", parts, [end]),
+            ], end
         self._use((*first.input[1:], *last.input[1:]))
         quantize = self._copy(first, [source, *first.input[1:]], middle)
-        return [quantize, self._copy(last, [middle, *last.input[1:]], given)], given
+        return [quantize, self._copy(last, [middle, *last.input[1:]], end)], end
 
     def _copy(self, node: Any, inputs: list[str], output: str) -> Any:
-        made = self.onnx.helper.make_node(node.op_type, inputs, [output], name=f"{node.name}@{output}")
-        made.attribute.extend(node.attribute)
-        return made
+        copy = self.node(node.op_type, inputs, [output], f"{node.name}@{output}")
+        copy.attribute.extend(node.attribute)
+        return copy
 
     def _use(self, names: Iterable[str]) -> None:
-        self.used.update({name: self.tensors[name] for name in names})
+        self.used.update({name: self.constants[name] for name in names})
 
 
-@dataclass
-class _Writer:
-    model: Any
-    layers: Mapping[str, Layer]
-    pairs: _Pairs
-    style: Style
-    nodes: list[Any] = field(default_factory=list)
-    rerouted: dict[str, str] = field(default_factory=dict)
-    flags: dict[str, str] = field(default_factory=dict)
+class _Writer(OnnxGraph):
+    def __init__(self, model: Any, layers: Mapping[str, Layer], pairs: _Pairs, style: Style) -> None:
+        super().__init__(model)
+        self.layers, self.pairs = layers, pairs
+        self.nodes: list[Any] = []
+        self.rerouted: dict[str, str] = {}
+        self.flags = {name: f"{FLAG}{number}" for number, name in enumerate(layers)}
+        convolutions = [layer for layer in layers.values() if layer.kind == "Conv" and style.fused_convolutions]
+        self.fused = {layer.output: layer for layer in convolutions if layer.output not in self.outputs}
 
     def write(self) -> dict[str, str]:
         """Rebuild the list of nodes; return layer name -> flag."""
-        onnx, graph = require("onnx", "build"), self.model.graph
-        outputs = {value.name for value in graph.output}
-        self.flags = {name: f"{FLAG}{number}" for number, name in enumerate(self.layers)}
-        convolutions = {
-            layer.output: layer
-            for layer in self.layers.values()
-            if layer.kind == "Conv" and self.style.fused_convolutions and layer.output not in outputs
-        }
-        for node in graph.node:
-            for index, name in enumerate(node.input):
-                node.input[index] = self.rerouted.get(name, name)
+        for node in self.graph.node:
+            node.input[:] = [self.rerouted.get(name, name) for name in node.input]
             self.nodes.append(self._switched(node) if node.name in self.layers else node)
-            layer = convolutions.get(node.output[0])
-            if layer is not None:
-                self._output(layer)
-        del graph.node[:]
-        graph.node.extend(self.nodes)
-        graph.initializer.extend(self.pairs.used.values())
-        boolean = onnx.TensorProto.BOOL
-        graph.input.extend(onnx.helper.make_tensor_value_info(flag, boolean, []) for flag in self.flags.values())
+            if node.output[0] in self.fused:
+                self._output(self.fused[node.output[0]])
+        self.replace_nodes(self.nodes)
+        self.graph.initializer.extend(self.pairs.used.values())
+        info, boolean = self.onnx.helper.make_tensor_value_info, self.onnx.TensorProto.BOOL
+        self.graph.input.extend(info(flag, boolean, []) for flag in self.flags.values())
         return dict(self.flags)
 
     def _switched(self, node: Any) -> Any:
@@ -151,28 +137,27 @@ class _Writer:
         before: list[Any] = []
         inputs = list(node.input)
         for index, name in enumerate(node.input):
-            made, given = self.pairs.of_input(node.name, index, name, f"@{flag}.{index}")
-            before += made
-            inputs[index] = given or name
+            nodes, value = self.pairs.of_input(node.name, index, name, f"@{flag}.{index}")
+            before += nodes
+            inputs[index] = value or name
         return self._if(flag, node, inputs, before)
 
     def _output(self, layer: Layer) -> None:
         """Let all later readers of a convolution's output read what its flag makes of it."""
-        onnx = require("onnx", "build")
         flag, target = self.flags[layer.name], f"{layer.output}@switched"
-        before, given = self.pairs.of_output(layer.output, f"@{flag}.out")
-        node = onnx.helper.make_node("Identity", [layer.output], [target], name=f"{layer.name}@out")
-        self.nodes.append(self._if(flag, node, [given], before))
+        before, value = self.pairs.of_output(layer.output, f"@{flag}.out")
+        node = self.node("Identity", [layer.output], [target], f"{layer.name}@out")
+        self.nodes.append(self._if(flag, node, [value], before))
         self.rerouted[layer.output] = target
 
     def _if(self, flag: str, node: Any, inputs: list[str], before: list[Any]) -> Any:
         """Return an ``If``: ``before`` and the node on ``inputs`` when the flag is set, else the node alone."""
-        helper = require("onnx", "build").helper
+        helper = self.onnx.helper
         branches = {}
         for word, nodes, read in (("then", before, inputs), ("else", [], list(node.input))):
-            given = f"{node.output[0]}@{word}"
-            last = helper.make_node(node.op_type, read, [given], name=f"{node.name}@{word}", domain=node.domain)
+            output = f"{node.output[0]}@{word}"
+            last = self.node(node.op_type, read, [output], f"{node.name}@{word}", domain=node.domain)
             last.attribute.extend(node.attribute)
-            value = helper.make_tensor_value_info(given, 1, None)
+            value = helper.make_tensor_value_info(output, FLOAT, None)
             branches[f"{word}_branch"] = helper.make_graph([*nodes, last], f"{node.name}@{word}", [], [value])
-        return helper.make_node("If", [flag], [node.output[0]], name=node.name, **branches)
+        return self.node("If", [flag], [node.output[0]], node.name, **branches)

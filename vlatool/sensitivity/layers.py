@@ -84,8 +84,8 @@ def sensitivities(
         DataError: when there is no observation, or one does not fit the spec.
         GraphError: when a graph cannot be rewritten or run.
     """
-    found = ranges_of(bundle, stage, context) if ranges is None else ranges
-    with Switchboard(bundle, stage, found) as board:
+    known = ranges_of(bundle, stage, context) if ranges is None else ranges
+    with Switchboard(bundle, stage, known) as board:
         return board.errors([(place,) for place in board.shares], observations, context, seconds=seconds)
 
 
@@ -96,8 +96,8 @@ def ranges_of(bundle: Bundle, stage: StaticInt8, context: Context) -> dict[str, 
         DataError: when the bundle has no calibration data, or a sample does not fit.
     """
     stage.check(bundle, None)
-    _, wanted = stage.plan(bundle)
-    statistics = stage.statistics(bundle, wanted, SampleSet(), context)
+    _, values = stage.plan(bundle)
+    statistics = stage.statistics(bundle, values, SampleSet(), context)
     return {graph: stage.ranges(values) for graph, values in statistics.items()}
 
 
@@ -137,10 +137,10 @@ class _Switchable:
         if not tape.changed:
             tape.place += 1
             return tape.recorded[tape.place - 1]
-        given: Mapping[str, Any] = self._session.run({**feeds, **self._set})
+        outputs: Mapping[str, Any] = self._session.run({**feeds, **self._set})
         if tape.recording:
-            tape.recorded.append(given)
-        return given
+            tape.recorded.append(outputs)
+        return outputs
 
 
 class Switchboard:
@@ -215,20 +215,20 @@ class Switchboard:
             DataError: when there is no observation.
         """
         if not observations:
-            raise DataError("There is no observation to measure the layers on.", "record some: see docs/data")
+            raise DataError("No observations to measure the layers on.", "record some: see docs/data")
         spec = self.policy.spec.action
         rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
         start = time.monotonic()
         for number, observation in enumerate(observations):
             if number and (time.monotonic() - start) * (number + 1) / number > seconds:
                 break
-            wanted = self.reference(observation)
+            reference = self.reference(observation)
             for index, group in enumerate(groups):
                 done = (number * len(groups) + index) / (len(observations) * len(groups))
                 context.tell(f"int8 in layer {index + 1} of {len(groups)}, all else in float32", done)
-                rows[index].append(_compare(spec, self.run(group, observation), wanted))
-        found = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
-        return sorted(found, key=lambda each: -each.error) if ordered else found
+                rows[index].append(_compare(spec, self.run(group, observation), reference))
+        layers = [self._error(group, row) for group, row in zip(groups, rows, strict=True)]
+        return sorted(layers, key=lambda layer: -layer.error) if ordered else layers
 
     def _error(self, group: Sequence[Place], rows: list[tuple[Array, ...]]) -> LayerError:
         spec = self.policy.spec.action
@@ -241,16 +241,16 @@ class Switchboard:
         return LayerError(name, graphs, float(errors), named, float(flips), float(jumps), share, len(rows))
 
 
-def _compare(spec: TensorSpec, got: Action, wanted: Action) -> tuple[Array, ...]:
+def _compare(spec: TensorSpec, got: Action, reference: Action) -> tuple[Array, ...]:
     """Return relative error, share of flips, relative change of the jump, and mean |error| of each element."""
-    raw, before = (np.asarray(action.outputs[spec.name], np.float64) for action in (got, wanted))
+    raw, before = (np.asarray(action.outputs[spec.name], np.float64) for action in (got, reference))
     error = np.array(relative_error(raw, before))
     if spec.kind == "discrete":
-        return error, np.mean(got.chunk != wanted.chunk), np.array(0.0), np.zeros(0)
-    elements = np.abs(got.chunk.astype(np.float64) - wanted.chunk).mean(axis=0)
+        return error, np.mean(got.chunk != reference.chunk), np.array(0.0), np.zeros(0)
+    elements = np.abs(got.chunk.astype(np.float64) - reference.chunk).mean(axis=0)
     columns = [index for index, label in enumerate(spec.labels) if "grip" in label.lower()]
-    flipped = (got.chunk[:, columns] > 0) != (wanted.chunk[:, columns] > 0)
-    steps, base = (each.reshape(-1, each.shape[-1]) for each in (raw, before))
+    flipped = (got.chunk[:, columns] > 0) != (reference.chunk[:, columns] > 0)
+    steps, base = (steps_of.reshape(-1, steps_of.shape[-1]) for steps_of in (raw, before))
     jump = relative_error(steps[-1] - steps[0], base[-1] - base[0]) if len(base) > 1 else 0.0
     return error, np.array(flipped.mean() if columns else 0.0), np.array(jump), elements
 

@@ -17,7 +17,7 @@ __all__ = ["Source", "brings_calibration", "is_bundle", "source_stage", "sourced
 
 
 def is_bundle(source: str) -> bool:
-    """Say whether SOURCE is a bundle rather than a policy to export."""
+    """Return whether SOURCE is a bundle rather than a policy to export."""
     path = Path(source)
     if (path / MANIFEST).is_file() or not path.is_dir():
         return (path / MANIFEST).is_file()
@@ -53,6 +53,6 @@ def sourced(source: str, cache: Path, context: Context) -> Bundle:
 
 
 def brings_calibration(source: str) -> bool:
-    """Say whether SOURCE brings calibration data, which static quantization needs."""
+    """Return whether SOURCE has calibration data, which static quantization needs."""
     policy = source_stage(source).policy
     return policy is not None and read_description(policy).calibration is not None

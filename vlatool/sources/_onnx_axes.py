@@ -17,7 +17,7 @@ def fix_axes(model: Any, spec: PolicySpec | None) -> dict[str, dict[int, int]]:
     """Give the free axes of a model's inputs their lengths, in place: input -> axis -> length.
 
     An axis has the length that the spec gives; else the first one is the batch, which is 1. An axis that is named like
-    one of these has that length too. What depends on them is inferred anew.
+    one of these has that length too. What depends on them is inferred again.
 
     Args:
         model: A ``ModelProto``.
@@ -49,10 +49,10 @@ def fix_axes(model: Any, spec: PolicySpec | None) -> dict[str, dict[int, int]]:
     return fixed
 
 
-def told(fixed: Mapping[str, Mapping[int, int]]) -> str:
-    """Say which axes were fixed; empty for none."""
-    each = [f"{name} axis {place} = {length}" for name, axes in fixed.items() for place, length in axes.items()]
-    return f"free axes get a length: {', '.join(each)}" if each else ""
+def axes_text(fixed: Mapping[str, Mapping[int, int]]) -> str:
+    """Return which axes were fixed, in words; empty for none."""
+    lengths = [f"{name} axis {place} = {length}" for name, axes in fixed.items() for place, length in axes.items()]
+    return f"free axes get a length: {', '.join(lengths)}" if lengths else ""
 
 
 def with_opset(model: Any, opset: int) -> Any:
@@ -90,12 +90,12 @@ def _axes(value: Any) -> Any:
 
 
 def _is_free(axis: Any, place: int) -> bool:
-    """Say whether an axis has no length: some exporters write -1, and 0 for the batch."""
+    """Return whether an axis has no length: some exporters write -1, and 0 for the batch."""
     return not axis.HasField("dim_value") or axis.dim_value < (1 if place == 0 else 0)
 
 
 def _declared(name: str, spec: PolicySpec | None) -> dict[int, int]:
-    tensor = next((each for each in spec.inputs if each.name == name), None) if spec else None
+    tensor = next((entry for entry in spec.inputs if entry.name == name), None) if spec else None
     return {place: axis for place, axis in enumerate(tensor.shape if tensor else ()) if isinstance(axis, int)}
 
 
@@ -104,12 +104,12 @@ def _infer(model: Any) -> None:
     onnx = require("onnx", "build")
     try:
         inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
-    except Exception:  # the seam: a model that onnx cannot infer may run all the same
+    except Exception:  # the seam: a model that onnx cannot infer may still run
         return
-    found = {value.name: value for value in inferred.graph.output}
+    outputs = {value.name: value for value in inferred.graph.output}
     for value in model.graph.output:
-        axes = _axes(found[value.name])
+        axes = _axes(outputs[value.name])
         if len(axes) and math.prod(axis.dim_value for axis in axes) > 0:
-            value.CopyFrom(found[value.name])
+            value.CopyFrom(outputs[value.name])
     del model.graph.value_info[:]
     model.graph.value_info.extend(inferred.graph.value_info)

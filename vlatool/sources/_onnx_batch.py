@@ -63,7 +63,7 @@ def _put_axis(value: Any) -> None:
 
 
 def _rename_reads(graph: Any, old: str, new: str) -> None:
-    """Let all nodes of a graph, and of those inside of it, read another value."""
+    """Rename a value wherever nodes of a graph, or of its subgraphs, read it."""
     for node in graph.node:
         node.input[:] = [new if name == old else name for name in node.input]
         for attribute in node.attribute:

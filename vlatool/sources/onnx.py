@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Graph, Manifest
 from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
@@ -18,12 +18,12 @@ from vlatool.data import observations_for
 from vlatool.errors import GraphError, InputError, SourceError, nearest, require
 from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.precision import precision_shares
-from vlatool.module.description import FILE, Description, copy_assets, read_description
+from vlatool.module.description import FILE, Description, copy_assets, description_file, read_description
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.runtime.program import Program
-from vlatool.sources._onnx_axes import fix_axes, opset_of, told, with_opset
+from vlatool.sources._onnx_axes import axes_text, fix_axes, opset_of, with_opset
 from vlatool.sources._onnx_batch import add_batch_axes
 from vlatool.sources._source import Source
 from vlatool.stage.base import Context
@@ -72,32 +72,29 @@ class OnnxFile(Source):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file exists."""
         if not self.model.is_file():
-            raise SourceError(f"There is no ONNX file {self.model}.")
+            raise SourceError(f"No such ONNX file: {self.model}.")
 
     def inputs(self) -> tuple[Path, ...]:
         """The model, its external data and what the description names."""
-        described = read_description(self.policy) if self.policy else None
-        data = [path for path in (described.calibration, described.evaluation) if path] if described else []
         beside = sorted(self.model.parent.glob(self.model.name + "*"))
-        if described is None or self.policy is None:
+        if self.policy is None:
             return tuple(beside)
-        description = self.policy / "policy.yaml" if self.policy.is_dir() else self.policy
-        assets = [described.folder / name for name in sorted(described.assets())]
-        return (*beside, *data, description, *assets)
+        described = read_description(self.policy)
+        return (*beside, *described.recordings().values(), description_file(self.policy), *described.assets())
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Load the file, store it, and run it once."""
         self.check(None, None)
         model = _load(self.model)
-        given = _description(self.policy) if self.policy else None
-        fixed = told(fix_axes(model, given.spec if given else None))
-        further = [] if given else add_batch_axes(model)
+        description = _description(self.policy) if self.policy else None
+        fixed = axes_text(fix_axes(model, description.spec if description else None))
+        further = [] if description else add_batch_axes(model)
         if further:
             axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
             fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
             context.tell(fixed, None)
-        described = given or self._described(model)
+        described = description or self._described(model)
         _check_names(model, described.spec)
         refuse_drawing_file(model, self.model)
         if self.opset is not None:
@@ -107,21 +104,12 @@ class OnnxFile(Source):
         onnx = require("onnx", "build")
         large = model.ByteSize() > 1_500_000_000
         onnx.save(model, str(out / "graphs/main.onnx"), save_as_external_data=large, location="main.onnx.data")
-        manifest = Manifest(
-            name=described.name,
-            version=described.version,
-            spec=described.spec,
-            program=described.program or single_graph(described.spec),
-            environment=described.environment,
-            parts=described.parts,
-            description=described.description,
-            license=described.license,
-        )
+        manifest = described.manifest(program=described.program or single_graph(described.spec))
         converted = {"opset": self.opset} if self.opset is not None else {}
         made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
-        with _told_of(self.model, out / "graphs/main.onnx"):
+        with _named_after(self.model, out / "graphs/main.onnx"):
             graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
-            observations = _observations(described, out, manifest)
+            observations = observations_for(seal(out, manifest), 2)
             if converted:
                 _compare(self.model, out, manifest, observations, further)
             return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
@@ -141,8 +129,8 @@ def _description(path: Path) -> Description:
     further = next((step.graph for step in described.program if step.graph != "main"), None)
     if further is not None:
         raise SourceError(
-            f"The program in {path} runs the graph '{further}'; a policy that is one ONNX file has the graph 'main' "
-            "alone.",
+            f"The program in {path} runs the graph '{further}'; a policy that is one ONNX file only has the graph "
+            "'main'.",
             "write graph: main in each step, or leave the program out",
         )
     return described
@@ -175,9 +163,9 @@ def _tensor(value: Any) -> TensorSpec:
 
 
 def _check_names(model: Any, spec: PolicySpec) -> None:
-    for wanted, found in ((spec.inputs, model.graph.input), (spec.outputs, model.graph.output)):
-        names = [value.name for value in found]
-        for tensor in wanted:
+    for tensors, values in ((spec.inputs, model.graph.input), (spec.outputs, model.graph.output)):
+        names = [value.name for value in values]
+        for tensor in tensors:
             if tensor.name not in names:
                 raise SourceError(
                     f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}."
@@ -185,8 +173,8 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
 
 
 @contextlib.contextmanager
-def _told_of(model: Path, copy: Path) -> Iterator[None]:
-    """Let what is wrong with a copy be told of the user's own file; the copy is gone when they read it."""
+def _named_after(model: Path, copy: Path) -> Iterator[None]:
+    """Report what is wrong with a copy by the user's own file: the copy is gone by the time they read it."""
     try:
         yield
     except InputError as error:
@@ -199,7 +187,7 @@ def _told_of(model: Path, copy: Path) -> Iterator[None]:
 def _compare(
     before: Path, out: Path, manifest: Manifest, observations: list[dict[str, Any]], unbatched: list[str]
 ) -> None:
-    """Hold the converted graph against the file that it came from, which has no batch axis in some tensors.
+    """Compare the converted graph with the file that it came from, which has no batch axis in some tensors.
 
     Raises:
         SourceError: when ONNX Runtime computes something else.
@@ -212,23 +200,17 @@ def _compare(
     for observation in observations:
         feeds = encode(observation)
         as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
-        wanted, got = (
-            program.run(each)[manifest.spec.action.name]
-            for program, each in zip(programs, (as_before, dict(feeds)), strict=True)
+        expected, got = (
+            program.run(inputs)[manifest.spec.action.name]
+            for program, inputs in zip(programs, (as_before, dict(feeds)), strict=True)
         )
-        error = relative_error(got, wanted)
+        error = relative_error(got, expected)
         if not error <= TOLERANCE:
             raise SourceError(
                 f"Converted to another opset, the ONNX file computes something else: relative L2 error {error:.3g}, "
                 f"allowed {TOLERANCE:g}.",
                 "leave --opset out, or export the file again where it was made",
             )
-
-
-def _observations(described: Description, out: Path, manifest: Manifest) -> list[dict[str, Any]]:
-    from vlatool.bundle.bundle import seal
-
-    return observations_for(seal(out, manifest), 2)
 
 
 def _refuse_bare(folder: Path) -> None:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle, hash_file, seal
-from vlatool.bundle.manifest import Manifest
 from vlatool.errors import SourceError
-from vlatool.module.description import Description, copy_assets, read_description, write_location
+from vlatool.module.description import Description, copy_assets, description_file, read_description, write_location
 from vlatool.module.factory import factory_file, split_factory
 from vlatool.module.imports import imported_files
 from vlatool.sources._source import Source
@@ -48,7 +47,7 @@ class TorchModule(Source):
         if not where.endswith(".py") or not function:
             return None
         if not Path(where).is_file():
-            raise SourceError(f"There is no file {where} (from '{typed}').")
+            raise SourceError(f"No such file: {where} (from '{typed}').")
         return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}").named()
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
@@ -69,10 +68,8 @@ class TorchModule(Source):
     def inputs(self) -> tuple[Path, ...]:
         """Everything that the policy is made of."""
         described = read_description(self.policy)
-        data = [path for path in (described.calibration, described.evaluation) if path]
-        assets = [described.folder / name for name in sorted(described.assets())]
-        description = self.policy / "policy.yaml" if self.policy.is_dir() else self.policy
-        return (description, *assets, *data, *self._code(described))
+        named = (*described.assets(), *described.recordings().values())
+        return (description_file(self.policy), *named, *self._code(described))
 
     def key(self, source_hash: str) -> str:
         """The bundle notes where the code is, so the place belongs to the key."""
@@ -88,22 +85,12 @@ class TorchModule(Source):
         root = self._root(described)
         code = {path.relative_to(root).as_posix(): hash_file(path) for path in self._code(described)}
         write_location(out, described.folder)
-        manifest = Manifest(
-            name=described.name,
-            version=described.version,
-            spec=described.spec,
-            program=described.program,
-            made_by={**self.made_by(), "options": {}},
-            source={"factory": factory, "arguments": described.arguments, "code": code, **_weights(described)},
-            environment=described.environment,
-            parts=described.parts,
-            description=described.description,
-            license=described.license,
-        )
-        return seal(out, manifest)
+        source_record = {"factory": factory, "arguments": described.arguments, "code": code, **_weights(described)}
+        made_by = {**self.made_by(), "options": {}}
+        return seal(out, described.manifest(made_by=made_by, source=source_record))
 
     def named(self) -> Self:
-        """Let the policy's code run in this process: the user named its folder."""
+        """Allow the policy's code to run in this process: the user named its folder."""
         trust.name(read_description(self.policy).folder, None if self.policy.is_dir() else self.policy, self.factory)
         return self
 
@@ -117,7 +104,7 @@ class TorchModule(Source):
         split_factory(factory)
         path = factory_file(factory, described.folder)
         if path is not None and not path.is_file():
-            raise SourceError(f"There is no file {path} (from '{factory}').")
+            raise SourceError(f"No such file: {path} (from '{factory}').")
         return factory
 
     def _code(self, described: Description) -> list[Path]:
@@ -135,17 +122,17 @@ class TorchModule(Source):
     def _data(self, described: Description, folder: Path) -> set[Path]:
         """Return the files that the factory reads: those that ``files`` names, else all that hold weights."""
         if described.files is None:
-            return {found for pattern in DATA for found in folder.glob(pattern)}
-        found: set[Path] = set()
+            return {path for pattern in DATA for path in folder.glob(pattern)}
+        data: set[Path] = set()
         for pattern in described.files:
             files = {file for file in described.folder.resolve().glob(pattern) if file.is_file()}
             if not files or not all(file.is_relative_to(folder) for file in files):
                 raise SourceError(
-                    f"{described.folder} says files: {pattern}, of which there is none beside the factory.",
+                    f"{described.folder} says files: {pattern}, which matches nothing beside the factory.",
                     "name files or globs below the folder of the factory",
                 )
-            found |= files
-        return found
+            data |= files
+        return data
 
     def _root(self, described: Description) -> Path:
         """Return the folder that the factory's imports begin in."""

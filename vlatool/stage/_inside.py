@@ -1,4 +1,4 @@
-"""A stage in a child process, for it runs a user's code or needs variables of its own: what asks, and what answers."""
+"""A stage in a child process, since it runs a user's code or needs its own environment: both sides of the call."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.report import Report
-from vlatool.stage.base import Context, Measure, Transform, build_stage
+from vlatool.stage.base import Context, Measure, Stage, Transform, build_stage
 from vlatool.user_code import children
 
 PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)
@@ -21,14 +21,19 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
 
     Raises:
         VlatoolError: what the stage raises; SourceError when the child ends before it is done.
-        BundleError: when what it wrote is no whole bundle.
+        BundleError: when what it wrote is not a whole bundle.
     """
-    job = {
-        "stage": stage.name(), "options": stage.model_dump(mode="json"), "out": str(draft), "workers": context.workers,
-        "source": str(source.path.absolute()) if source else "", "command": context.command,
-    }  # fmt: skip
+    job = {**_job(stage, source, context), "out": str(draft)}
     children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), PRELOAD)
     return Bundle.open(draft)
+
+
+def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any]:
+    """Return what a child needs to know of a stage."""
+    return {
+        "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
+        "source": str(source.path.absolute()) if source else "", "command": context.command,
+    }  # fmt: skip
 
 
 def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
@@ -37,8 +42,8 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
     if not isinstance(stage, Transform):
         raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
-    made = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"]))
-    return {"hash": made.hash}
+    bundle = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"]))
+    return {"hash": bundle.hash}
 
 
 def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:
@@ -47,13 +52,10 @@ def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle
     Raises:
         VlatoolError: what the stage raises.
     """
-    job = {
-        "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
-        "source": str(source.path.absolute()), "command": context.command,
-    }  # fmt: skip
-    about = f"{stage.name()} with {' '.join(f'{name}={value}' for name, value in environment.items())}"
-    told = children.call("vlatool.stage._inside:measure", job, context.tell, about, environment=environment)
-    return Report.from_json(str(told))
+    job, settings = _job(stage, source, context), " ".join(f"{name}={value}" for name, value in environment.items())
+    about = f"{stage.name()} with {settings}"
+    report = children.call("vlatool.stage._inside:measure", job, context.tell, about, environment=environment)
+    return Report.from_json(str(report))
 
 
 def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:

@@ -17,7 +17,7 @@ from pydantic import ConfigDict, ValidationError
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import PluginError, RecipeError, nearest
 from vlatool.files.numbers import Numeric
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.version import VERSION
@@ -32,12 +32,13 @@ Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
 BEFORE_ENGINES = ("sources", "export")
 """Kinds of stages whose output is the same whatever OpenVINO computes in."""
+UNFINISHED = "define it; docs/guides/add-a-method.md shows a complete stage"
 RECORD = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
 
 
 def _silent(_what: str, _share: float | None) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class Transform(Stage):
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
     def on(self, profile: Profile) -> Self:
-        """Return the stage as a board takes what it makes; options that were given stay."""
+        """Return the stage with the options that a board needs; options that were given stay."""
         return self
 
     def runs(self, source: Bundle | None) -> str:
@@ -162,22 +163,22 @@ class Transform(Stage):
         """
         return ""
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
+    def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return what else a person wants to know about the new bundle, a sentence for each line."""
         return ()
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the new bundle into the empty directory ``out`` and return it."""
-        raise NotImplementedError(self.name())
+        raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
 
-    def _told_options(self) -> dict[str, Any]:
+    def _recorded_options(self) -> dict[str, Any]:
         """Return the options with files named by name and content: paths are not recorded."""
-        told = self.options()
-        for name in told:
+        options = self.options()
+        for name in options:
             value = getattr(self, name)
             if isinstance(value, Path):
-                told[name] = f"{value.name} sha256:{_content(value)[:16]}"
-        return told
+                options[name] = f"{value.name} sha256:{_content(value)[:16]}"
+        return options
 
     def made_by(self, seed: int | None = None, calibration: SampleSet | None = None) -> dict[str, Any]:
         """Return the ``made_by`` entry of the manifest.
@@ -191,24 +192,24 @@ class Transform(Stage):
             ``files`` (name -> SHA-256 of each file outside the source), ``seed`` and ``calibration``. No paths, no
             times: the same command gives the same entry in another directory and on another day.
         """
-        found = {package: installed_version(package) for package in self.used_packages()}
-        versions = {package: version for package, version in found.items() if version}
-        made: dict[str, Any] = {"vlatool": VERSION, "stage": self.name(), "options": self._told_options()}
+        installed = {package: installed_version(package) for package in self.used_packages()}
+        versions = {package: version for package, version in installed.items() if version}
+        entry: dict[str, Any] = {"vlatool": VERSION, "stage": self.name(), "options": self._recorded_options()}
         files = self.input_hashes()
-        made |= {"versions": versions, **({"files": files} if files else {})}
-        made |= {} if seed is None else {"seed": seed}
-        return made | ({} if calibration is None else {"calibration": calibration.record()})
+        entry |= {"versions": versions, **({"files": files} if files else {})}
+        entry |= {} if seed is None else {"seed": seed}
+        return entry | ({} if calibration is None else {"calibration": calibration.record()})
 
     def input_hashes(self) -> dict[str, str]:
         """Return name -> SHA-256 of the files outside the source; a second file of the same name is ``NAME (2)``."""
-        found: dict[str, str] = {}
+        hashes: dict[str, str] = {}
         for path in (path for path in self.inputs() if path.is_file()):
             digest, name, number = hash_file(path), path.name, 1
-            while found.get(name, digest) != digest:
+            while hashes.get(name, digest) != digest:
                 number += 1
                 name = f"{path.name} ({number})"
-            found[name] = digest
-        return found
+            hashes[name] = digest
+        return hashes
 
 
 class Measure(Stage):
@@ -223,7 +224,7 @@ class Measure(Stage):
 
     def run(self, source: Bundle, context: Context) -> Report:
         """Measure and return the report; the caller writes it."""
-        raise NotImplementedError(self.name())
+        raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)
 
 
 def source_of(source: Bundle | None, stage: str) -> Bundle:
@@ -241,14 +242,14 @@ def stage_class(name: str) -> type[Stage]:
     """Return the class of a stage by its recipe name.
 
     Raises:
-        RecipeError: when the name is not ``kind.name`` of a known stage.
+        RecipeError: for a name that is not ``kind.name`` of a known stage.
     """
     kind, _, entry = name.partition(".")
-    known = [f"{each}.{found}" for each in stage_kinds() for found in registry.names(each)]
+    known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
         raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.")
-    found: type[Stage] = registry.load(kind, entry)
-    return found
+    stage: type[Stage] = registry.load(kind, entry)
+    return stage
 
 
 def stage_kinds() -> tuple[str, ...]:

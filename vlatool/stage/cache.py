@@ -1,8 +1,8 @@
 """What the cache holds, how large it is, and how it is made smaller.
 
 Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
-list of its files, work that waits to be continued by its lock, a count by its content, a shared recording by its hash.
-Everything else that lies there is named and left alone. What a running process uses is locked, and stays.
+list of its files, unfinished work by its lock, a count by its content, a shared recording by its hash.
+Everything else there is listed and left alone. What a running process uses is locked, and stays.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Entry:
 
     Args:
         name: Below the cache.
-        what: The stage's name; ``unfinished work`` or ``count of a policy`` for what is no stage.
+        what: The stage's name; ``unfinished work`` or ``count of a policy`` where it is not a stage.
         used: When it was last made or used, in seconds since 1970.
         files: Relative name -> inode and bytes of the files that vlatool wrote.
     """
@@ -68,7 +68,7 @@ class Contents:
         cache: Where it is.
         entries: The least recently used one first.
         kept: Shared files: name below the cache -> inode and bytes.
-        unknown: Names below the cache of what vlatool did not write, as far as it lies beside entries.
+        unknown: Names below the cache of what vlatool did not write, as far as it is beside entries.
     """
 
     cache: Path
@@ -84,8 +84,8 @@ class Contents:
     @property
     def bytes(self) -> int:
         """Bytes of all files, one that entries share counted once."""
-        found = {inode: size for entry in self.entries for inode, size in entry.files.values()}
-        return sum({**found, **dict(self.kept.values())}.values())
+        sizes = {inode: size for entry in self.entries for inode, size in entry.files.values()}
+        return sum({**sizes, **dict(self.kept.values())}.values())
 
     def sizes(self, entry: Entry) -> tuple[int, int]:
         """Return the bytes of an entry that are its own, and those that others have, too."""
@@ -104,7 +104,7 @@ class Removed:
 
 
 def is_cache(place: Path) -> bool:
-    """Say whether a directory is empty, or holds one of the folders of a cache."""
+    """Return whether a directory is empty, or holds one of the folders of a cache."""
     return not any(place.iterdir()) or any((place / name).exists() for name in (STAGES, STREAMS, WORKLOADS, FILES, TAG))
 
 
@@ -114,7 +114,7 @@ def contents(cache: Path) -> Contents:
     Raises:
         OSError: when it cannot be read.
     """
-    found, unknown = [], []
+    entries, unknown = [], []
     for folder in (STAGES, STREAMS, WORKLOADS):
         for path in _below(cache / folder):
             try:
@@ -122,18 +122,18 @@ def contents(cache: Path) -> Contents:
             except FileNotFoundError:  # another process removed it since the folder was read
                 continue
             if entry is not None:
-                found.append(entry)
+                entries.append(entry)
             elif not DRAFT.fullmatch(path.name):
                 unknown.append(path.relative_to(cache).as_posix())
     kept, others = _kept(cache)
     unknown += others
     known = (STAGES, STREAMS, WORKLOADS, FILES, TAG)
     unknown += [path.name for path in _below(cache) if path.name not in known]
-    return Contents(cache, tuple(sorted(found, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
+    return Contents(cache, tuple(sorted(entries, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
 
 
 def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
-    """Return the shared files by their names below the cache, and the names of what lies beside them."""
+    """Return the shared files by their names below the cache, and the names of what else is there."""
     kept, unknown = {}, []
     for path in _below(cache / FILES):
         name = path.relative_to(cache).as_posix()
@@ -153,7 +153,7 @@ def prune(
 
     Args:
         cache: The cache.
-        older_than_s: Remove what was not used for so many seconds; 0 for everything.
+        older_than_s: Remove what was not used for this many seconds; 0 for everything.
         most_bytes: Remove until no more than that is left.
         dry_run: Only say what would be removed.
     """
@@ -176,7 +176,7 @@ def prune(
             uses.subtract(files.keys())
             left -= sum(size for inode, size in files.items() if not uses[inode])
     if not dry_run:
-        stays |= _swept(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
+        stays |= _sweep(cache, [name for name, (inode, _) in held.kept.items() if not uses[inode]])
     return Removed(tuple(removed), held.bytes - left, stays)
 
 
@@ -196,7 +196,7 @@ def _inode(status: os.stat_result) -> tuple[Inode, int]:
 
 
 def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
-    """Return an entry of the cache, None for what is none."""
+    """Return an entry of the cache, None for anything else."""
     named = NAMES[folder].fullmatch(path.name)
     status = path.lstat()
     if named is None or stat.S_ISLNK(status.st_mode):
@@ -221,15 +221,15 @@ def _stage_files(path: Path) -> dict[str, tuple[Inode, int]]:
 
 def _own_files(path: Path, is_own: Callable[[str], object]) -> dict[str, tuple[Inode, int]]:
     """Return the regular files below a directory whose names are vlatool's, to which no link leads."""
-    found = {}
+    kept = {}
     for folder, _, files in os.walk(path):
         for file in files:
             name = Path(folder, file).relative_to(path).as_posix()
             with contextlib.suppress(FileNotFoundError):
                 status = os.lstat(Path(folder, file))
                 if is_own(name) and stat.S_ISREG(status.st_mode):
-                    found[name] = _inode(status)
-    return found
+                    kept[name] = _inode(status)
+    return kept
 
 
 def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
@@ -243,7 +243,7 @@ def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
             return f"{IN_USE} by a running process"
         if dry_run:
             return ""
-        for name in sorted(entry.files, key=lambda each: (each in (LEDGER, "manifest.json"), each == LEDGER)):
+        for name in sorted(entry.files, key=lambda file: (file in (LEDGER, "manifest.json"), file == LEDGER)):
             with contextlib.suppress(FileNotFoundError):
                 (path / name if name else path).unlink()
         _remove_folders(path)
@@ -257,8 +257,8 @@ def _remove_folders(path: Path) -> None:
             os.rmdir(folder)
 
 
-def _swept(cache: Path, unused: Iterable[str]) -> dict[str, str]:
-    """Remove shared files that nobody links to, and what killed writers left; return why something stays."""
+def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
+    """Remove shared files without links, and what killed writers left; return why something stays."""
     stays = {}
     for name in unused:
         with contextlib.suppress(FileNotFoundError):
@@ -274,13 +274,13 @@ def _swept(cache: Path, unused: Iterable[str]) -> dict[str, str]:
 
 
 def _drafts(cache: Path) -> Iterator[Path]:
-    """Let drafts of stages be removed whose writers are gone; yield unfinished shared files of such writers."""
-    for final in {found["final"] for path in _below(cache / STAGES) if (found := DRAFT.fullmatch(path.name))}:
+    """Remove drafts of stages whose writers are gone; yield unfinished shared files of such writers."""
+    for final in {match["final"] for path in _below(cache / STAGES) if (match := DRAFT.fullmatch(path.name))}:
         sweep(cache / STAGES / final)
     for path in _below(cache / FILES):
-        found = PART.fullmatch(path.name)
+        match = PART.fullmatch(path.name)
         with contextlib.suppress(FileNotFoundError):
-            if found and _abandoned(path.lstat(), found["process"]):
+            if match and _abandoned(path.lstat(), match["process"]):
                 yield path
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle, restate, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
-from vlatool.runtime.arithmetic import SATURATING, is_int8, machine, told
+from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
@@ -30,7 +30,7 @@ ROUNDING = 0.045
 right engines and processors it was seen to be at most 0.035, on wrong ones at least 0.09, and where int8 products
 saturate from 0.045 on."""
 FARTHER = 1.2
-"""How many times as far from the source as the graphs an engine may be that rounds otherwise, as root mean square of
+"""How many times as far from the source as the graphs an engine may be that rounds differently, as root mean square of
 ``TRIALS`` observations: it draws an error of the same size again. A loop over int8 layers carries a rounding that falls
 the other way into all that follow: in ten steps of a denoising UNet the engine was as far from the graphs (up to 0.09)
 as either was from float32. Of its observations 99 in 100 choices of 8 give at most 1.18; a fault of the engine's own
@@ -42,18 +42,18 @@ REDRAWN = 1.5
 was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
 LEAST_TOLERANCE = 0.01
 COARSE_TOLERANCE = {"float16": 0.03, "int4": 0.03, "int4 weights": 0.03, "float8": 0.06}
-"""The same for graphs whose kernels round otherwise by design from processor to processor: float16 is computed as such
-where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8 where
-there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72). A sum that
-is added up in another order falls on the other side of a step of float8, which is an eighth of a value: between one and
-two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029."""
+"""The same for graphs whose kernels round differently by design from processor to processor: float16 is computed as
+such where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8
+where there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72). A sum
+that is added up in another order falls on the other side of a step of float8, which is an eighth of a value: between
+one and two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029."""
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")
-HANDED_OUT = "optimize"
-"""In a build record, the entry of the step in which ``optimize`` hands a candidate out."""
+FINALIZED = "optimize"
+"""In a build record, the entry of the step in which ``optimize`` finalizes a candidate."""
 DECIDED = ("accuracy", "engine")
-"""Fields of a manifest that ``optimize`` sets when it hands a candidate out."""
+"""Fields of a manifest that ``optimize`` sets when it finalizes a candidate."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Golden:
 
     Args:
         samples: Observations with the noise of each.
-        wanted: What the graphs say.
+        expected: What the graphs say.
         difference: Largest relative L2 difference of the engine's actions from those of the graphs, as they give them.
         of_chunk: The same of the chunks in physical units.
     """
 
     samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]
-    wanted: Sequence[Action]
+    expected: Sequence[Action]
     difference: float
     of_chunk: float
 
@@ -111,109 +111,109 @@ def finish(
     origin = {key: value for key, value in source.manifest.source.items() if key != "arguments"}
     unhashed = {graph.file: FileRecord("", 0) for graph in graphs.values()}
     draft = seal(out, replace(source.manifest, golden="", source=origin, files=unhashed, **changed))
-    seen = write_golden(draft, observations, out)
+    golden = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
-    made = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
-    limit = _limit(source, made, seen)
-    redrawn = seen.difference > limit and _rounds_otherwise(source, made, observations)
-    found = [] if seen.difference <= limit or redrawn else [_engine_difference(made, seen.difference, limit)]
-    if is_int8(made.manifest) and reference().arithmetic() == SATURATING:
-        found.append(_inexact_reference(made))
-    kept = [each for each in source.manifest.findings if each["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
-    discrete = made.manifest.spec.action.kind == "discrete"
-    return restate(made, replace(
-        made.manifest, golden_tolerance=_tolerance(seen.difference, made, redrawn),
-        golden_chunk_tolerance=0.0 if discrete else _tolerance(seen.of_chunk, made, redrawn), findings=(*kept, *found),
+    bundle = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
+    limit = _limit(source, bundle, golden)
+    redrawn = golden.difference > limit and _rounds_differently(source, bundle, observations)
+    new = [] if golden.difference <= limit or redrawn else [_engine_difference(bundle, golden.difference, limit)]
+    if is_int8(bundle.manifest) and reference().arithmetic() == SATURATING:
+        new.append(_inexact_reference(bundle))
+    kept = [finding for finding in source.manifest.findings if finding["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
+    discrete = bundle.manifest.spec.action.kind == "discrete"
+    return restate(bundle, replace(
+        bundle.manifest, findings=(*kept, *new), golden_tolerance=_tolerance(golden.difference, bundle, redrawn),
+        golden_chunk_tolerance=0.0 if discrete else _tolerance(golden.of_chunk, bundle, redrawn),
     ))  # fmt: skip
 
 
-def _tolerance(seen: float, made: Bundle, redrawn: bool) -> float:
+def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:
     """Return what a machine may differ where the engine was seen to differ so much, in three decimals; at most 1.
 
     What differs in rounding here may do so twice as much elsewhere; a larger difference is no rounding, or one that is
     drawn again on each machine.
     """
-    computed = {name for graph in made.manifest.graphs.values() for name in graph.precision}
+    computed = {name for graph in bundle.manifest.graphs.values() for name in graph.precision}
     least = max([LEAST_TOLERANCE, *(COARSE_TOLERANCE[name] for name in computed & set(COARSE_TOLERANCE))])
-    wanted = max(least, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING))
-    return math.ceil(wanted * 1000) / 1000 if math.isfinite(wanted) else 1.0
+    tolerance = max(least, (REDRAWN if redrawn else 1.2) * seen, min(2 * seen, ROUNDING))
+    return math.ceil(tolerance * 1000) / 1000 if math.isfinite(tolerance) else 1.0
 
 
-def _limit(source: Bundle, made: Bundle, seen: Golden) -> float:
+def _limit(source: Bundle, bundle: Bundle, golden: Golden) -> float:
     """Return how far the engine may be from what the graphs say: as far as the graphs are from those of the source.
 
     What is computed in bfloat16 differs by what bfloat16 costs, which is judged as accuracy.
     """
-    if any(graph.compute == "bfloat16" for graph in made.manifest.graphs.values()):
+    if any(graph.compute == "bfloat16" for graph in bundle.manifest.graphs.values()):
         return math.inf
-    if seen.difference <= ROUNDING or not source.manifest.graphs:
+    if golden.difference <= ROUNDING or not source.manifest.graphs:
         return ROUNDING
-    before = _outputs(reference_policy(source), seen.samples)
-    return max(ROUNDING, _worst(_apart(seen.wanted, before, made.manifest.spec.action.name)))
+    before = _outputs(reference_policy(source), golden.samples)
+    return max(ROUNDING, _worst(_differences(golden.expected, before, bundle.manifest.spec.action.name)))
 
 
-def _rounds_otherwise(source: Bundle, made: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
-    """Say whether an engine that is far from the graphs is as near to their source as they are.
+def _rounds_differently(source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether an engine that is far from the graphs is as near to their source as they are.
 
     Then it computes the same policy with other roundings, and no other one.
     """
     if not source.manifest.graphs:
         return False
-    samples = _samples(made.manifest, observations, TRIALS)
+    samples = _samples(bundle.manifest, observations, TRIALS)
     before = _outputs(reference_policy(source), samples)
-    name = made.manifest.spec.action.name
-    graphs = _apart(_outputs(reference_policy(made), samples), before, name)
-    engine = _apart(_outputs(Policy.open(made, threads=1, seed=SEED), samples), before, name)
+    name = bundle.manifest.spec.action.name
+    graphs = _differences(_outputs(reference_policy(bundle), samples), before, name)
+    engine = _differences(_outputs(Policy.open(bundle, threads=1, seed=SEED), samples), before, name)
     return float(np.linalg.norm(engine)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
 
 
 def _samples(
     manifest: Manifest, observations: Sequence[Mapping[str, Any]], count: int
 ) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
-    """Return so many observations, from the first on again where there are fewer, with noise for each."""
+    """Return ``count`` observations, starting over where there are fewer, with noise for each."""
     random = np.random.default_rng(SEED)
-    wanted = [pair for step in manifest.program for pair in step.noise.items()]
+    noises = [pair for step in manifest.program for pair in step.noise.items()]
     chosen = [observations[index % len(observations)] for index in range(count)]
-    return [(each, {name: draw(noise, random) for name, noise in wanted}) for each in chosen]
+    return [(observation, {name: draw(noise, random) for name, noise in noises}) for observation in chosen]
 
 
-def _apart(given: Sequence[Action], wanted: Sequence[Action], name: str) -> list[float]:
+def _differences(actions: Sequence[Action], expected: Sequence[Action], name: str) -> list[float]:
     """Return the relative L2 difference of an output, for each action."""
-    return [relative_error(a.outputs[name], b.outputs[name]) for a, b in zip(given, wanted, strict=True)]
+    return [relative_error(a.outputs[name], b.outputs[name]) for a, b in zip(actions, expected, strict=True)]
 
 
-def _engine_difference(made: Bundle, difference: float, limit: float) -> dict[str, Any]:
-    engine = made.manifest.engine or DEFAULT_ENGINE
+def _engine_difference(bundle: Bundle, difference: float, limit: float) -> dict[str, Any]:
+    engine = bundle.manifest.engine or DEFAULT_ENGINE
     words = f"the engine {engine} computes another action than the graphs say on this {machine(engine)}: relative "
     words += f"difference {difference:.2g}, allowed {limit:.2g}. Do not trust this bundle; "
-    cause, remedy = told(made.manifest, engine)
+    cause, remedy = int8_trouble(bundle.manifest, engine)
     words += remedy or "leave layers out with --exclude, or use another layout or engine"
     words += f". {cause}".rstrip()
     value = round(difference, 4) if math.isfinite(difference) else 1e9
-    stage = str(made.manifest.made_by.get("stage", ""))
+    stage = str(bundle.manifest.made_by.get("stage", ""))
     return {"name": ENGINE_DIFFERENCE, "message": words, "value": value, "allowed": round(limit, 4), "stage": stage}
 
 
-def _inexact_reference(made: Bundle) -> dict[str, Any]:
+def _inexact_reference(bundle: Bundle) -> dict[str, Any]:
     words = "the golden action of this bundle was computed where int8 products are not exact, with any option of ONNX "
     words += "Runtime that was tried: it may be another one than the graphs say. Make the bundle on another machine."
-    return {"name": INEXACT, "message": words, "stage": str(made.manifest.made_by.get("stage", ""))}
+    return {"name": INEXACT, "message": words, "stage": str(bundle.manifest.made_by.get("stage", ""))}
 
 
 def history(bundle: Bundle) -> tuple[dict[str, Any], ...]:
     """Return the build record of a bundle: one entry for each stage from the source to this bundle.
 
-    A source bundle has no ``build`` of its own, and ``optimize`` hands a bundle out without a stage; their entries are
+    A source bundle has no ``build`` of its own, and ``optimize`` finalizes a bundle without a stage; their entries are
     what their manifests say. A bundle from before there was a record has an incomplete one, or none.
     """
     manifest = bundle.manifest
-    made, recorded = manifest.made_by, manifest.build
-    if not recorded and str(made.get("stage", "")).startswith("sources."):
-        recorded = ({**made, "factory": manifest.source.get("factory", "")},)
-    if "candidate" not in made or (recorded and recorded[-1]["stage"] == HANDED_OUT):
+    made_by, recorded = manifest.made_by, manifest.build
+    if not recorded and str(made_by.get("stage", "")).startswith("sources."):
+        recorded = ({**made_by, "factory": manifest.source.get("factory", "")},)
+    if "candidate" not in made_by or (recorded and recorded[-1]["stage"] == FINALIZED):
         return recorded
-    options = {name: made[name] for name in ("candidate", "profile") if name in made}
-    handed = {"vlatool": made.get("vlatool", ""), "stage": HANDED_OUT, "options": options, "input": manifest.parent}
+    options = {name: made_by[name] for name in ("candidate", "profile") if name in made_by}
+    handed = {"vlatool": made_by.get("vlatool", ""), "stage": FINALIZED, "options": options, "input": manifest.parent}
     decided = {name: getattr(manifest, name) for name in DECIDED if getattr(manifest, name)}
     return (*recorded, {**handed, **decided})
 
@@ -248,17 +248,17 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     name = draft.manifest.spec.action.name
     policy = Policy.open(draft, threads=1, seed=SEED)
     own = _outputs(policy, samples)
-    wanted = _outputs(reference_policy(draft), samples)
+    expected = _outputs(reference_policy(draft), samples)
     arrays: dict[str, list[Any]] = {}
-    for (observation, noise), action in zip(samples, wanted, strict=True):
+    for (observation, noise), action in zip(samples, expected, strict=True):
         parts = (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", {name: action.chunk}))
         for prefix, values in parts:
-            for each, value in values.items():
-                arrays.setdefault(f"{prefix}.{each}", []).append(value)
+            for key, value in values.items():
+                arrays.setdefault(f"{prefix}.{key}", []).append(value)
     (out / GOLDEN).parent.mkdir(exist_ok=True)
-    save_npz(out / GOLDEN, {each: np.stack([np.asarray(item) for item in items]) for each, items in arrays.items()})
-    of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, wanted, strict=True))
-    return Golden(samples, wanted, _worst(_apart(own, wanted, name)), of_chunk)
+    save_npz(out / GOLDEN, {key: np.stack([np.asarray(item) for item in items]) for key, items in arrays.items()})
+    of_chunk = _worst(policy.chunk_error(a.chunk, b.chunk) for a, b in zip(own, expected, strict=True))
+    return Golden(samples, expected, _worst(_differences(own, expected, name)), of_chunk)
 
 
 def _worst(errors: Iterable[float]) -> float:
@@ -271,7 +271,7 @@ def _outputs(policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[
 
 
 def reference_policy(bundle: Bundle) -> Policy:
-    """Open a bundle in what computes its graphs as they are written, whatever engine it was made for."""
+    """Open a bundle in the reference engine, which computes graphs as written, whatever engine it was made for."""
     graphs = bundle.manifest.graphs.items()
     sessions = {name: open_graph(bundle, replace(graph, compute=""), reference(), 1) for name, graph in graphs}
     return Policy(bundle, Program(bundle.manifest.program, sessions, SEED), "reference")

@@ -32,7 +32,7 @@ def run_transform(
         stage: What runs.
         source: Its input; None for a stage that starts a chain.
         out: The new bundle.
-        context: Whom to tell.
+        context: For progress.
         force: Replace a directory that vlatool wrote.
         damaged: See ``vlatool.files.writing.writing``.
 
@@ -55,11 +55,6 @@ def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
     return cache / "stages" / f"{stage.name()}-{stage.key(source_hash)}"
 
 
-def is_cached(stage: Stage, source_hash: str, cache: Path) -> bool:
-    """Say whether the output of a stage is there."""
-    return cached_path(stage, source_hash, cache).is_dir()
-
-
 def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
     """Return the stage's bundle from the cache, or run the stage into the cache."""
     path = cached_path(stage, source.hash if source else "", cache)
@@ -69,9 +64,9 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
         except BundleError:
             context.tell(f"the cached {stage.name()} is damaged; making it again", None)
     tag(cache)
-    made = run_transform(stage, source, path, context, damaged=True)
+    bundle = run_transform(stage, source, path, context, damaged=True)
     hold(path)
-    return made
+    return bundle
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:

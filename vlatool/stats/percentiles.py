@@ -34,14 +34,14 @@ class Percentile:
         value: The order statistic; NaN when the series is too short to say anything of this percentile.
         bound: What the percentile of all calls does not exceed, at ``confidence``; NaN as above.
         needed: Independent calls from which there is a bound.
-        worth: Independent calls that the series is worth.
+        effective_sample_size: Independent calls that the series is worth.
     """
 
     percent: float
     value: float
     bound: float
     needed: int
-    worth: float
+    effective_sample_size: float
     confidence: float = CONFIDENCE
 
     @property
@@ -84,16 +84,16 @@ def percentile(
     if not len(series) or not np.isfinite(series).all():
         raise ValueError("no sample, or one that is not finite")
     share = percent / 100
-    worth = min(most, worth_of(series, share, processes))
+    size = min(most, effective_sample_size(series, share, processes))
     needed = floor(share, confidence)
-    if worth < needed:
-        return Percentile(percent, math.nan, math.nan, needed, worth, confidence)
+    if size < needed:
+        return Percentile(percent, math.nan, math.nan, needed, size, confidence)
     ordered = np.sort(series)
     count = len(ordered)
-    allowed = exceeding(int(worth), share, confidence) / int(worth)  # of the calls, beyond the bound
+    allowed = exceeding(int(size), share, confidence) / int(size)  # of the calls, beyond the bound
     value = ordered[min(count - 1, max(0, math.ceil(share * count) - 1))]
     bound = ordered[min(count - 1, count - 1 - math.floor(allowed * count))]
-    return Percentile(percent, float(value), float(max(bound, value)), needed, worth, confidence)
+    return Percentile(percent, float(value), float(max(bound, value)), needed, size, confidence)
 
 
 def proven_above(
@@ -110,11 +110,11 @@ def proven_above(
         (True, False)
     """
     series = np.asarray(samples, np.float64)
-    worth = int(worth_of(series, percent / 100, processes))
-    over = math.floor(float((series > limit).mean()) * worth)
+    size = int(effective_sample_size(series, percent / 100, processes))
+    over = math.floor(float((series > limit).mean()) * size)
     if not over:
         return False
-    fewer = binomial_tail(worth, 1 - percent / 100)[over - 1]
+    fewer = binomial_tail(size, 1 - percent / 100)[over - 1]
     return bool(1 - fewer <= 1 - confidence)
 
 
@@ -146,10 +146,12 @@ def independent(series: Array) -> float:
     That is exact for a first-order autoregression; ranks keep one long stall from hiding what the others do. A series
     that alternates counts as independent.
     """
+    from scipy.stats import rankdata  # a target, which has numpy alone, imports this module as well
+
     count = len(series)
     if count < 3:
         return float(count)
-    ranks = midranks(series)
+    ranks = rankdata(series)
     centred = ranks - ranks.mean()
     spread = float(centred @ centred)
     if spread == 0:
@@ -160,7 +162,7 @@ def independent(series: Array) -> float:
     return count * (1 - follow) / (1 + follow)
 
 
-def worth_of(series: Array, share: float, processes: Sequence[int] | None) -> float:
+def effective_sample_size(series: Array, share: float, processes: Sequence[int] | None) -> float:
     """Return how many independent calls a series of several processes is worth, for a percentile.
 
     The smaller of two: by how calls follow each other, and by how far whole processes are apart, which a call's
@@ -172,8 +174,8 @@ def worth_of(series: Array, share: float, processes: Sequence[int] | None) -> fl
         return worth
     exceeds = (series > np.quantile(series, share)).astype(np.float64)
     alike = max(0.0, intraclass(exceeds, processes))
-    each = len(series) / len(set(processes))
-    return min(worth, len(series) / (1 + (each - 1) * alike))
+    size = len(series) / len(set(processes))
+    return min(worth, len(series) / (1 + (size - 1) * alike))
 
 
 def intraclass(values: Array, processes: Sequence[int]) -> float:
@@ -183,13 +185,6 @@ def intraclass(values: Array, processes: Sequence[int]) -> float:
     means = np.bincount(place, values) / counts
     within = float(((values - means[place]) ** 2).sum()) / max(1, total - groups)
     between = float((counts * (means - values.mean()) ** 2).sum()) / (groups - 1)
-    each = (total - float((counts**2).sum()) / total) / (groups - 1)
-    spread = between + (each - 1) * within
+    size = (total - float((counts**2).sum()) / total) / (groups - 1)
+    spread = between + (size - 1) * within
     return (between - within) / spread if spread > 0 else 0.0
-
-
-def midranks(series: Array) -> Array:
-    """Return the ranks of a series from 1, equal values sharing their mean."""
-    _, inverse, counts = np.unique(series, return_inverse=True, return_counts=True)
-    last = np.cumsum(counts)
-    return np.asarray((last - (counts - 1) / 2)[inverse], np.float64)

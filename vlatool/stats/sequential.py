@@ -1,9 +1,10 @@
 """Is B slower than A by more than a margin? Decided from processes that each time both, in as few as suffice.
 
-Each process gives one log ratio. Two questions are asked of their Hodges-Lehmann centre at each look: does its lower
-bound exceed the margin (then the candidate is slower: fail), does its upper bound stay below it (pass)? Neither: more
-processes. The error probability is shared out over the looks (Bonferroni), and the bounds are those of the exact
-signed-rank distribution, so the stated error holds for any symmetric noise however few processes there are.
+Each process gives one log ratio. Two questions are asked of their Hodges-Lehmann centre at each interim analysis: does
+its lower bound exceed the margin (then the candidate is slower: fail), does its upper bound stay below it (pass)?
+Neither: more processes. The error probability is shared out over the interim analyses (Bonferroni), and the bounds are
+those of the exact signed-rank distribution, so the stated error holds for any symmetric noise however few processes
+there are.
 
 Several statistics of the same processes (``jointly``) fail when one of them does and pass when all do. Between equal
 bundles each is symmetric, whatever it is: swapping the two turns its sign.
@@ -20,9 +21,9 @@ import numpy as np
 
 from vlatool.stats.signed_rank import fewest, hodges_lehmann, lower_bound, upper_bound
 
-LOOKS = (10, 20, 40)
+INTERIM_ANALYSES = (10, 20, 40)
 ALPHA = 0.01
-"""Chance of a false verdict over all looks, on either side."""
+"""Chance of a false verdict over all interim analyses, on either side."""
 POWER = 0.95
 DRAWS = 1000
 
@@ -34,11 +35,11 @@ class Decision:
     Args:
         verdict: ``pass``, ``fail`` or ``inconclusive``.
         ratio: Candidate over baseline, Hodges-Lehmann centre; 1.1 is a tenth slower.
-        low, high: What it lies between, each bound at the error of one look.
+        low, high: What it lies between, each bound at the error of one analysis.
         margin: The largest slowdown that passes, a share.
         processes: How many were measured.
         spread: Standard deviation of the log ratios of single processes.
-        alpha: Chance of a false verdict of the look, on either side.
+        alpha: Chance of a false verdict of the analysis, on either side.
     """
 
     verdict: str
@@ -81,16 +82,18 @@ def reach(processes: int, alpha: float) -> float:
     if processes < fewest(alpha):
         return math.inf
     noise = np.random.default_rng(0).normal(size=(DRAWS, processes))
-    return float(np.quantile([-lower_bound(each, alpha) for each in noise], POWER))
+    return float(np.quantile([-lower_bound(sample, alpha) for sample in noise], POWER))
 
 
-def judged(log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(LOOKS), sharing: int = 1) -> Decision:
+def judged(
+    log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / len(INTERIM_ANALYSES), sharing: int = 1
+) -> Decision:
     """Judge the processes that there are.
 
     Args:
         log_ratios: Of each process, natural logarithm of candidate over baseline.
         margin: The largest slowdown that passes, a share above -1.
-        alpha: Chance of a false verdict of this look, on either side.
+        alpha: Chance of a false verdict of this analysis, on either side.
         sharing: Statistics of which one alone makes a gate fail, while all of them must pass: they share the error of a
             failure, and each may keep that of a pass.
 
@@ -108,56 +111,38 @@ def judged(log_ratios: Sequence[float], margin: float, alpha: float = ALPHA / le
     return Decision(verdict, math.exp(centre), math.exp(low), math.exp(high), margin, count, spread, alpha / sharing)
 
 
-def sequential(
-    measure: Callable[[int], float], margin: float, looks: Sequence[int] = LOOKS, alpha: float = ALPHA
-) -> tuple[Decision, list[float]]:
-    """Measure process after process until a look decides, or the last look is over.
-
-    Args:
-        measure: Called with the number of the process, from 0; returns its log ratio.
-        margin: The largest slowdown that passes, a share.
-        looks: After how many processes it is judged, ascending.
-        alpha: Chance of a false verdict over all looks, on either side.
-
-    Returns:
-        The decision, and the log ratio of every process.
-
-    Raises:
-        ValueError: when the looks do not ascend, or the first is too early to decide anything.
-    """
-    decisions, found = jointly(lambda number: (measure(number),), 1, margin, looks, alpha)
-    return decisions[0], [ratios[0] for ratios in found]
-
-
 def jointly(
     measure: Callable[[int], Sequence[float]],
     statistics: int,
     margin: float,
-    looks: Sequence[int] = LOOKS,
+    interim_analyses: Sequence[int] = INTERIM_ANALYSES,
     alpha: float = ALPHA,
 ) -> tuple[list[Decision], list[Sequence[float]]]:
-    """Judge several statistics of the same processes: it ends when one fails, or when all pass.
+    """Measure process after process until a look decides or the last one is over: one statistic fails, or all pass.
 
     Args:
-        measure: As in ``sequential``, but returns a log ratio for each statistic.
+        measure: Called with the number of the process, from 0; returns a log ratio for each statistic.
         statistics: How many.
-        margin, looks, alpha: As in ``sequential``.
+        margin: The largest slowdown that passes, a share.
+        interim_analyses: After how many processes they are judged, ascending.
+        alpha: Chance of a false verdict over all interim analyses, on either side.
 
     Returns:
         A decision for each statistic, and the log ratios of every process.
 
     Raises:
-        ValueError: as ``sequential``.
+        ValueError: when the interim analyses do not ascend, or the first is too early to decide anything.
     """
-    least = fewest(alpha / statistics / len(looks)) if looks else 1
-    if not looks or list(looks) != sorted(set(looks)) or looks[0] < least:
-        raise ValueError(f"the looks are {tuple(looks)}; allowed: ascending numbers from {least}")
-    found: list[Sequence[float]] = []
-    for look in looks:
-        while len(found) < look:
-            found.append(measure(len(found)))
-        decisions = [judged(ratios, margin, alpha / len(looks), statistics) for ratios in zip(*found, strict=True)]
+    after = tuple(interim_analyses)
+    least = fewest(alpha / statistics / len(after)) if after else 1
+    if not after or list(after) != sorted(set(after)) or after[0] < least:
+        raise ValueError(f"the interim analyses are {after}; allowed: ascending numbers from {least}")
+    processes: list[Sequence[float]] = []
+    for count in after:
+        while len(processes) < count:
+            processes.append(measure(len(processes)))
+        decisions = [judged(ratios, margin, alpha / len(after), statistics) for ratios in zip(*processes, strict=True)]
         verdicts = {decision.verdict for decision in decisions}
         if "fail" in verdicts or "inconclusive" not in verdicts:
             break
-    return decisions, found
+    return decisions, processes

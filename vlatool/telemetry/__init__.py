@@ -4,12 +4,14 @@ One file for each source. ``open_all`` gives the readers of this machine and wha
 """
 
 from vlatool.telemetry._open import open_all
-from vlatool.telemetry._reading import Absent, Reader, Reading, Run
+from vlatool.telemetry._reading import DEGREE, THROTTLE, Absent, Reader, Reading, Run
 from vlatool.telemetry._summary import Counted, Energy, Gauge, Recorded, Series, collect, summarise
 from vlatool.telemetry._total import Total, totals
 from vlatool.telemetry.recorder import Recorder
 
 __all__ = [
+    "DEGREE",
+    "THROTTLE",
     "Absent",
     "Counted",
     "Energy",

@@ -22,9 +22,9 @@ def open_all(root: Path = ROOT, run: Run | None = None) -> list[Reader | Absent]
         For every source its reader, or why it is unmeasured.
     """
     files = [registry.load("telemetry", name) for name in registry.names("telemetry")]
-    classes: list[type[Reader]] = [found for found in files if issubclass(found, Reader)]
-    opened = {found.name: found.open(root, run) for found in classes if not found.fallback_for}
-    for found in classes:
-        if found.fallback_for and not isinstance(opened.get(found.fallback_for), Reader):
-            opened[found.name] = found.open(root, run)
+    classes: list[type[Reader]] = [kind for kind in files if issubclass(kind, Reader)]
+    opened = {kind.name: kind.open(root, run) for kind in classes if not kind.fallback_for}
+    for kind in classes:
+        if kind.fallback_for and not isinstance(opened.get(kind.fallback_for), Reader):
+            opened[kind.name] = kind.open(root, run)
     return list(opened.values())

@@ -9,13 +9,14 @@ import math
 import re
 import subprocess
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 from vlatool.machine.host import ROOT, read_number
 
+R = TypeVar("R", bound="Reader")
 Kind = Literal["gauge", "counter"]
 Run = Callable[[Sequence[str]], "str | None"]
 """Runs a command and returns what it printed; None when it is absent, fails or takes too long."""
@@ -30,6 +31,8 @@ SHARE = "share"
 COUNT = "count"
 THROTTLE = "throttle"
 """Of a counter: throttle events. Of a gauge: 1 while the machine is throttled for this reason, else 0."""
+COLDEST = -200.0
+"""Below this in degC a thermal zone is powered off: Jetsons show -256."""
 COMMAND_TIMEOUT_S = 2.0
 
 
@@ -99,6 +102,55 @@ class Reader(ABC):
         """Return the parts that this source could have and has not."""
         return []
 
+    def or_absent(self: R, reason: str) -> R | Absent:
+        """Return this reader, or why it is absent where it reads nothing."""
+        return self if self.read() else Absent(self.name, reason)
+
+
+@dataclass(frozen=True)
+class NumberFile:
+    """A file that holds one whole number.
+
+    Args:
+        name, unit, kind, wraps, note: Of the reading.
+        path: Relative to the root of the file system.
+        factor: From the number to the unit.
+        least: The smallest value that means something.
+    """
+
+    name: str
+    path: str
+    factor: float
+    unit: str
+    kind: Kind = "gauge"
+    wraps: float | None = None
+    note: str = ""
+    least: float = -math.inf
+
+
+class FileReader(Reader):
+    """Reads files that hold one number each."""
+
+    def __init__(self, root: Path, files: Iterable[NumberFile]) -> None:
+        self._root = root
+        self._files = tuple(files)
+
+    def read(self) -> list[Reading]:
+        """Return a reading of every file that can be read now."""
+        values = [(file, scaled(self._root, file.path, file.factor)) for file in self._files]
+        return [
+            Reading(file.name, value, file.unit, file.kind, file.wraps, file.note)
+            for file, value in values
+            if value is not None and value >= file.least
+        ]
+
+
+class CommandReader(Reader):
+    """Reads what a command prints."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
 
 def gauge(name: str, value: float | None, unit: str, note: str = "") -> list[Reading]:
     """Return one gauge; nothing when there is no finite value."""
@@ -128,10 +180,10 @@ def scaled(root: Path, path: str, factor: float) -> float | None:
 def listed(root: Path, folder: str, pattern: str) -> list[str]:
     """Return the entries of a folder that match, relative to ``root``; ``hwmon2`` comes before ``hwmon10``."""
     try:
-        found = [path.relative_to(root).as_posix() for path in (root / folder).glob(pattern)]
+        paths = [path.relative_to(root).as_posix() for path in (root / folder).glob(pattern)]
     except OSError:
         return []
-    return sorted(found, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)])
+    return sorted(paths, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path)])
 
 
 def run_command(command: Sequence[str]) -> str | None:

@@ -6,7 +6,6 @@ from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 from vlatool.telemetry._reading import JOULE, THROTTLE, WATT, Absent, Reading
 from vlatool.telemetry._total import Total, totals
@@ -98,45 +97,30 @@ class Recorded:
 
     Args:
         seconds: Time between the first and the last sample.
-        gauges: Name -> gauge.
-        counters: Name -> how far it moved.
         energy: Of the board or its processor, then of the graphics cards, where measured; they are not added, and the
             label says which one it is. Empty when unmeasured.
         throttled: Whether a throttle counter moved or a throttle bit was set; None when nothing tells.
         throttling: What throttled, in words.
-        absent: What was unmeasured, and why.
+        gauges: Name -> gauge.
+        counters: Name -> how far it moved.
+        unmeasured: What could not be measured, and why.
     """
 
     seconds: float
-    gauges: Mapping[str, Gauge]
-    counters: Mapping[str, Counted]
     energy: tuple[Energy, ...]
     throttled: bool | None
     throttling: tuple[str, ...]
-    absent: tuple[Absent, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON values; the keys are those of the fields, but ``unmeasured`` for what is absent."""
-        return {
-            "seconds": self.seconds,
-            "energy": [{**vars(each), "names": list(each.names)} for each in self.energy],
-            "throttled": self.throttled,
-            "throttling": list(self.throttling),
-            "gauges": {
-                name: {**vars(each), "times": list(each.times), "values": list(each.values)}
-                for name, each in self.gauges.items()
-            },
-            "counters": {name: dict(vars(each)) for name, each in self.counters.items()},
-            "unmeasured": [dict(vars(each)) for each in self.absent],
-        }
+    gauges: Mapping[str, Gauge]
+    counters: Mapping[str, Counted]
+    unmeasured: tuple[Absent, ...]
 
 
 def collect(samples: Iterable[tuple[float, Reading]]) -> dict[str, Series]:
     """Return the series of samples that are in the order of time (seconds)."""
-    found: dict[str, Series] = {}
+    series: dict[str, Series] = {}
     for time_s, reading in samples:
-        found.setdefault(reading.name, Series(reading)).append(time_s, reading)
-    return found
+        series.setdefault(reading.name, Series(reading)).append(time_s, reading)
+    return series
 
 
 def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> Recorded:
@@ -148,32 +132,33 @@ def summarise(samples: Mapping[str, Series], absent: Iterable[Absent] = ()) -> R
 
     Example:
         >>> watts = [Reading("ina.VDD_IN", value, "W", "gauge") for value in (5.0, 7.0)]
-        >>> found = summarise(collect(zip((0.0, 10.0), watts)))
-        >>> found.energy[0].joules, found.energy[0].label
+        >>> recorded = summarise(collect(zip((0.0, 10.0), watts)))
+        >>> recorded.energy[0].joules, recorded.energy[0].label
         (60.0, 'module input VDD_IN, without the carrier board')
     """
     missing = list(absent)
-    gauges = {name: _gauge(one) for name, one in samples.items() if one.first.kind == "gauge"}
+    gauges = {name: _gauge(series) for name, series in samples.items() if series.first.kind == "gauge"}
     counters: dict[str, Counted] = {}
-    for name, one in samples.items():
-        if one.first.kind == "counter":
-            difference = _difference(one)
-            if isinstance(difference, str):
-                missing.append(Absent(name, difference))
+    for name, series in samples.items():
+        if series.first.kind == "counter":
+            moved = _difference(series)
+            if isinstance(moved, str):
+                missing.append(Absent(name, moved))
             else:
-                counters[name] = Counted(one.first.unit, difference, one.times[-1] - one.times[0], one.note)
-    found = [_energy(total, samples) for total in totals(one.first for one in samples.values())]
-    missing += [one for one in found if isinstance(one, Absent)] or ([] if found else [Absent("energy", NO_POWER)])
+                counters[name] = Counted(series.first.unit, moved, series.times[-1] - series.times[0], series.note)
+    energies = [_energy(total, samples) for total in totals(series.first for series in samples.values())]
+    missing += [energy for energy in energies if isinstance(energy, Absent)]
+    missing += [] if energies else [Absent("energy", NO_POWER)]
     throttled, throttling = _throttled(gauges, counters)
-    times = [time_s for one in samples.values() for time_s in (one.times[0], one.times[-1])]
+    times = [time_s for series in samples.values() for time_s in (series.times[0], series.times[-1])]
     return Recorded(
         seconds=max(times) - min(times) if times else 0.0,
-        gauges=gauges,
-        counters=counters,
-        energy=tuple(one for one in found if isinstance(one, Energy)),
+        energy=tuple(energy for energy in energies if isinstance(energy, Energy)),
         throttled=throttled,
         throttling=throttling,
-        absent=tuple(missing),
+        gauges=gauges,
+        counters=counters,
+        unmeasured=tuple(missing),
     )
 
 
@@ -204,8 +189,8 @@ def difference(values: Sequence[float], wraps: float | None) -> float | None:
 def _difference(series: Series) -> float | str:
     if len(series.values) < 2:
         return "read once only, and of a counter only differences mean something"
-    found = difference(series.values, series.first.wraps)
-    return "the counter went back during the run (its driver was loaded again)" if found is None else found
+    moved = difference(series.values, series.first.wraps)
+    return "the counter went back during the run (its driver was loaded again)" if moved is None else moved
 
 
 def _gauge(series: Series) -> Gauge:
@@ -228,7 +213,7 @@ def _energy(total: Total, samples: Mapping[str, Series]) -> Energy | Absent:
             difference([part[time_s] for time_s in times], samples[name].first.wraps)
             for name, part in zip(total.names, parts, strict=True)
         ]
-        joules = sum(one for one in moved if one is not None) if None not in moved else None
+        joules = sum(filter(None, moved)) if None not in moved else None
     else:
         joules = _trapezoid(times, [sum(part[time_s] for part in parts) for time_s in times])
     if joules is None:
@@ -243,10 +228,10 @@ def _trapezoid(times: Sequence[float], watts: Sequence[float]) -> float:
 
 
 def _throttled(gauges: Mapping[str, Gauge], counters: Mapping[str, Counted]) -> tuple[bool | None, tuple[str, ...]]:
-    flags = {name: one for name, one in gauges.items() if one.unit == THROTTLE}
-    events = {name: one for name, one in counters.items() if one.unit == THROTTLE}
+    flags = [(flag.note or name, flag.max) for name, flag in gauges.items() if flag.unit == THROTTLE]
+    events = [(event.note or name, event.difference) for name, event in counters.items() if event.unit == THROTTLE]
     if not flags and not events:
         return None, ()
-    words = [f"{one.note or name} (set in a sample)" for name, one in flags.items() if one.max > 0]
-    words += [f"{one.note or name} ({one.difference:g} more)" for name, one in events.items() if one.difference > 0]
+    words = [f"{what} (set in a sample)" for what, highest in flags if highest > 0]
+    words += [f"{what} ({count:g} more)" for what, count in events if count > 0]
     return bool(words), tuple(words)

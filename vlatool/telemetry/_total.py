@@ -46,8 +46,7 @@ def totals(readings: Iterable[Reading]) -> list[Total]:
     ``readings`` are all that were seen, one of each name. Empty when no reading is known to be a whole.
     """
     units = {reading.name: reading.unit for reading in readings if reading.unit in (WATT, JOULE)}
-    found = [_jetson(units), _pmic(units), _package(units)]
-    board = [total for total in found if total is not None]
+    board = [total for total in (_jetson(units), _pmic(units), _package(units)) if total is not None]
     cards = _cards(units)
     return board[:1] + ([cards] if cards else [])
 

@@ -33,7 +33,7 @@ class CpufreqReader(Reader):
     def __init__(self, root: Path, policies: list[str], counts: list[str]) -> None:
         self._root = root
         self._policies = {f"cpufreq.{place.rpartition('/')[2]}": f"{place}/scaling_cur_freq" for place in policies}
-        self._counts = {path: found[1] for path in counts if (found := COUNT.search(path))}
+        self._counts = {path: part[1] for path in counts if (part := COUNT.search(path))}
         self._last: dict[str, float] = {}
 
     @classmethod
@@ -41,24 +41,23 @@ class CpufreqReader(Reader):
         """Find policies and counters; absent where there are neither."""
         policies = listed(root, f"{CPUS}/cpufreq", "policy*")
         counts = listed(root, CPUS, "cpu[0-9]*/thermal_throttle/*_throttle_count")
-        found = cls(root, policies, counts)
-        if not found.read():
-            return Absent(cls.name, "neither clocks nor throttle counters are visible (virtual machine or container)")
-        return found
+        return cls(root, policies, counts).or_absent(
+            "neither clocks nor throttle counters are visible (virtual machine or container)"
+        )
 
     def read(self) -> list[Reading]:
         """Return clocks in MHz and the sums of the throttle counters."""
-        found: list[Reading] = []
+        readings: list[Reading] = []
         for name, path in self._policies.items():
-            found += gauge(name, scaled(self._root, path, 1e-3), MEGAHERTZ)
+            readings += gauge(name, scaled(self._root, path, 1e-3), MEGAHERTZ)
         for path in self._counts:
             if (value := scaled(self._root, path, 1.0)) is not None:
                 self._last[path] = value
         for part in ("core", "package"):
             known = [value for path, value in self._last.items() if self._counts[path] == part]
             words = f"{part} thermal throttling"
-            found += counter(f"cpufreq.{part}_throttle_count", sum(known) if known else None, THROTTLE, note=words)
-        return found
+            readings += counter(f"cpufreq.{part}_throttle_count", sum(known) if known else None, THROTTLE, note=words)
+        return readings
 
     def absent(self) -> list[Absent]:
         """Return the throttle counters when this processor has none."""

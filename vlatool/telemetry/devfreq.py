@@ -10,34 +10,26 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import MEGAHERTZ, SHARE, Absent, Reader, Reading, Run, gauge, listed, scaled
+from vlatool.telemetry._reading import MEGAHERTZ, SHARE, Absent, FileReader, NumberFile, Run, listed
 
 GPU = re.compile(r"\.(gpu|ga10b|gp10b|gv11b)$|^gpu-gpc-\d+$")
 """``17000000.gpu`` and the like; ``gpu-gpc-0`` on an AGX Thor."""
 
 
-class DevfreqReader(Reader):
-    """Load (share) and clock (MHz) of the GPU, as ``devfreq.gpu.load`` and ``devfreq.gpu.clock``."""
+class DevfreqReader(FileReader):
+    """Load (share) and clock (MHz) of the GPU, as ``devfreq.gpu.load`` and ``devfreq.gpu.clock``.
+
+    A GPU that is powered off gives none.
+    """
 
     name = "devfreq"
-
-    def __init__(self, root: Path, places: list[str]) -> None:
-        self._root = root
-        self._places = {f"devfreq.gpu{index or ''}": place for index, place in enumerate(places)}
 
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> DevfreqReader | Absent:
         """Find the GPUs; absent where no device of that name can be read."""
         places = [place for place in listed(root, "sys/class/devfreq", "*") if GPU.search(place.rpartition("/")[2])]
-        found = cls(root, places)
-        if not found.read():
-            return Absent(cls.name, "no GPU has a frequency policy in /sys/class/devfreq: this is no Jetson")
-        return found
-
-    def read(self) -> list[Reading]:
-        """Return load and clock; a GPU that is powered off gives none."""
-        found: list[Reading] = []
-        for name, place in self._places.items():
-            found += gauge(f"{name}.load", scaled(self._root, f"{place}/device/load", 1e-3), SHARE)
-            found += gauge(f"{name}.clock", scaled(self._root, f"{place}/cur_freq", 1e-6), MEGAHERTZ)
-        return found
+        files = []
+        for index, place in enumerate(places):
+            files.append(NumberFile(f"devfreq.gpu{index or ''}.load", f"{place}/device/load", 1e-3, SHARE))
+            files.append(NumberFile(f"devfreq.gpu{index or ''}.clock", f"{place}/cur_freq", 1e-6, MEGAHERTZ))
+        return cls(root, files).or_absent("no GPU has a frequency policy in /sys/class/devfreq: this is no Jetson")

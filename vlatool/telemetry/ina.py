@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vlatool.machine.host import ROOT, read_text
@@ -68,36 +68,31 @@ class InaReader(Reader):
         rails = _numbered(_hwmon(root) or list(_iio(root)))
         if not rails:
             return Absent(cls.name, REASON)
-        found = cls(root, rails)
-        if not found.read():
-            return Absent(cls.name, "there are power monitors, but none of their rails can be read; look at dmesg")
-        return found
+        return cls(root, rails).or_absent(
+            "there are power monitors, but none of their rails can be read; look at dmesg"
+        )
 
     def read(self) -> list[Reading]:
         """Return the power of the rails in watts."""
-        found: list[Reading] = []
-        for rail in self._rails:
-            found += gauge(f"ina.{rail.label}", rail.watts(self._root), WATT)
-        return found
+        return [reading for rail in self._rails for reading in gauge(f"ina.{rail.label}", rail.watts(self._root), WATT)]
 
 
 def _numbered(rails: list[_Rail]) -> list[_Rail]:
     """Give the second rail of the same label the index 1, and so on."""
     seen: Counter[str] = Counter()
-    found = []
+    numbered = []
     for rail in rails:
         index = seen[rail.label]
         seen[rail.label] += 1
-        label = f"{rail.label}-{index}" if index else rail.label
-        found.append(_Rail(label, rail.power, rail.scale, rail.current))
-    return found
+        numbered.append(replace(rail, label=f"{rail.label}-{index}") if index else rail)
+    return numbered
 
 
 def _hwmon(root: Path) -> list[_Rail]:
     for folder, pattern in HWMON:
-        found = [rail for place in listed(root, folder, pattern) for rail in _chip(root, place)]
-        if found:
-            return found
+        rails = [rail for place in listed(root, folder, pattern) for rail in _chip(root, place)]
+        if rails:
+            return rails
     return []
 
 
@@ -124,6 +119,6 @@ def _iio(root: Path) -> Iterator[_Rail]:
     for place in listed(root, *IIO):
         for path in listed(root, place, "rail_name_*"):
             label = read_text(root, path)
-            found = re.search(r"rail_name_(\d+)$", path)
-            if found and label and label != NO_RAIL:
-                yield _Rail(label, f"{place}/in_power{found[1]}_input", 1e-3)
+            channel = re.search(r"rail_name_(\d+)$", path)
+            if channel and label and label != NO_RAIL:
+                yield _Rail(label, f"{place}/in_power{channel[1]}_input", 1e-3)

@@ -53,32 +53,28 @@ class NvmlReader(Reader):
             cards = [library.nvmlDeviceGetHandleByIndex(index) for index in range(library.nvmlDeviceGetCount())]
         except library.NVMLError as error:
             return Absent(cls.name, f"NVML cannot be opened ({error}): there is no NVIDIA card or driver")
-        found = cls(library, cards)
-        if not found.read():
-            return Absent(cls.name, "NVML tells nothing here, as on most Jetsons; their INA monitors are read instead")
-        return found
+        return cls(library, cards).or_absent(
+            "NVML tells nothing here, as on most Jetsons; their INA monitors are read instead"
+        )
 
     def read(self) -> list[Reading]:
         """Return what the cards tell; what one does not support is left out."""
-        found: list[Reading] = []
-        for index, card in enumerate(self._cards):
-            found += self._card(f"nvml.gpu{index}", card)
-        return found
+        return [reading for index, card in enumerate(self._cards) for reading in self._card(f"nvml.gpu{index}", card)]
 
     def _card(self, name: str, card: Any) -> list[Reading]:
-        found = gauge(f"{name}.power", self._ask(1e-3, "nvmlDeviceGetPowerUsage", card), _reading.WATT, LABEL)
+        readings = gauge(f"{name}.power", self._ask(1e-3, "nvmlDeviceGetPowerUsage", card), _reading.WATT, LABEL)
         energy = self._ask(1e-3, "nvmlDeviceGetTotalEnergyConsumption", card)
-        found += counter(f"{name}.energy", energy, _reading.JOULE, note=LABEL)
+        readings += counter(f"{name}.energy", energy, _reading.JOULE, note=LABEL)
         degrees = self._ask(1.0, "nvmlDeviceGetTemperature", card, "NVML_TEMPERATURE_GPU")
-        found += gauge(f"{name}.temperature", degrees, _reading.DEGREE)
+        readings += gauge(f"{name}.temperature", degrees, _reading.DEGREE)
         for part, kind in (("sm", "NVML_CLOCK_SM"), ("memory", "NVML_CLOCK_MEM")):
             clock = self._ask(1.0, "nvmlDeviceGetClockInfo", card, kind)
-            found += gauge(f"{name}.{part}_clock", clock, _reading.MEGAHERTZ)
+            readings += gauge(f"{name}.{part}_clock", clock, _reading.MEGAHERTZ)
         for call in REASON_CALLS:
             bits = self._ask(1.0, call, card)
             if bits is not None:
-                return found + _reasons(name, int(bits))
-        return found
+                return readings + _reasons(name, int(bits))
+        return readings
 
     def _ask(self, factor: float, call: str, card: Any, constant: str = "") -> float | None:
         """Call NVML and scale the answer; None when the library, the driver or the card does not have it."""
@@ -90,7 +86,8 @@ class NvmlReader(Reader):
 
 
 def _reasons(name: str, bits: int) -> list[Reading]:
-    found: list[Reading] = []
-    for bit, words in REASONS.items():
-        found += gauge(f"{name}.{words.replace(' ', '_')}", float(bool(bits & bit)), _reading.THROTTLE, words)
-    return found
+    return [
+        reading
+        for bit, words in REASONS.items()
+        for reading in gauge(f"{name}.{words.replace(' ', '_')}", float(bool(bits & bit)), _reading.THROTTLE, words)
+    ]

@@ -10,28 +10,24 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import COUNT, Absent, Reader, Reading, Run, gauge, runner
+from vlatool.telemetry._reading import COUNT, Absent, CommandReader, Reading, Run, gauge, runner
 
 COMMAND = ("nvpmodel", "-q")
 MODE = re.compile(r"NV Power Mode:[ \t]*(\S[^\r\n]*?)[ \t]*\r?\n\s*(\d{1,6})\s*$", re.MULTILINE)
 
 
-class NvpmodelReader(Reader):
+class NvpmodelReader(CommandReader):
     """The number of the power mode as ``nvpmodel.mode`` with its name as note; read at the start and at the end."""
 
     name = "nvpmodel"
     period_s = math.inf
 
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> NvpmodelReader | Absent:
         """Ask for the mode; absent where there is no answer."""
-        found = cls(runner(root, run))
-        if not found.read():
-            return Absent(cls.name, "nvpmodel -q gives no mode: this is no Jetson, or the command needs sudo here")
-        return found
+        return cls(runner(root, run)).or_absent(
+            "nvpmodel -q gives no mode: this is no Jetson, or the command needs sudo here"
+        )
 
     def read(self) -> list[Reading]:
         """Return the number of the mode; its name is the note."""
@@ -46,5 +42,5 @@ def parse(text: str) -> tuple[str, int] | None:
         >>> parse("NV Power Mode: 25W\n1\n")
         ('25W', 1)
     """
-    found = MODE.search(text)
-    return (found[1], int(found[2])) if found else None
+    mode = MODE.search(text)
+    return (mode[1], int(mode[2])) if mode else None

@@ -10,32 +10,28 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT
-from vlatool.telemetry._reading import THROTTLE, Absent, Reader, Reading, Run, counter, listed, scaled
+from vlatool.telemetry._reading import THROTTLE, Absent, FileReader, NumberFile, Run, listed
 
 COUNT = re.compile(r"/(oc\d+)_event_cnt$")
 
 
-class OvercurrentReader(Reader):
+class OvercurrentReader(FileReader):
     """Events of every over-current alarm, as ``overcurrent.oc1``."""
 
     name = "overcurrent"
 
-    def __init__(self, root: Path, paths: list[str]) -> None:
-        self._root = root
-        self._counts = {f"overcurrent.{found[1]}": path for path in paths if (found := COUNT.search(path))}
-
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> OvercurrentReader | Absent:
         """Find the counters; absent where there are none, which is everywhere but on a Jetson."""
-        found = cls(root, listed(root, "sys/class/hwmon", "hwmon*/oc*_event_cnt"))
-        if not found.read():
-            return Absent(cls.name, "no over-current counters: this is no Jetson with JetPack 5 or later")
-        return found
-
-    def read(self) -> list[Reading]:
-        """Return the event counters."""
-        found: list[Reading] = []
-        for name, path in self._counts.items():
-            words = f"over-current alarm {name.rpartition('.')[2].upper()}"
-            found += counter(name, scaled(self._root, path, 1.0), THROTTLE, note=words)
-        return found
+        paths = {
+            match[1]: path
+            for path in listed(root, "sys/class/hwmon", "hwmon*/oc*_event_cnt")
+            if (match := COUNT.search(path))
+        }
+        files = [
+            NumberFile(
+                f"overcurrent.{alarm}", path, 1.0, THROTTLE, "counter", note=f"over-current alarm {alarm.upper()}"
+            )
+            for alarm, path in paths.items()
+        ]
+        return cls(root, files).or_absent("no over-current counters: this is no Jetson with JetPack 5 or later")

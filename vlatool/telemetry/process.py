@@ -47,15 +47,11 @@ class ProcessReader(Reader):
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None, number: int = 0) -> ProcessReader | Absent:
         """Read ``/proc``, or open psutil on this machine; absent where there is neither."""
-        found = cls(root, number=number)
-        if found.read():
-            return found
-        if root == ROOT:
+        reader = cls(root, number=number)
+        if not reader.read() and root == ROOT:
             with contextlib.suppress(ImportError):
-                found = cls(root, importlib.import_module("psutil").Process(number or None))
-            if found.read():
-                return found
-        return Absent(cls.name, "there is no /proc; elsewhere than on Linux: pip install psutil")
+                reader = cls(root, importlib.import_module("psutil").Process(number or None))
+        return reader.or_absent("there is no /proc; elsewhere than on Linux: pip install psutil")
 
     def read(self) -> list[Reading]:
         """Return the counters of this process and the machine's steal time."""
@@ -63,13 +59,13 @@ class ProcessReader(Reader):
 
     def _proc(self) -> list[Reading]:
         times = STAT.search(read_text(self._root, f"{self._place}/stat") or "")
-        found = _times((int(times[1]) + int(times[2])) / TICKS if times else None)
+        readings = _times((int(times[1]) + int(times[2])) / TICKS if times else None)
         resident = RESIDENT.search(read_text(self._root, f"{self._place}/status") or "")
-        found += gauge("process.memory", int(resident[1]) * 1024 / 1e6 if resident else None, _reading.MEGABYTE)
+        readings += gauge("process.memory", int(resident[1]) * 1024 / 1e6 if resident else None, _reading.MEGABYTE)
         for path in listed(self._root, f"{self._place}/task", "*/status"):
             if switches := SWITCHES.search(read_text(self._root, path) or ""):
                 self._switches[path] = int(switches[1])
-        return found + _switches(sum(self._switches.values()) if self._switches else None)
+        return readings + _switches(sum(self._switches.values()) if self._switches else None)
 
     def _steal(self) -> list[Reading]:
         stolen = STEAL.search(read_text(self._root, "proc/stat") or "")
@@ -84,8 +80,8 @@ class ProcessReader(Reader):
                 switches = self._process.num_ctx_switches().involuntary
         except Exception:  # psutil.Error, or what one platform does not have
             return []
-        found = _times(times.user + times.system) + gauge("process.memory", memory, _reading.MEGABYTE)
-        return found + _switches(switches)
+        readings = _times(times.user + times.system) + gauge("process.memory", memory, _reading.MEGABYTE)
+        return readings + _switches(switches)
 
 
 def _times(seconds: float | None) -> list[Reading]:

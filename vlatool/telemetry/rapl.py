@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 
 from vlatool.machine.host import ROOT, read_text
-from vlatool.telemetry._reading import JOULE, Absent, Reader, Reading, Run, counter, listed, scaled
+from vlatool.telemetry._reading import JOULE, Absent, FileReader, NumberFile, Run, listed, scaled
 
 ZONE = re.compile(r"intel-rapl:\d+$")
 """A zone at the top. Its children (core, uncore, dram) are inside of it and never added."""
@@ -22,7 +22,7 @@ UDEV_RULE = (
 """Lets a group read the counters; without the second part the group may not, because the mode is 0400."""
 
 
-class RaplReader(Reader):
+class RaplReader(FileReader):
     """Energy of every processor package in joules, as ``rapl.package-0``.
 
     The zone ``psys`` is left out: it holds the package again, and how much of the board it covers differs by vendor.
@@ -30,32 +30,21 @@ class RaplReader(Reader):
 
     name = "rapl"
 
-    def __init__(self, root: Path, zones: dict[str, str]) -> None:
-        self._root = root
-        self._zones = zones
-
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> RaplReader | Absent:
         """Find the packages; absent where there is none, or where the counter of one cannot be read."""
-        zones: dict[str, str] = {}
+        files: dict[str, NumberFile] = {}
         for place in listed(root, "sys/class/powercap", "intel-rapl:*"):
             label = read_text(root, f"{place}/name") or ""
             if ZONE.search(place) and label.startswith("package"):
-                zones[f"rapl.{label}"] = place
-        if not zones:
+                wraps = scaled(root, f"{place}/max_energy_range_uj", 1e-6)
+                files[label] = NumberFile(f"rapl.{label}", f"{place}/energy_uj", 1e-6, JOULE, "counter", wraps, LABEL)
+        if not files:
             return Absent(cls.name, "no RAPL package is visible (virtual machine or ARM); measure at the wall")
-        found = cls(root, zones)
-        if len(found.read()) < len(zones):
+        reader = cls(root, files.values())
+        if len(reader.read()) < len(files):
             fix = f"write into /etc/udev/rules.d/70-rapl.rules, with your group for GROUP, and reboot: {UDEV_RULE}"
             return Absent(
                 cls.name, f"the energy counter is there, but cannot be read (since Linux 5.10 only root may); {fix}"
             )
-        return found
-
-    def read(self) -> list[Reading]:
-        """Return the energy counters in joules."""
-        found: list[Reading] = []
-        for name, place in self._zones.items():
-            wraps = scaled(self._root, f"{place}/max_energy_range_uj", 1e-6)
-            found += counter(name, scaled(self._root, f"{place}/energy_uj", 1e-6), JOULE, wraps, LABEL)
-        return found
+        return reader

@@ -44,9 +44,9 @@ class Recorder:
     ) -> None:
         if not (math.isfinite(period_s) and period_s > 0):
             raise ValueError(f"period_s must be above zero, got {period_s}")
-        found = list(readers)
-        self._absent = [one for one in found if isinstance(one, Absent)]
-        self._readers = [one for one in found if isinstance(one, Reader)]
+        opened = list(readers)
+        self._absent = [absent for absent in opened if isinstance(absent, Absent)]
+        self._readers = [reader for reader in opened if isinstance(reader, Reader)]
         self._period_s = period_s
         self._clock = clock
         self._last: dict[str, float] = {}
@@ -86,7 +86,7 @@ class Recorder:
     def recorded(self) -> Recorded:
         """The summary of what has been sampled so far."""
         with self._lock:
-            partly = [one for reader in self._readers for one in reader.absent()]
+            partly = [part for reader in self._readers for part in reader.absent()]
             return summarise(self._samples, [*self._absent, *partly])
 
     def _loop(self) -> None:

@@ -11,12 +11,10 @@ from pathlib import Path
 
 from vlatool.machine.host import ROOT
 from vlatool.telemetry import _reading
-from vlatool.telemetry._reading import Absent, Reader, Reading, Run, gauge, runner
+from vlatool.telemetry._reading import COLDEST, Absent, CommandReader, Reading, Run, gauge, runner
 
 COMMAND = ("sh", "-c", "timeout 1 tegrastats --interval 100 | head -n 1")
 """One line: tegrastats runs until it is stopped."""
-COLDEST = -200.0
-"""Below this in degC a zone is powered off: it shows -256."""
 MEGABYTES = {"k": 1024 / 1e6, "M": 1024**2 / 1e6, "G": 1024**3 / 1e6}
 """tegrastats divides by 1024: one of its MB is 1.048576 MB."""
 MEMORY = re.compile(r"\bRAM (\d+)/\d+([kMG])B")
@@ -28,23 +26,19 @@ TEMPERATURE = re.compile(r"(?<![\w-])([A-Za-z][\w-]*)@(-?\d+(?:\.\d+)?)C\b")
 POWER = re.compile(r"\b([A-Z]\w*) (-?\d+)(?:mW)?/-?\d+(?:mW)?(?=\s|$)")
 
 
-class TegrastatsReader(Reader):
+class TegrastatsReader(CommandReader):
     """One line of tegrastats, at most once a second; it stands in where the INA monitors cannot be read."""
 
     name = "tegrastats"
     period_s = 1.0
     fallback_for = "ina"
 
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
     @classmethod
     def open(cls, root: Path = ROOT, run: Run | None = None) -> TegrastatsReader | Absent:
         """Ask for one line; absent where there is no tegrastats or it says nothing that is known."""
-        found = cls(runner(root, run))
-        if not found.read():
-            return Absent(cls.name, "tegrastats gives no line: this is no Jetson, or it needs the L4T tools installed")
-        return found
+        return cls(runner(root, run)).or_absent(
+            "tegrastats gives no line: this is no Jetson, or it needs the L4T tools installed"
+        )
 
     def read(self) -> list[Reading]:
         """Return what one line says."""
@@ -55,25 +49,25 @@ def parse(line: str) -> list[Reading]:
     """Return the readings of one line: W, degC, MHz, MB and share; of ``now/average`` the first.
 
     Example:
-        >>> [(found.name, found.value) for found in parse("GR3D_FREQ 14%@[407] VDD_IN 5251mW/8535mW")]
+        >>> [(reading.name, reading.value) for reading in parse("GR3D_FREQ 14%@[407] VDD_IN 5251mW/8535mW")]
         [('tegrastats.GR3D.load', 0.14), ('tegrastats.GR3D.clock', 407.0), ('tegrastats.VDD_IN', 5.251)]
     """
     return [*_memory(line), *_cores(line), *_engines(line), *_temperatures(line), *_power(line)]
 
 
 def _memory(line: str) -> list[Reading]:
-    found = MEMORY.search(line)
-    return gauge("tegrastats.RAM", float(found[1]) * MEGABYTES[found[2]], _reading.MEGABYTE) if found else []
+    memory = MEMORY.search(line)
+    return gauge("tegrastats.RAM", float(memory[1]) * MEGABYTES[memory[2]], _reading.MEGABYTE) if memory else []
 
 
 def _cores(line: str) -> list[Reading]:
     """Load and clock of each core that is on; before JetPack 3 one clock stands behind the list."""
-    found = CPU.search(line)
+    cores = CPU.search(line)
     readings: list[Reading] = []
-    for index, text in enumerate(found[1].split(",") if found else []):
+    for index, text in enumerate(cores[1].split(",") if cores else []):
         core = CORE.fullmatch(text)
         if core:
-            clock = core[2] or (found and found[2])
+            clock = core[2] or (cores and cores[2])
             readings += gauge(f"tegrastats.cpu{index}.load", float(core[1]) / 100, _reading.SHARE)
             readings += gauge(f"tegrastats.cpu{index}.clock", float(clock) if clock else None, _reading.MEGAHERTZ)
     return readings

@@ -51,30 +51,30 @@ class VcgencmdReader(Reader):
 
     def read(self) -> list[Reading]:
         """Return what vcgencmd says now."""
-        found = gauge("vcgencmd.temperature", temperature(self._ask("measure_temp")), DEGREE)
+        readings = gauge("vcgencmd.temperature", temperature(self._ask("measure_temp")), DEGREE)
         bits = throttled(self._ask("get_throttled"))
         for bit, words in BITS.items() if bits is not None else ():
             name = words.replace(" ", "_")
-            found += gauge(f"vcgencmd.{name}", _bit(bits, bit), THROTTLE, words)
+            readings += gauge(f"vcgencmd.{name}", _bit(bits, bit), THROTTLE, words)
             if not _bit(self._was_throttled, bit):
                 sticky = _bit(bits, bit + SINCE_START)
-                found += counter(f"vcgencmd.{name}_since_start", sticky, THROTTLE, note=words)
+                readings += counter(f"vcgencmd.{name}_since_start", sticky, THROTTLE, note=words)
         if self._has_rails:
             for rail, watts in pmic_watts(self._ask("pmic_read_adc")).items():
-                found += gauge(f"vcgencmd.{rail}", watts, WATT)
-        return found
+                readings += gauge(f"vcgencmd.{rail}", watts, WATT)
+        return readings
 
     def absent(self) -> list[Absent]:
         """Return the board's missing current sensing, and the reasons that no longer tell anything new."""
-        found = [] if self._has_rails else [Absent("vcgencmd power", NO_CURRENT)]
+        missing = [] if self._has_rails else [Absent("vcgencmd power", NO_CURRENT)]
         before = [words for bit, words in BITS.items() if _bit(self._was_throttled, bit)]
         if before:
             reason = (
                 f"{', '.join(before)} occurred before the recording; these bits stay until a restart, "
                 "so a new event between two samples cannot be seen"
             )
-            found.append(Absent("vcgencmd since start", reason))
-        return found
+            missing.append(Absent("vcgencmd since start", reason))
+        return missing
 
     def _ask(self, command: str) -> str:
         return self._run(("vcgencmd", command)) or ""
@@ -86,14 +86,14 @@ def _bit(bits: int | None, bit: int) -> int:
 
 def temperature(text: str) -> float | None:
     """Return the degC of ``temp=48.0'C``; None when there is none."""
-    found = TEMPERATURE.search(text)
-    return float(found[1]) if found else None
+    degrees = TEMPERATURE.search(text)
+    return float(degrees[1]) if degrees else None
 
 
 def throttled(text: str) -> int | None:
     """Return the bits of ``throttled=0x50000``; None when there are none."""
-    found = THROTTLED.search(text)
-    return int(found[1], 16) if found else None
+    bits = THROTTLED.search(text)
+    return int(bits[1], 16) if bits else None
 
 
 def pmic_watts(text: str) -> dict[str, float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.frames import file_of
-from vlatool.episodes.play import Job
+from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.description import read_description, read_location
@@ -43,15 +43,15 @@ class Scene:
     folder: Path
     tasks: tuple[str, ...]
 
-    def jobs(self, episodes: int, first_seed: int, noise: float, record: Path) -> list[Job]:
+    def jobs(self, episodes: int, first_seed: int, noise: float, record: Path) -> list[EpisodesJob]:
         """Return the jobs of so many episodes, spread evenly over the tasks."""
         each = -(-episodes // len(self.tasks))
-        jobs: list[Job] = []
+        jobs: list[EpisodesJob] = []
         for task in self.tasks:
             for start in range(0, each, SLICE):
                 seeds = tuple(range(first_seed + start, first_seed + min(each, start + SLICE)))
                 place = str(record / f"{len(jobs):05d}")
-                jobs.append(Job(self.make, str(self.folder), task, seeds, noise=noise, record=place))
+                jobs.append(EpisodesJob(self.make, str(self.folder), task, seeds, noise=noise, record=place))
         return jobs
 
 

@@ -28,16 +28,16 @@ def read(line: bytes, about: str) -> dict[str, Any]:
         SourceError: when it is none of those that ``vlatool.user_code._child`` says.
     """
     try:
-        found = parse_json(line)
+        message = parse_json(line)
     except ValueError as error:
         raise nonsense(about) from error
-    if not isinstance(found, dict) or not _makes_sense(found):
+    if not isinstance(message, dict) or not _makes_sense(message):
         raise nonsense(about)
-    return found
+    return message
 
 
-def _makes_sense(told: Mapping[str, Any]) -> bool:
-    match told:
+def _makes_sense(line: Mapping[str, Any]) -> bool:
+    match line:
         case {"progress": [str(), None]} | {"warning": str()} | {"result": _} | {"memory": True}:
             return True
         case {"progress": [str(), int() | float() as share]}:
@@ -49,7 +49,7 @@ def _makes_sense(told: Mapping[str, Any]) -> bool:
     return False
 
 
-def result(told: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
+def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     """Return the result that an answer holds, or raise what it says that was raised.
 
     Args:
@@ -62,23 +62,23 @@ def result(told: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         SourceError: for everything else that was raised; RuntimeError where ``own``.
         OSError, MemoryError: what the child met.
     """
-    if "result" in told:
-        return told["result"]
-    if "memory" in told:
+    if "result" in answer:
+        return answer["result"]
+    if "memory" in answer:
         raise MemoryError
-    message = plain(told["message"])
-    if "error" in told:
-        kind = getattr(errors, told["error"], None)
+    message = plain(answer["message"])
+    if "error" in answer:
+        kind = getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, InputError | MissingExtra):
-            raise kind(told["message"], told["fix"])
-        name = f"{told['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
+            raise kind(answer["message"], answer["fix"])
+        name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
         raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}")
-    if "errno" in told:
-        raise OSError(told["errno"], message, told["file"])
-    name = plain(told["raised"])
+    if "errno" in answer:
+        raise OSError(answer["errno"], message, answer["file"])
+    name = plain(answer["raised"])
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
-    if told["ours"]:
+    if answer["ours"]:
         raise SourceError(
             f"{about}: the process that runs it failed: {name}: {message}.",
             "VLATOOL_DEBUG=1 shows where; report it where that is in vlatool",
@@ -93,14 +93,14 @@ def nonsense(about: str) -> SourceError:
 
 def plain(text: str) -> str:
     """Return a text without what would steer a terminal."""
-    return "".join(each if unicodedata.category(each)[0] != "C" else " " for each in text).rstrip()
+    return "".join(character if unicodedata.category(character)[0] != "C" else " " for character in text).rstrip()
 
 
-def left(about: str, name: str, told: str) -> SourceError:
+def left(about: str, name: str, text: str) -> SourceError:
     """Return the error for code that raises what is no ``Exception``."""
     if name == "SystemExit":
-        return SourceError(f"{about} called sys.exit({told}).", "raise an exception that says what is wrong instead")
-    return SourceError(f"{about} raised {name}{told and ': '}{told}.", "raise an Exception that says what is wrong")
+        return SourceError(f"{about} called sys.exit({text}).", "raise an exception that says what is wrong instead")
+    return SourceError(f"{about} raised {name}{text and ': '}{text}.", "raise an Exception that says what is wrong")
 
 
 def ended(status: bytes, about: str) -> BaseException:

@@ -89,7 +89,7 @@ def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket
     try:
         die_with_parent()
         if os.getppid() == server:
-            for fd in (status, *own, *(each.fileno() for each in children.values())):
+            for fd in (status, *own, *(other.fileno() for other in children.values())):
                 os.close(fd)
             _stand_alone(output)
             code = _converse(socket.socket(fileno=talk))
@@ -124,15 +124,15 @@ def _converse(talk: socket.socket) -> int:
     return 0
 
 
-def _settle(told: dict[str, Any]) -> None:
+def _settle(parent: dict[str, Any]) -> None:
     """Be where the parent is: directory, variables, modules, processors."""
-    os.chdir(told["folder"])
+    os.chdir(parent["folder"])
     os.environ.clear()
-    os.environ.update(told["environment"])
-    sys.path[:] = told["path"]
+    os.environ.update(parent["environment"])
+    sys.path[:] = parent["path"]
     with contextlib.suppress(OSError):
-        os.sched_setaffinity(0, told["processors"])
-    trust.restore(told["named"])
+        os.sched_setaffinity(0, parent["processors"])
+    trust.restore(parent["named"])
     if "numpy" in sys.modules:  # or all children would draw the same numbers
         sys.modules["numpy"].random.seed()
 
@@ -161,17 +161,17 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
 def _raised(error: BaseException) -> dict[str, Any]:
     if os.environ.get("VLATOOL_DEBUG"):
         traceback.print_exc()
-    told = message_of(error).strip().splitlines()
-    return {"raised": type(error).__name__, "message": told[0] if told else "", "ours": isinstance(error, Exception)}
+    lines = message_of(error).strip().splitlines()
+    return {"raised": type(error).__name__, "message": lines[0] if lines else "", "ours": isinstance(error, Exception)}
 
 
 def _function(name: str) -> Callable[..., Any]:
     """Return a function of vlatool by ``module:name``."""
     module, _, function = name.partition(":")
     if not module.startswith("vlatool."):
-        raise ValueError(f"{name} is no function of vlatool")
-    found: Callable[..., Any] = getattr(importlib.import_module(module), function)
-    return found
+        raise ValueError(f"{name} is not a function of vlatool")
+    called: Callable[..., Any] = getattr(importlib.import_module(module), function)
+    return called
 
 
 @contextlib.contextmanager

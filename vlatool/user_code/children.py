@@ -133,15 +133,15 @@ class Apart:
             select.select([self._status], [], [], PATIENCE_S)
             self._print(last=True)
         self.end()
-        for each in (self._talk, self._status):
-            each.close()
+        for stream in (self._talk, self._status):
+            stream.close()
         os.close(self._output)
 
     def end(self) -> None:
         """End the child, from any thread; a call that waits for it ends too."""
-        for each in (self._talk, self._status):
+        for stream in (self._talk, self._status):
             with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
+                stream.shutdown(socket.SHUT_RDWR)
 
     def call(self, function: str, job: Mapping[str, Any], tell: Tell, *, own: bool = False) -> Any:
         """Call ``module:function`` of vlatool with a job and ``tell``; return its result. All are JSON values.
@@ -256,16 +256,16 @@ def spread(
 
     with contextlib.ExitStack() as opened, ThreadPoolExecutor(processes) as threads:
         children = [opened.enter_context(Apart(about, preload)) for _ in range(max(1, min(processes, len(jobs))))]
-        for each in children:
-            idle.put(each)
+        for child in children:
+            idle.put(child)
         try:
             yield from threads.map(run, jobs)
-            for each in children if last else ():
-                each.call(last, {}, tell)
+            for child in children if last else ():
+                child.call(last, {}, tell)
         except BaseException:  # Ctrl-C too: what runs ends
             threads.shutdown(wait=False, cancel_futures=True)
-            for each in children:
-                each.end()
+            for child in children:
+                child.end()
             raise
 
 
@@ -286,9 +286,9 @@ class _Said:
         if not line.strip() or self._shown > SHOWN_LINES:
             return
         self._shown += 1
-        told = f"[{self._about}] {line}" if self._shown <= SHOWN_LINES else f"[{self._about}] prints more; not shown"
+        shown = f"[{self._about}] {line}" if self._shown <= SHOWN_LINES else f"[{self._about}] prints more; not shown"
         with contextlib.suppress(OSError, ValueError, AttributeError):
-            sys.stderr.write(told + "\n")
+            sys.stderr.write(shown + "\n")
             sys.stderr.flush()
 
 

@@ -64,13 +64,13 @@ def is_named(folder: Path) -> bool:
 
 def named_so_far() -> list[list[Any]]:
     """Return what was named, as JSON values for a child process."""
-    return [list(astuple(each)) for each in _named.values()]
+    return [list(astuple(folder)) for folder in _named.values()]
 
 
 def restore(named: Sequence[Sequence[Any]]) -> None:
     """Take over what the parent process was told."""
     _named.clear()
-    _named.update({each[0]: Named(*each) for each in named})
+    _named.update({entry[0]: Named(*entry) for entry in named})
 
 
 @contextlib.contextmanager
@@ -115,7 +115,7 @@ def trust(folder: Path) -> None:
         OutputError: when it cannot be remembered.
     """
     if not folder.is_dir():
-        raise UsageError(f"--trust {folder} is no directory.", "name the directory of a policy")
+        raise UsageError(f"--trust {folder} is not a directory.", "name the directory of a policy")
     trusted = {**_read(), str(folder.resolve()): content(folder)}
     file = place()
     draft = file.with_name(f".{file.name}.{os.getpid()}")
@@ -131,8 +131,8 @@ def trust(folder: Path) -> None:
 
 def place() -> Path:
     """Return the file of what is trusted: ``$VLATOOL_TRUST``, or ``vlatool/trusted.json`` among the user's settings."""
-    if told := os.environ.get(PLACE):
-        return Path(told)
+    if named := os.environ.get(PLACE):
+        return Path(named)
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "vlatool" / "trusted.json"
 
 
@@ -142,7 +142,7 @@ def content(folder: Path) -> str:
     Raises:
         UsageError: when there are too many, or one cannot be read.
     """
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for count, (name, path) in enumerate(_files(folder)):
         if count >= MOST_FILES:
             raise UsageError(
@@ -150,10 +150,10 @@ def content(folder: Path) -> str:
                 f"{SMALLER}; installed packages (.venv, node_modules) and data belong elsewhere",
             )
         try:
-            found.update(json.dumps([name, hash_file(path) if isinstance(path, Path) else f"is {path}"]).encode())
+            digest.update(json.dumps([name, hash_file(path) if isinstance(path, Path) else f"is {path}"]).encode())
         except OSError as error:
             raise UsageError(f"{path} cannot be read: {error.strerror}; it cannot be trusted.", SMALLER) from error
-    return f"sha256:{found.hexdigest()}"
+    return f"sha256:{digest.hexdigest()}"
 
 
 def _files(folder: Path) -> Iterator[tuple[str, Path | str]]:
@@ -189,14 +189,14 @@ def _read() -> dict[str, str]:
     try:
         with file.open(encoding="utf-8") as stream:
             about = os.fstat(stream.fileno())
-            found = json.load(stream)
+            stored = json.load(stream)
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
         raise SourceError(f"{file} cannot be read: {error}.", "remove it, and trust again with --trust DIR") from error
     if about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise SourceError(f"{file} can be written by others.", f"remove it, or: chmod 600 {file}")
-    trusted = found.get("trusted") if isinstance(found, dict) and found.get("schema") == SCHEMA else None
-    if not isinstance(trusted, dict) or not all(isinstance(each, str) for each in trusted.values()):
-        raise SourceError(f"{file} makes no sense.", "remove it, and trust again with --trust DIR")
+    trusted = stored.get("trusted") if isinstance(stored, dict) and stored.get("schema") == SCHEMA else None
+    if not isinstance(trusted, dict) or not all(isinstance(digest, str) for digest in trusted.values()):
+        raise SourceError(f"{file} is malformed.", "remove it, and trust again with --trust DIR")
     return trusted

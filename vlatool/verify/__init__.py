@@ -48,7 +48,7 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
         context: Whom to tell.
 
     Raises:
-        SourceError: when the original cannot be imported, fails, or gives what is no action.
+        SourceError: when the original cannot be imported, fails, or gives something that is not an action.
         DataError: when the observations cannot be read.
     """
     file = factory_file(options.against, Path.cwd())
@@ -60,8 +60,8 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
         "tolerance": options.tolerance, "seed": options.seed,
     }  # fmt: skip
     about = split_factory(options.against)[0]
-    found = children.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
-    return _report(bundle, options, found)
+    comparison = children.call("vlatool.verify._compare:compare", job, context.tell, about, PRELOAD)
+    return _report(bundle, options, comparison)
 
 
 def check(options: Options) -> None:
@@ -70,31 +70,31 @@ def check(options: Options) -> None:
         raise UsageError(f"--tolerance is {options.tolerance:g}; allowed: from 0, below 1.")
 
 
-def _report(bundle: Bundle, options: Options, found: Mapping[str, Any]) -> Report:
+def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> Report:
     """Return what was found as a report; its verdict is ``fail`` when the actions differ."""
-    name, count, differing = bundle.manifest.name, int(found["samples"]), int(found["differing"])
-    observations = str(found["observations"]).removesuffix("s" if count == 1 else "")
+    name, count, differing = bundle.manifest.name, int(comparison["samples"]), int(comparison["differing"])
+    observations = str(comparison["observations"]).removesuffix("s" if count == 1 else "")
     title = f"{name} against {options.against} on {count} {observations}"
-    worst = float(found["error"])
+    worst = float(comparison["error"])
     if differing:
-        first = found["first"]
-        said = [
+        first = comparison["first"]
+        sentences = [
             f"{name} does not give what {options.against} gives: {differing} of {count} observations differ by more "
             f"than {options.tolerance:g}, the first is observation {first}; the largest relative error is {worst:.3g}.",
-            *map(str, found["causes"]),
+            *map(str, comparison["causes"]),
         ]
-        said += [] if found["hooks"] or found["certain"] else [HOOKS[0].upper() + HOOKS[1:] + "."]
+        sentences += [] if comparison["hooks"] or comparison["certain"] else [HOOKS[0].upper() + HOOKS[1:] + "."]
     else:
-        said = [f"{name} gives what {options.against} gives: the largest relative error is {worst:.3g} (allowed: "
+        sentences = [f"{name} gives what {options.against} gives: the largest relative error is {worst:.3g} (allowed: "
                 f"{options.tolerance:g})."]  # fmt: skip
     measurements = [Measurement("relative_error_max", worst, "1", samples=count, note="action, in physical units")]
     measurements += [
-        Measurement(f"error_max.{each['element']}", float(each["max error"]), str(each["unit"]), samples=count,
-                    note="largest |difference|") for each in found["elements"]
+        Measurement(f"error_max.{element['element']}", float(element["max error"]), str(element["unit"]), samples=count,
+                    note="largest |difference|") for element in comparison["elements"]
     ]  # fmt: skip
-    details = {ELEMENTS: list(found["elements"]), STAGES: list(found["stages"])}
+    details = {ELEMENTS: list(comparison["elements"]), STAGES: list(comparison["stages"])}
     row = Row(name, measurements=tuple(measurements), details={key: value for key, value in details.items() if value})
     return Report(
-        "verify", title, "fail" if differing else "pass", tuple(said), (row,), environment=fingerprint(),
-        warnings=tuple(found["warnings"]), limits={"tolerance": options.tolerance},
+        "verify", title, "fail" if differing else "pass", tuple(sentences), (row,), environment=fingerprint(),
+        warnings=tuple(comparison["warnings"]), limits={"tolerance": options.tolerance},
     )  # fmt: skip

@@ -31,12 +31,12 @@ def causes(
 ) -> tuple[list[str], bool]:
     """Return what differs, a sentence for each cause, and whether the stage is certain."""
     known = list(_of_quantization(policy))
-    told = list(_of_rounding(policy, samples)) or list(_of_stages(policy, samples, stages, tolerance))
-    if told:
-        return [*known, *told], True
-    found = [*_of_action(policy, samples, tolerance), *_of_inputs(policy, samples, tolerance)]
-    if found:
-        return [*known, *found], True
+    certain = list(_of_rounding(policy, samples)) or list(_of_stages(policy, samples, stages, tolerance))
+    if certain:
+        return [*known, *certain], True
+    guesses = [*_of_action(policy, samples, tolerance), *_of_inputs(policy, samples, tolerance)]
+    if guesses:
+        return [*known, *guesses], True
     text = [*known, *_of_texts(policy, samples, tolerance)]
     where = "no single change of an input or of the action makes both equal, so it is the network (weights, layers, "
     where += "eval mode, the order of the inputs), or more than one stage"
@@ -60,7 +60,7 @@ def _of_rounding(policy: Policy, samples: Sequence[Sample]) -> Iterator[str]:
     if policy.spec.action.kind == "discrete":
         return
     mine = np.concatenate([sample.chunk for sample in samples])
-    theirs = np.concatenate([sample.wanted for sample in samples])
+    theirs = np.concatenate([sample.expected for sample in samples])
     for dtype, (relative, least) in NARROW.items():
         within = np.abs(mine - theirs) <= 1.1 * np.maximum(relative * np.abs(mine), least)
         if within.all() and np.array_equal(_narrowed(theirs, dtype), theirs):
@@ -121,12 +121,12 @@ def _are(names: Sequence[str]) -> str:
 
 def _by(samples: Sequence[Sample], stage: Mapping[str, Any]) -> str:
     """Return what both have there, of an input that differs."""
-    sample = next(each for each in samples if each.number == stage["first"])
+    sample = next(entry for entry in samples if entry.number == stage["first"])
     mine, theirs = sample.encoded[stage["input"]], sample.inputs[stage["input"]]
     if mine.shape != theirs.shape:
         return f": {list(mine.shape)} here, {list(theirs.shape)} in the original"
     place = np.unravel_index(int(np.abs(mine.astype(np.float64) - theirs).argmax()), mine.shape)
-    return f": {mine[place]:.6g} here, {theirs[place]:.6g} in the original, at {[int(each) for each in place[1:]]}"
+    return f": {mine[place]:.6g} here, {theirs[place]:.6g} in the original, at {[int(entry) for entry in place[1:]]}"
 
 
 def _of_action(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
@@ -134,7 +134,7 @@ def _of_action(policy: Policy, samples: Sequence[Sample], tolerance: float) -> I
     if policy.spec.action.kind == "discrete":
         return
     if policy.spec.action.normalisation != "none" and all(
-        policy.chunk_error(sample.raw.reshape(-1, sample.wanted.shape[1])[: len(sample.wanted)], sample.wanted)
+        policy.chunk_error(sample.raw.reshape(-1, sample.expected.shape[1])[: len(sample.expected)], sample.expected)
         <= tolerance
         for sample in samples
     ):
@@ -146,11 +146,11 @@ def _of_action(policy: Policy, samples: Sequence[Sample], tolerance: float) -> I
 def _of_lines(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
     """Fit the original's elements as straight lines of this policy's: a difference in scale or offset alone."""
     mine = np.concatenate([sample.chunk for sample in samples])
-    theirs = np.concatenate([sample.wanted for sample in samples])
+    theirs = np.concatenate([sample.expected for sample in samples])
     if len(mine) < LEAST_FIT:
         return
     labels = policy.spec.action.labels or tuple(map(str, range(mine.shape[1])))
-    told = []
+    lines = []
     for index, label in enumerate(labels):
         spread = float(mine[:, index].std())
         if not spread:
@@ -164,9 +164,9 @@ def _of_lines(policy: Policy, samples: Sequence[Sample], tolerance: float) -> It
         if abs(slope - 1) > tolerance or abs(offset) > tolerance * spread:
             if not left.std() <= LEFT_OVER * np.sqrt(np.mean((theirs - mine)[:, index] ** 2)):
                 return
-            told.append(f"the original's {label} is {slope:.4g} times this policy's plus {offset:.4g}")
-    if told:
-        yield f"The denormalisation differs (statistics, units or order of the elements): {'; '.join(told[:6])}."
+            lines.append(f"the original's {label} is {slope:.4g} times this policy's plus {offset:.4g}")
+    if lines:
+        yield f"The denormalisation differs (statistics, units or order of the elements): {'; '.join(lines[:6])}."
 
 
 def _of_inputs(policy: Policy, samples: Sequence[Sample], tolerance: float) -> Iterator[str]:
@@ -224,7 +224,10 @@ def _equal(policy: Policy, samples: Sequence[Sample], change: Change, tolerance:
             chunk = policy.decode(values[policy.spec.action.name])
         except VlatoolError:
             return False
-        if not error_of(policy, chunk.astype(sample.wanted.dtype)[: len(sample.wanted)], sample.wanted) <= tolerance:
+        if (
+            not error_of(policy, chunk.astype(sample.expected.dtype)[: len(sample.expected)], sample.expected)
+            <= tolerance
+        ):
             return False
     return True
 
@@ -234,8 +237,8 @@ def _of_texts(policy: Policy, samples: Sequence[Sample], tolerance: float) -> It
     for tensor in policy.spec.inputs:
         if tensor.kind != "text":
             continue
-        wrong = {str(each.observation[tensor.name]) for each in samples if not each.error <= tolerance}
-        right = {str(each.observation[tensor.name]) for each in samples if each.error <= tolerance}
+        wrong = {str(sample.observation[tensor.name]) for sample in samples if not sample.error <= tolerance}
+        right = {str(sample.observation[tensor.name]) for sample in samples if sample.error <= tolerance}
         if right and not wrong & right:
             first = min(wrong)
             yield (

@@ -1,4 +1,4 @@
-"""Both sides on the same observations, in this process: actions, and what can be told of the stages between."""
+"""Both sides on the same observations, in this process: actions, and what is known of the stages between."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
         samples.append(_sample(policy, original, number, observation, random))
     stages = _stages(policy, samples, tolerance)
     differing = [sample for sample in samples if not sample.error <= tolerance]
-    found = causes(policy, samples, stages, tolerance) if differing else ([], True)
+    sentences = causes(policy, samples, stages, tolerance) if differing else ([], True)
     return {
         "samples": len(samples), "differing": len(differing), "first": differing[0].number if differing else -1,
         "error": _worst([sample.error for sample in samples]), "elements": _elements(policy.spec, samples),
-        "stages": stages, "causes": found[0], "certain": found[1], "hooks": original.hooks,
+        "stages": stages, "causes": sentences[0], "certain": sentences[1], "hooks": original.hooks,
         "observations": "recorded observations" if recording else "random observations",
         "warnings": _warnings(policy, original, recording),
     }  # fmt: skip
@@ -79,16 +79,16 @@ def _sample(
     policy: Policy, original: Original, number: int, observation: dict[str, Any], random: np.random.Generator
 ) -> Sample:
     steps = policy.bundle.manifest.program
-    noise = {name: draw(wanted, random) for step in steps for name, wanted in step.noise.items()}
+    noise = {name: draw(expected, random) for step in steps for name, expected in step.noise.items()}
     encoded = {name: value.copy() for name, value in policy.encode(observation).items()}
     action = policy.infer(observation, noise=noise)
-    wanted = original.act(observation, noise, number)
-    chunk = action.chunk.astype(wanted.dtype)[: len(wanted)]
+    expected = original.act(observation, noise, number)
+    chunk = action.chunk.astype(expected.dtype)[: len(expected)]
     tensors = {tensor.name: tensor for tensor in policy.spec.inputs}
     inputs = {name: as_fed(tensors[name], value) for name, value in original.preprocess(observation, number).items()}
     return Sample(
-        number, observation, noise, encoded, action.outputs[policy.spec.action.name], chunk, wanted, inputs,
-        original.raw(observation, noise, number), error_of(policy, chunk, wanted),
+        number, observation, noise, encoded, action.outputs[policy.spec.action.name], chunk, expected, inputs,
+        original.raw(observation, noise, number), error_of(policy, chunk, expected),
     )  # fmt: skip
 
 
@@ -97,34 +97,34 @@ def _elements(spec: PolicySpec, samples: list[Sample]) -> list[dict[str, Any]]:
     if spec.action.kind == "discrete":
         return []
     labels = spec.action.labels or tuple(str(index) for index in range(spec.action.width))
-    errors = np.stack([np.abs(sample.chunk - sample.wanted).max(axis=0) for sample in samples])
-    sizes = np.max([np.abs(sample.wanted).max(axis=0) for sample in samples], axis=0)
-    found = []
+    errors = np.stack([np.abs(sample.chunk - sample.expected).max(axis=0) for sample in samples])
+    sizes = np.max([np.abs(sample.expected).max(axis=0) for sample in samples], axis=0)
+    rows = []
     for index, (label, unit) in enumerate(zip(labels, spec.action.units(), strict=True)):
         worst = int(errors[:, index].argmax())
         largest = float(errors[worst, index])
         relative = largest / (float(sizes[index]) or 1.0)
-        found.append({"element": label, "unit": unit, "max error": float(f"{largest:.4g}"),
+        rows.append({"element": label, "unit": unit, "max error": float(f"{largest:.4g}"),
                       "relative": float(f"{relative:.4g}"),
                       "observation": samples[worst].number})  # fmt: skip
-    return found
+    return rows
 
 
 def _stages(policy: Policy, samples: list[Sample], tolerance: float) -> list[dict[str, Any]]:
     """Return the stages that could be compared, in the order in which an observation goes through them."""
-    found = []
+    stages = []
     for tensor in policy.spec.inputs:
         if all(tensor.name in sample.inputs for sample in samples):
             what = f"tokenizer of '{tensor.name}'" if tensor.kind == "text" else (
                 f"normalisation of '{tensor.name}' ({tensor.normalisation})")  # fmt: skip
             errors = [_error(sample.encoded[tensor.name], sample.inputs[tensor.name]) for sample in samples]
-            found.append(_stage(what, tensor.name, samples, errors, tolerance))
-    if all(sample.wanted_raw is not None for sample in samples):
-        errors = [_error(sample.raw, np.asarray(sample.wanted_raw)) for sample in samples]
-        found.append(_stage("network", "", samples, errors, tolerance))
+            stages.append(_stage(what, tensor.name, samples, errors, tolerance))
+    if all(sample.expected_raw is not None for sample in samples):
+        errors = [_error(sample.raw, np.asarray(sample.expected_raw)) for sample in samples]
+        stages.append(_stage("network", "", samples, errors, tolerance))
     errors = [sample.error for sample in samples]
-    found.append(_stage(f"action ({policy.spec.action.normalisation})", "", samples, errors, tolerance))
-    return found
+    stages.append(_stage(f"action ({policy.spec.action.normalisation})", "", samples, errors, tolerance))
+    return stages
 
 
 def _stage(what: str, name: str, samples: list[Sample], errors: list[float], tolerance: float) -> dict[str, Any]:
@@ -133,9 +133,9 @@ def _stage(what: str, name: str, samples: list[Sample], errors: list[float], tol
             "first": differing[0] if differing else None}  # fmt: skip
 
 
-def _error(got: Array, wanted: Array) -> float:
+def _error(got: Array, expected: Array) -> float:
     """Return the relative L2 difference; the largest number for other sizes, of which a batch axis is none."""
-    return min(relative_error(got, wanted), LARGEST)
+    return min(relative_error(got, expected), LARGEST)
 
 
 def _worst(errors: list[float]) -> float:
@@ -143,13 +143,13 @@ def _worst(errors: list[float]) -> float:
 
 
 def _warnings(policy: Policy, original: Original, recording: Recording | None) -> list[str]:
-    found = []
+    warnings = []
     if recording is None:
-        found.append("there is no recording, so both ran on random observations: pass --data FILE.npz to compare on "
+        warnings.append("there is no recording, so both ran on random observations: pass --data FILE.npz to compare on "
                      "what the policy is for")  # fmt: skip
     if any(step.noise for step in policy.bundle.manifest.program) and not original.takes_noise:
-        found.append("the policy draws noise, and act() takes none: the difference is also that of the noise; write "
+        warnings.append("the policy draws noise, and act() takes none: the difference is also that of the noise; write "
                      "act(observation, noise) with noise, a dict of arrays by the names in policy.yaml")  # fmt: skip
     if policy.program.keeps and original._reset is None:
-        found.append("the policy keeps values from step to step, and the original has no reset() beside act()")
-    return found
+        warnings.append("the policy keeps values from step to step, and the original has no reset() beside act()")
+    return warnings

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import exits_told, import_factory
+from vlatool.module.factory import exits_caught, import_factory
 
 Array = NDArray[Any]
 
 
 class Original:
-    """Calls a user's functions; what they raise, and what is no answer, becomes one sentence.
+    """Calls a user's functions; what they raise, and an answer of the wrong kind, becomes one sentence.
 
     Args:
         factory: ``original.py:act`` or ``package.module:act``.
@@ -53,8 +53,8 @@ class Original:
 
     def act(self, observation: Mapping[str, Any], noise: Mapping[str, Array], number: int) -> Array:
         """Return its action: (T, A) float64 in physical units, T at most the chunk; or (T,) int64 indices."""
-        given = self._called(self._act, "act", number, observation, **self._noise(self._act, noise))
-        return self._indices(given, number) if self._spec.action.kind == "discrete" else self._chunk(given, number)
+        answer = self._called(self._act, "act", number, observation, **self._noise(self._act, noise))
+        return self._indices(answer, number) if self._spec.action.kind == "discrete" else self._chunk(answer, number)
 
     def preprocess(self, observation: Mapping[str, Any], number: int) -> dict[str, Array]:
         """Return what its network takes, as far as it tells it: input name -> array; nothing when it has no function.
@@ -64,23 +64,23 @@ class Original:
         """
         if self._preprocess is None:
             return {}
-        given = self._called(self._preprocess, "preprocess", number, observation)
+        answer = self._called(self._preprocess, "preprocess", number, observation)
         names = [tensor.name for tensor in self._spec.inputs]
-        if not isinstance(given, Mapping) or not given or not set(given) <= set(names):
-            got = ", ".join(map(str, given)) if isinstance(given, Mapping) else f"a {type(given).__name__}"
+        if not isinstance(answer, Mapping) or not answer or not set(answer) <= set(names):
+            got = ", ".join(map(str, answer)) if isinstance(answer, Mapping) else f"a {type(answer).__name__}"
             raise SourceError(
                 f"preprocess() beside '{self._name}' gives {got or 'nothing'}; wanted a dict with some of "
                 f"{', '.join(names)}.",
                 "return what the network takes, by the names in policy.yaml",
             )
-        return {name: self._array(value, f"preprocess()['{name}']", number) for name, value in given.items()}
+        return {name: self._array(value, f"preprocess()['{name}']", number) for name, value in answer.items()}
 
     def raw(self, observation: Mapping[str, Any], noise: Mapping[str, Array], number: int) -> Array | None:
         """Return what its network gives, before it is un-normalised; None when it has no function for that."""
         if self._raw is None:
             return None
-        given = self._called(self._raw, "raw", number, observation, **self._noise(self._raw, noise))
-        return self._array(given, "raw()", number)
+        answer = self._called(self._raw, "raw", number, observation, **self._noise(self._raw, noise))
+        return self._array(answer, "raw()", number)
 
     def _noise(self, function: Callable[..., Any], noise: Mapping[str, Array]) -> dict[str, Any]:
         return {"noise": {name: value.copy() for name, value in noise.items()}} if _takes(function, "noise") else {}
@@ -90,8 +90,8 @@ class Original:
     ) -> Any:
         where = f"{name}() of '{self._name}'" + (f", on observation {number}," if number >= 0 else "")
         try:
-            with exits_told(where):
-                return function(*(copy.deepcopy(dict(each)) for each in arguments), **more)
+            with exits_caught(where):
+                return function(*(copy.deepcopy(dict(argument)) for argument in arguments), **more)
         except (VlatoolError, MemoryError):
             raise
         except Exception as error:  # the seam: user code may raise anything
@@ -105,17 +105,17 @@ class Original:
             array = np.asarray(value)
         except Exception as error:  # the seam: an object may refuse in any way
             raise SourceError(
-                f"{what} of '{self._name}' gives a {type(value).__name__}, which is no array: {message_of(error)}.",
+                f"{what} of '{self._name}' gives a {type(value).__name__}, which is not an array: {message_of(error)}.",
                 "return a numpy array, or a tensor of float32",
             ) from error
         if array.dtype.kind not in "biuf" or not array.size:
-            raise SourceError(f"{what} of '{self._name}' gives {_told(value, array)}; wanted an array of numbers.")
+            raise SourceError(f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.")
         if not np.isfinite(array).all():
             raise SourceError(f"{what} of '{self._name}' gives NaN or infinity on observation {number}.")
         return array
 
-    def _chunk(self, given: Any, number: int) -> Array:
-        array, action = self._array(given, "act()", number), self._spec.action
+    def _chunk(self, answer: Any, number: int) -> Array:
+        array, action = self._array(answer, "act()", number), self._spec.action
         width, most = action.width, self._spec.chunk
         wide = array if array.ndim else array[None]
         if wide.shape[-1] != width or not 1 <= wide.size // width <= most:
@@ -126,17 +126,17 @@ class Original:
             )
         return wide.astype(np.float64).reshape(-1, width)
 
-    def _indices(self, given: Any, number: int) -> Array:
+    def _indices(self, answer: Any, number: int) -> Array:
         labels, action = self._spec.action.labels, self._spec.action
-        if isinstance(given, str):
-            given = [labels.index(given)] if given in labels else [given]
-        array = np.asarray(given) if isinstance(given, list) else self._array(given, "act()", number)
+        if isinstance(answer, str):
+            answer = [labels.index(answer)] if answer in labels else [answer]
+        array = np.asarray(answer) if isinstance(answer, list) else self._array(answer, "act()", number)
         flat = array.reshape(-1)
         right = flat.dtype.kind in "iu" and 1 <= flat.size <= self._spec.chunk
         if not right or not ((flat >= 0) & (flat < len(labels))).all():
             raise SourceError(
-                f"act() of '{self._name}' gives {_told(given, array)} for '{action.name}'; wanted an index from 0 to "
-                f"{len(labels) - 1}, or one of {', '.join(labels)}.",
+                f"act() of '{self._name}' gives {_described(answer, array)} for '{action.name}'; wanted an index from "
+                f"0 to {len(labels) - 1}, or one of {', '.join(labels)}.",
                 "return argmax of the logits",
             )
         return flat.astype(np.int64)
@@ -148,8 +148,8 @@ def as_fed(tensor: TensorSpec, value: Array) -> Array:
 
 
 def _function(beside: Mapping[str, Any], name: str) -> Callable[..., Any] | None:
-    found = beside.get(name)
-    return found if callable(found) else None
+    function = beside.get(name)
+    return function if callable(function) else None
 
 
 def _takes(function: Callable[..., Any], name: str) -> bool:
@@ -159,7 +159,7 @@ def _takes(function: Callable[..., Any], name: str) -> bool:
         return False
 
 
-def _told(value: Any, array: Array) -> str:
+def _described(value: Any, array: Array) -> str:
     if isinstance(value, Mapping):
         return f"a dict of {', '.join(map(str, value))}"[:120]
     return repr(value)[:60] if array.size <= 4 else f"an array of {array.dtype} with the shape {list(array.shape)}"

@@ -25,9 +25,9 @@ class Sample:
         encoded: What this policy's network takes, with a batch axis.
         raw: What its network gives.
         chunk: Its action: (T, A) float64, or (T,) int64.
-        wanted: The original's, the same, as many leading steps as it gives.
+        expected: The original's, the same, as many leading steps as it gives.
         inputs: What the original's network takes, as far as it tells it.
-        wanted_raw: What that gives, None when it does not tell it.
+        expected_raw: What that gives, None when it does not tell it.
         error: Relative error of the action.
     """
 
@@ -37,14 +37,14 @@ class Sample:
     encoded: dict[str, Array]
     raw: Array
     chunk: Array
-    wanted: Array
+    expected: Array
     inputs: dict[str, Array] = field(default_factory=dict)
-    wanted_raw: Array | None = None
+    expected_raw: Array | None = None
     error: float = 0.0
 
 
-def error_of(policy: Policy, got: Array, wanted: Array) -> float:
+def error_of(policy: Policy, got: Array, expected: Array) -> float:
     """Return the relative error of an action: by the spread of each element; the share of others where discrete."""
     if policy.spec.action.kind == "discrete":
-        return float(np.mean(got != wanted))
-    return min(policy.chunk_error(got, wanted), LARGEST)
+        return float(np.mean(got != expected))
+    return min(policy.chunk_error(got, expected), LARGEST)

@@ -96,20 +96,20 @@ def read_shards(folder: Path, pattern: str) -> dict[str, StoredTensor]:
     """Read the headers of all shards: name -> where the tensor is, in the order of files and offsets.
 
     Raises:
-        SourceError: when a shard is missing, cut off or no safetensors file, or a tensor is there twice.
+        SourceError: when a shard is missing, cut off or not a safetensors file, or a tensor is there twice.
     """
     files = shard_files(folder, pattern)
     _check_indexes(files)
-    found: dict[str, StoredTensor] = {}
+    tensors: dict[str, StoredTensor] = {}
     for file in files:
-        for tensor in sorted(read_header(file), key=lambda each: each.offset):
-            if tensor.name in found:
+        for tensor in sorted(read_header(file), key=lambda entry: entry.offset):
+            if tensor.name in tensors:
                 raise SourceError(
-                    f"The tensor '{tensor.name}' is in {found[tensor.name].file.name} and in {file.name}.",
+                    f"The tensor '{tensor.name}' is in {tensors[tensor.name].file.name} and in {file.name}.",
                     "keep one set of shards in the folder",
                 )
-            found[tensor.name] = tensor
-    return found
+            tensors[tensor.name] = tensor
+    return tensors
 
 
 def _check_indexes(files: list[Path]) -> None:
@@ -117,14 +117,14 @@ def _check_indexes(files: list[Path]) -> None:
     for index in sorted({path for file in files for path in file.parent.glob(f"*{INDEX}")}):
         try:
             named = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-            wanted = {str(tensor): str(file) for tensor, file in named.items()}
+            files_of = {str(tensor): str(file) for tensor, file in named.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise SourceError(f"{index} is no index of safetensors shards: {error!r}.", AGAIN) from error
-        for name in sorted(set(wanted.values())):
+            raise SourceError(f"{index} is not an index of safetensors shards: {error!r}.", AGAIN) from error
+        for name in sorted(set(files_of.values())):
             if not (index.parent / name).is_file():
                 raise SourceError(f"{index} names the shard {name}, which is missing.", AGAIN)
-        held = {name: {each.name for each in read_header(index.parent / name)} for name in set(wanted.values())}
-        for tensor, name in wanted.items():
+        held = {name: {tensor.name for tensor in read_header(index.parent / name)} for name in set(files_of.values())}
+        for tensor, name in files_of.items():
             if tensor not in held[name]:
                 raise SourceError(f"{index} says that '{tensor}' is in {name}, which does not hold it.", AGAIN)
 
@@ -141,7 +141,7 @@ def read_header(file: Path) -> list[StoredTensor]:
     except ValueError as error:
         raise SourceError(f"{file} has a damaged safetensors header: {error}.", AGAIN) from error
     if not isinstance(entries, Mapping):
-        raise SourceError(f"{file} has a damaged safetensors header: it is no mapping.", AGAIN)
+        raise SourceError(f"{file} has a damaged safetensors header: it is not a mapping.", AGAIN)
     return [_entry(file, str(name), entry, start, size) for name, entry in entries.items() if name != "__metadata__"]
 
 
@@ -153,7 +153,7 @@ def _header_bytes(file: Path) -> tuple[bytes, int, int]:
             length = struct.unpack("<Q", stream.read(8))[0] if size >= 8 else 0
             if not 2 <= length <= min(size - 8, LARGEST_HEADER):
                 raise SourceError(
-                    f"{file} is no safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
+                    f"{file} is not a safetensors file, or is cut off: {size} bytes cannot hold a header of {length}.",
                     AGAIN,
                 )
             return stream.read(length), 8 + length, size
@@ -224,10 +224,10 @@ class Reader:
             return tensor.array[begin : begin + size]
         start = tensor.offset + begin
         aligned = start - start % PAGE
-        wanted = -(-(start + size - aligned) // PAGE) * PAGE
-        buffer = self._room(wanted)
+        length = -(-(start + size - aligned) // PAGE) * PAGE
+        buffer = self._room(length)
         try:
-            got = self._fill(tensor.file, memoryview(buffer)[:wanted], aligned, start + size - aligned)
+            got = self._fill(tensor.file, memoryview(buffer)[:length], aligned, start + size - aligned)
         except OSError as error:
             raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.") from error
         if got < start + size - aligned:

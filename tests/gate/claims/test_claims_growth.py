@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -64,7 +65,7 @@ def test_the_memory_is_that_of_fresh_processes(
     def probed(path, engine, threads, timeout, observations):
         assert observations is None
         asked.append((path, threads, timeout))
-        return {"peak_rss_mb": 90.0 if path == float_bundle.path else 120.0 + len(asked)}
+        return SimpleNamespace(peak_rss_mb=90.0 if path == float_bundle.path else 120.0 + len(asked))
 
     monkeypatch.setattr(growth, "cold_start", probed)
     found = examine_memory(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vlatool.gate import timed as timed_module
-from vlatool.gate.claims.latency import change, examine, examine_all, slower, told
+from vlatool.gate.claims.latency import change, examine, examine_all, sentence_of, slower
 from vlatool.gate.config import LatencyClaim
 from vlatool.measurement.pairs import Pairs
 from vlatool.stats.sequential import Decision
@@ -77,16 +77,16 @@ def test_a_process_that_was_measured_is_not_measured_again(timed) -> None:
     examine(processes, LatencyClaim())
     assert len(processes.pairs) == 10
     first = [pairs.log_ratio for pairs in processes.pairs]
-    examine(processes, LatencyClaim(looks=(12,)))
+    examine(processes, LatencyClaim(interim_analyses=(12,)))
     assert [pairs.log_ratio for pairs in processes.pairs][:10] == first
     assert len(processes.pairs) == 12
 
 
 def test_the_sentence_says_what_was_found_and_what_could_have_been() -> None:
-    fine = told(Decision("pass", 0.98, 0.95, 1.01, 0.05, 10, 0.02))
+    fine = sentence_of(Decision("pass", 0.98, 0.95, 1.01, 0.05, 10, 0.02))
     assert fine.startswith("2.0% faster (-5.0% to +1.0%, 10 processes; allowed: +5.0%); a slowdown of ")
     assert "would decide" not in fine
-    open_ = told(Decision("inconclusive", 1.04, 0.0, math.inf, 0.05, 10, 0.02))
+    open_ = sentence_of(Decision("inconclusive", 1.04, 0.0, math.inf, 0.05, 10, 0.02))
     assert "4.0% slower (unbounded to unbounded, 10 processes" in open_
     assert "processes would decide" in open_
     assert (slower(1.0), change(1.1)) == ("0.0% slower", "+10.0%")

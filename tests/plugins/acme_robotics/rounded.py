@@ -8,27 +8,40 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.files import load, save
+from vlatool.graph.layers import find_layers
 from vlatool.quantize import Quantization
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, source_of
 
 
 class Rounded(Quantization):
     """Round every weight to a few bits of its tensor's range; it stays float32 in the file."""
 
+    packages = ("acme-robotics", "onnx", "numpy")
     tried = {"": {}}
 
     bits: int = Field(6, ge=2, le=16, description="bits of a weight")
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
-        """Round the weights of every selected graph."""
+        """Round the weights of every selected layer."""
+        bundle = source_of(source, self.name())
+        layers = {}
+        for graph in self.chosen_graphs(bundle):
+            model = load(bundle.file(bundle.manifest.graphs[graph].file))
+            layers[graph] = find_layers(model, ("MatMul", "Gemm", "Conv"))
+        selected = self.selected([layer.name for found in layers.values() for layer in found], bundle)
 
-        def quantize(_name: str, original: Path, target: Path) -> None:
+        def quantize(graph: str, original: Path, target: Path) -> None:
             model = load(original)
+            weights = {layer.weight for layer in layers[graph] if layer.name in selected}
             for tensor in model.graph.initializer:
-                values = numpy_helper.to_array(tensor)
-                if values.dtype == np.float32 and values.ndim > 1:
-                    step = np.abs(values).max() / (2 ** (self.bits - 1) - 1) or 1.0
-                    tensor.CopyFrom(numpy_helper.from_array((np.round(values / step) * step).astype("f4"), tensor.name))
+                if tensor.name in weights:
+                    rounded = self.rounded(numpy_helper.to_array(tensor))
+                    tensor.CopyFrom(numpy_helper.from_array(rounded, tensor.name))
             save(model, target)
 
-        return self.transform(source, out, context, quantize)
+        return self.transform(bundle, out, context, quantize)
+
+    def rounded(self, weights: np.ndarray) -> np.ndarray:
+        """Return the nearest of ``2 ** bits - 1`` evenly spaced values for each weight."""
+        step = np.abs(weights).max() / (2 ** (self.bits - 1) - 1) or 1.0
+        return (np.round(weights / step) * step).astype(np.float32)

@@ -35,11 +35,13 @@ from vlatool.errors import VlatoolError
 from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.run import run_gate
 from vlatool.optimize.evidence import with_accuracy
-from vlatool.optimize.pipeline import judged_rows, make_plan, verdict_of
+from vlatool.optimize.pipeline import judged_rows
+from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, Recipe
+from vlatool.optimize.summary import verdict_of
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.report import Measurement, Row
-from vlatool.runtime.policy import load_goldens
+from vlatool.runtime.golden import load_goldens
 from vlatool.stage.base import Context
 from vlatool.stage.finish import write_golden
 

@@ -29,7 +29,8 @@ from vlatool.bundle.manifest import FileRecord
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import DRAWN, Drawer, read_recording
 from vlatool.evaluate.recorded import run_recorded
-from vlatool.runtime.policy import Policy, load_goldens
+from vlatool.runtime.golden import load_goldens
+from vlatool.runtime.policy import Policy
 from vlatool.stage.base import Context
 
 Make = Callable[[Bundle, Path], Bundle]

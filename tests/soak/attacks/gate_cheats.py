@@ -65,7 +65,7 @@ from vlatool.stage.base import Context
 RECORDED_TEXTS = ((2, 3, 4, 7), (2, 3, 4, 8), (5, 7, 0, 0), (6, 8, 0, 0))
 FAST = {"latency": None}
 """A gate that times nothing: enough for what is wrong, not slow."""
-TIMED = {"latency": {"looks": [10], "pairs": 60, "margin": 0.25, "warmup": 5}, "size": None}
+TIMED = {"latency": {"interim_analyses": [10], "pairs": 60, "margin": 0.25, "warmup": 5}, "size": None}
 """A gate with a margin above what a busy machine and a policy of 50 us make of two equal bundles."""
 
 
@@ -182,7 +182,7 @@ def main() -> int:
                 wrong += told(title, *outcome, 1 if cheat.found_by else 3, cheat.found_by)
         for title, bundle in honest(known["tiny"], folder).items():
             if given.only in title:
-                gate = {"latency": {"margin": 1.0, "worst": 2.0, "looks": [10], "pairs": 60},
+                gate = {"latency": {"margin": 1.0, "worst": 2.0, "interim_analyses": [10], "pairs": 60},
                         "accuracy": {"max_drop": 0.5}, "size": {"margin": 1.0}}  # fmt: skip
                 wrong += told(title, *run(bundle.path, known["tiny"].path, gate_file(gate, folder / "gate.yaml")), 0)
         print(f"{wrong} otherwise than they must")

@@ -16,7 +16,7 @@ from vlatool.errors import DataError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import alone, run_recorded
 from vlatool.gate.config import AccuracyClaim
-from vlatool.gate.found import CONFIDENCE, Found, worst
+from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
 from vlatool.stats.intervals import paired_drop
@@ -52,7 +52,9 @@ class _Drop:
         return words
 
 
-def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = "") -> Found:
+def examine(
+    candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = ""
+) -> ClaimResult:
     """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
 
     Args:
@@ -69,18 +71,20 @@ def examine(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: 
         drops.append(_recorded(candidate, baseline, data, context, engine))
     if claim.episodes:
         drops.append(_closed_loop(candidate, baseline, claim, context, engine))
-    said = [each.told(claim.max_drop) for each in drops]
+    words = [lost.told(claim.max_drop) for lost in drops]
     measured = tuple(
-        Measurement(each.name, each.value, "1", samples=each.samples, low=finite(each.low), high=finite(each.high),
-                    confidence=CONFIDENCE, note=each.words)
-        for each in drops
+        Measurement(lost.name, lost.value, "1", samples=lost.samples, low=finite(lost.low), high=finite(lost.high),
+                    confidence=CONFIDENCE, note=lost.words)
+        for lost in drops
     )  # fmt: skip
-    baselines = tuple(found for each in drops for found in each.baseline if found.name in DECIDE)
+    baselines = tuple(number for lost in drops for number in lost.baseline if number.name in DECIDE)
     trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
-    verdict = "inconclusive" if trust.fails else worst(each.verdict(claim.max_drop) for each in drops)
-    unjudged = [warning for each in drops for warning in each.warnings]
-    told = [sentence.rstrip(".") for sentence in trust.sentences]
-    return Found("accuracy", verdict, "; ".join([*told, *said, *trust.warnings, *unjudged]), measured, baselines)
+    verdict = "inconclusive" if trust.fails else worst(lost.verdict(claim.max_drop) for lost in drops)
+    unjudged = [warning for lost in drops for warning in lost.warnings]
+    reservations = [sentence.rstrip(".") for sentence in trust.sentences]
+    return ClaimResult(
+        "accuracy", verdict, "; ".join([*reservations, *words, *trust.warnings, *unjudged]), measured, baselines
+    )
 
 
 def finite(bound: float) -> float | None:
@@ -97,13 +101,13 @@ def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
         DataError: when there are none and no episodes are asked for.
     """
     own = baseline.path / EVALUATION if EVALUATION in baseline.manifest.files else None
-    if (found := claim.data or own) is None and not claim.episodes:
+    if (data := claim.data or own) is None and not claim.episodes:
         raise DataError(
             f"Accuracy is claimed, but the baseline {baseline.path} carries no evaluation data (those of the candidate "
             "do not count) and no episodes are asked for.",
             "name recorded data (accuracy: data) or episodes in the gate, or set accuracy: null",
         )
-    return found
+    return data
 
 
 def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str) -> _Drop:

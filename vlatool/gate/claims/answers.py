@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from vlatool.data import DRAWN, OTHER, RECORDED
 from vlatool.gate.config import AnswersClaim
-from vlatool.gate.found import Found, worst
+from vlatool.gate.result import ClaimResult, worst
 from vlatool.gate.timed import Timed
 from vlatool.measurement.agreement import SEQUENCE, Agreement, Followed
 from vlatool.report import Measurement
@@ -19,17 +19,17 @@ KINDS = {
 }
 
 
-def examine(agreement: Agreement, timed: Timed, claim: AnswersClaim) -> Found:
+def examine(agreement: Agreement, timed: Timed, claim: AnswersClaim) -> ClaimResult:
     """Examine answers of the process that timed nothing, and those of all that did so far."""
     parts = [_steady(agreement, timed), *([] if claim.follows is None else [_follows(agreement, claim.follows)])]
-    told = sorted(parts, key=lambda part: ("fail", "inconclusive", "pass").index(part[0]))
+    ordered = sorted(parts, key=lambda part: ("fail", "inconclusive", "pass").index(part[0]))
     measured = [
-        Measurement("follows", each.correlation, "1", samples=each.samples,
-                    note=f"least correlation with the baseline's answers: {each.output}, {KINDS[each.kind]}")
-        for each in _least(agreement.followed)
+        Measurement("follows", followed.correlation, "1", samples=followed.samples,
+                    note=f"least correlation with the baseline's answers: {followed.output}, {KINDS[followed.kind]}")
+        for followed in _least(agreement.followed)
     ]  # fmt: skip
-    return Found("answers", worst(verdict for verdict, _ in parts), "; ".join(words for _, words in told),
-                 tuple(measured))  # fmt: skip
+    verdict, words = worst(verdict for verdict, _ in parts), "; ".join(words for _, words in ordered)
+    return ClaimResult("answers", verdict, words, tuple(measured))
 
 
 def _steady(agreement: Agreement, timed: Timed) -> tuple[str, str]:
@@ -64,5 +64,5 @@ def _least(followed: Sequence[Followed]) -> list[Followed]:
     Where there are recordings, observations that are drawn without any are far from what the policy is for, and say
     little of a copy in fewer bits.
     """
-    near = [each for each in followed if each.kind != DRAWN] or list(followed)
-    return sorted(near, key=lambda each: each.correlation)[:1]
+    near = [output for output in followed if output.kind != DRAWN] or list(followed)
+    return sorted(near, key=lambda output: output.correlation)[:1]

@@ -10,8 +10,8 @@ from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
 from vlatool.data import CALIBRATION, EVALUATION
 from vlatool.files.written import LEDGER
 from vlatool.gate.config import GrowthClaim, LatencyClaim
-from vlatool.gate.found import Found
 from vlatool.gate.inputs import MEMORY, Inputs
+from vlatool.gate.result import ClaimResult
 from vlatool.measurement.cold_start import cold_start
 from vlatool.report import Measurement
 from vlatool.stage.base import Context
@@ -35,7 +35,7 @@ def examine_memory(
     how: LatencyClaim,
     context: Context,
     inputs: Inputs | None = None,
-) -> Found:
+) -> ClaimResult:
     """Examine the peak memory of a fresh process that loads a bundle and infers on observations of all kinds.
 
     Args:
@@ -48,15 +48,15 @@ def examine_memory(
     for number in range(PROBES):
         context.tell("memory of each in fresh processes", number / PROBES)
         with inputs.file(OBSERVATIONS, MEMORY, number) if inputs else contextlib.nullcontext() as path:
-            for bundle, found in zip((candidate, baseline), peaks, strict=True):
+            for bundle, taken in zip((candidate, baseline), peaks, strict=True):
                 probed = cold_start(bundle.path, how.engine, how.threads, timeout=how.timeout, observations=path)
-                found.append(probed["peak_rss_mb"])
+                taken.append(probed.peak_rss_mb)
     mine, theirs = median(peaks[0]), median(peaks[1])
     note = f"load and some inferences, median of {PROBES} fresh processes"
     return judged("memory", theirs, Measurement("peak_rss", mine, "MB", samples=PROBES, note=note), claim)
 
 
-def examine_size(candidate: Bundle, baseline: Bundle, claim: GrowthClaim) -> Found:
+def examine_size(candidate: Bundle, baseline: Bundle, claim: GrowthClaim) -> ClaimResult:
     """Examine the bytes of the graphs and assets."""
     mine, theirs = (deployed_bytes(bundle) / 1e6 for bundle in (candidate, baseline))
     return judged("size", theirs, Measurement("size", mine, "MB", note="graphs and assets on disk"), claim)
@@ -72,10 +72,10 @@ def deployed_bytes(bundle: Bundle) -> int:
     return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)
 
 
-def judged(name: str, baseline: float, measured: Measurement, claim: GrowthClaim) -> Found:
+def judged(name: str, baseline: float, measured: Measurement, claim: GrowthClaim) -> ClaimResult:
     """Hold a number that hardly varies against that of the baseline."""
     growth = measured.value / baseline - 1
     kept = growth <= claim.margin + ROUNDING
     words = f"{measured.value:.1f} {measured.unit}, the baseline {baseline:.1f} {measured.unit} ({growth:+.1%}; "
     words += f"allowed: {claim.margin:+.1%})"
-    return Found(name, "pass" if kept else "fail", words, (measured,), (replace(measured, value=baseline),))
+    return ClaimResult(name, "pass" if kept else "fail", words, (measured,), (replace(measured, value=baseline),))

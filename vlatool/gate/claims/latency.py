@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from vlatool.gate.config import LatencyClaim
-from vlatool.gate.found import CONFIDENCE, Found, worst
+from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.gate.timed import Timed
 from vlatool.measurement.turns import CONFIRM
 from vlatool.report import Measurement
@@ -19,57 +19,57 @@ AGREE = CONFIRM - 1
 """Pairs of ``CONFIRM`` that must be slow: between equal bundles, 19 of 20 are so once in 50,000 times."""
 
 
-def examine_all(timed: Timed, claim: LatencyClaim) -> list[Found]:
+def examine_all(timed: Timed, claim: LatencyClaim) -> list[ClaimResult]:
     """Examine the slowdown at the number of threads of ``timed``, and at each further one that the claim names."""
-    found = [examine(timed, claim)]
+    results = [examine(timed, claim)]
     for threads in claim.also_threads:
-        part = examine(timed.at_threads(threads), claim)
-        measured = tuple(replace(each, name=f"{each.name}_{threads}_threads") for each in part.measurements)
-        found.append(replace(part, claim=f"{part.claim}, {threads} threads", measurements=measured))
-    return found
+        result = examine(timed.at_threads(threads), claim)
+        measured = tuple(replace(number, name=f"{number.name}_{threads}_threads") for number in result.measurements)
+        results.append(replace(result, claim=f"{result.claim}, {threads} threads", measurements=measured))
+    return results
 
 
-def examine(timed: Timed, claim: LatencyClaim) -> Found:
+def examine(timed: Timed, claim: LatencyClaim) -> ClaimResult:
     """Examine the slowdown, process by process until it is decided."""
 
     def ratios(number: int) -> tuple[float, float]:
         pairs = timed.process(number)
         return pairs.log_ratio, pairs.mean_log_ratio
 
-    decisions, found = jointly(ratios, len(STATISTICS), claim.margin, claim.looks)
+    decisions, processes = jointly(ratios, len(STATISTICS), claim.margin, claim.interim_analyses)
     measured = tuple(
         Measurement(
-            name, decision.ratio, "x", samples=len(found), low=decision.low, high=decision.high, confidence=CONFIDENCE,
-            note=f"candidate over baseline, {what}, fresh processes with both, Hodges-Lehmann",
+            name, decision.ratio, "x", samples=len(processes), low=decision.low, high=decision.high,
+            confidence=CONFIDENCE, note=f"candidate over baseline, {what}, fresh processes with both, Hodges-Lehmann",
         )
         for (name, what), decision in zip(TOLD, decisions, strict=True)
     )  # fmt: skip
     verdicts = [decision.verdict for decision in decisions]
     slow = slow_observations(timed, claim.worst)
     if slow:
-        words = f"{len(slow)} of {len(found)} processes found an observation that is slower by more than "
+        words = f"{len(slow)} of {len(processes)} processes found an observation that is slower by more than "
         words += f"{claim.worst:.0%} each time: {slow[0]}"
-        return Found("latency", "fail", f"{words}; {told(decisions[0])}", measured)
+        return ClaimResult("latency", "fail", f"{words}; {sentence_of(decisions[0])}", measured)
     chosen = worst(verdicts)
-    return Found("latency", chosen, said(decisions, chosen), measured)
+    return ClaimResult("latency", chosen, reason_of(decisions, chosen), measured)
 
 
 def slow_observations(timed: Timed, margin: float) -> list[str]:
     """Return the observations, in words, on which the candidate is slower by more than a margin again and again."""
     limit = math.log1p(margin)
-    return [each.slow_input for each in timed.pairs if sum(ratio > limit for ratio in each.slow) >= AGREE]
+    return [pairs.slow_input for pairs in timed.pairs if sum(ratio > limit for ratio in pairs.slow) >= AGREE]
 
 
-def said(decisions: list[Decision], verdict: str) -> str:
+def reason_of(decisions: list[Decision], verdict: str) -> str:
     """Return what decides in words: the median, and the mean where it is the one that fails or cannot decide."""
     middle, mean = decisions
     if middle.verdict == verdict or mean.verdict != verdict:
         other = f"the mean over observations {slower(mean.ratio)} ({change(mean.low)} to {change(mean.high)})"
-        return f"{told(middle)}; {other}"
-    return f"the mean over observations is {told(mean)}; the median alone is {slower(middle.ratio)}"
+        return f"{sentence_of(middle)}; {other}"
+    return f"the mean over observations is {sentence_of(mean)}; the median alone is {slower(middle.ratio)}"
 
 
-def told(decision: Decision) -> str:
+def sentence_of(decision: Decision) -> str:
     """Return a decision in words: the ratio, what it lies between, and what the processes could have found."""
     words = f"{slower(decision.ratio)} ({change(decision.low)} to {change(decision.high)}, {decision.processes} "
     words += f"processes; allowed: {change(1 + decision.margin)}); "

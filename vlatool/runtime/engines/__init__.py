@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def reference() -> type[ReferenceSession]:
-    """Return the session that computes each operator as it is written: what engines are held against.
+    """Return the session that computes each operator as it is written: the reference that engines are compared with.
 
     Raises:
         MissingExtra: when the library that computes so is not installed.

@@ -13,7 +13,7 @@ from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, MOVES, MOVING, QUANT
 
 
 class OpenvinoProfiled:
-    """OpenVINO counts the time of every node of a compiled model when it is told to."""
+    """OpenVINO counts the time of every node of a compiled model on request."""
 
     def __init__(self, openvino: Any, path: Path, compiled: Callable[[Any, Any], Any]) -> None:
         try:
@@ -54,7 +54,7 @@ def fused_names(compiled: Any, known: Mapping[str, str]) -> dict[str, tuple[str,
         compiled: The compiled model.
         known: Name of each node as it was read -> its operator type.
     """
-    found: dict[str, tuple[str, str]] = {}
+    names: dict[str, tuple[str, str]] = {}
     for node in compiled.get_runtime_model().get_ops():
         about = node.get_rt_info()
         if str(about["layerType"].astype(str)) != "Subgraph":
@@ -63,8 +63,8 @@ def fused_names(compiled: Any, known: Mapping[str, str]) -> dict[str, tuple[str,
         computing = [name for name in inside if not _is_quantizer(name) and known[name] != "FakeQuantize"]
         product = next((name for name in computing if known[name] == "MatMul"), "")
         if computing:
-            found[node.get_friendly_name()] = (product or computing[0], "Subgraph (MatMul)" if product else "Subgraph")
-    return found
+            names[node.get_friendly_name()] = (product or computing[0], "Subgraph (MatMul)" if product else "Subgraph")
+    return names
 
 
 def _is_quantizer(name: str) -> bool:

@@ -19,11 +19,7 @@ CONTAINERS = ("If", "Loop", "Scan")
 class OrtProfiled:
     """ONNX Runtime writes a trace file of every node of every run."""
 
-    def __init__(self, ort: Any, path: Path, threads: int, scratch: Path, left_out: list[str]) -> None:
-        options = ort.SessionOptions()
-        options.log_severity_level = 3
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
+    def __init__(self, ort: Any, path: Path, options: Any, scratch: Path, left_out: list[str]) -> None:
         options.enable_profiling = True
         options.profile_file_prefix = str(scratch)
         try:
@@ -40,16 +36,16 @@ class OrtProfiled:
     def times(self) -> list[dict[Node, float]]:
         events = json.loads(Path(self._session.end_profiling()).read_text(encoding="utf-8"))
         starts = sorted(event["ts"] for event in events if event["name"] == "model_run")
-        found: list[dict[Node, float]] = [{} for _ in starts]
+        runs: list[dict[Node, float]] = [{} for _ in starts]
         for event in events:
             name, about = event["name"], event.get("args", {})
             if event["cat"] != "Node" or not name.endswith("_kernel_time") or about["op_name"] in CONTAINERS:
                 continue
-            dtypes = " ".join(next(iter(each)) for each in about.get("input_type_shape", ()) if each)
+            dtypes = " ".join(next(iter(tensor)) for tensor in about.get("input_type_shape", ()) if tensor)
             key = (name.removesuffix("_kernel_time"), about["op_name"], dtypes)
-            run = found[bisect_right(starts, event["ts"]) - 1]
+            run = runs[bisect_right(starts, event["ts"]) - 1]
             run[key] = run.get(key, 0.0) + event["dur"]
-        return found
+        return runs
 
 
 def precision(node: Node) -> str:

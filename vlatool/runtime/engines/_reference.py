@@ -1,7 +1,7 @@
 """What a graph says: ONNX Runtime on the CPU, which computes each operator as it is written.
 
-No engine to run a robot on, but the one that others are held against: an engine that rewrites a graph may compute other
-numbers than the graph says, and an answer of its own would not show it.
+Not an engine to run a robot on, but the one that others are compared with: an engine that rewrites a graph may compute
+other numbers than the graph says, and its own answer would not show it.
 
 Where integer operators saturate, they do so in a session that rewrites nothing, too, and a saturated answer is not what
 the graph says. There the option that makes them exact is set, with the rewriting that it takes and no more
@@ -23,27 +23,20 @@ class ReferenceSession(OrtCpuSession):
     optimized = False
 
     @staticmethod
-    def _ways(ort: Any, threads: int | None) -> list[Any]:
+    def _option_sets(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
-        wanted = [True, False] if _exact(ort) == arithmetic.EXACT_BY_OPTION else [False]
-        ways = [session_options(ort, threads) for _ in wanted]
-        for options, precise in zip(ways, wanted, strict=True):
-            arithmetic.as_written(ort, options, precise)
-        return ways
+        exact_by_option = arithmetic.ort_exactness(ort, written=True) == arithmetic.EXACT_BY_OPTION
+        option_sets = []
+        for precise in [True, False] if exact_by_option else [False]:
+            option_sets.append(session_options(ort, threads))
+            arithmetic.as_written(ort, option_sets[-1], precise)
+        return option_sets
 
     @staticmethod
     def arithmetic() -> str:
-        """Say whether integer products of the reference are exact on this machine, or saturate.
+        """Return whether integer products of the reference are exact on this machine, or saturate.
 
         Raises:
             MissingExtra: when onnxruntime is not installed.
         """
-        return _exact(require("onnxruntime", "ort"))
-
-
-def _exact(ort: Any) -> str:
-    plain = arithmetic.said(arithmetic.ort_product(ort, written=True))
-    if plain != arithmetic.SATURATING:
-        return plain
-    exact = arithmetic.ort_product(ort, precise=True, written=True) == arithmetic.WANTED
-    return arithmetic.EXACT_BY_OPTION if exact else plain
+        return arithmetic.ort_exactness(require("onnxruntime", "ort"), written=True)

@@ -11,7 +11,7 @@ SEQUENCE = 2
 
 
 def joins_a_sequence(model: Any) -> bool:
-    """Say whether two values meet, one of which comes from a sequence of products of matrices.
+    """Return whether two values meet, one of which comes from a sequence of products of matrices.
 
     OpenVINO (2026.4) generates one kernel for Linear, GELU, Linear on matrices. Where the sum of a residual connection
     behind it does not fit into that kernel, as with a bias in both, it reads the kernel as one that it could still add
@@ -23,13 +23,13 @@ def joins_a_sequence(model: Any) -> bool:
     products: dict[str, int] = {}  # of what varies with an input: how many products without anything else between
     for node in model.get_ordered_ops():
         name = node.get_friendly_name()
-        given = [port.get_node().get_friendly_name() for port in node.input_values()]
-        varying = [each for each in given if each in products]
+        inputs = [port.get_node().get_friendly_name() for port in node.input_values()]
+        varying = [value for value in inputs if value in products]
         if node.get_type_name() == "Parameter":
             products[name] = 0
         elif varying:
-            known = max(products[each] for each in varying)
-            products[name] = _continued(node, known, given[-1] not in products)
+            known = max(products[value] for value in varying)
+            products[name] = _continued(node, known, inputs[-1] not in products)
             if len(varying) > 1 and known >= SEQUENCE and products[name]:
                 return True
     return False

@@ -33,13 +33,13 @@ INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {
 GRACE_MS = 1000
 """How long a run that is cancelled may take to end."""
 HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
-"""What OpenVINO is told to compute in: left alone it silently takes bfloat16 where the processor has it."""
+"""What OpenVINO is asked to compute in: left alone it silently takes bfloat16 where the processor has it."""
 PLAIN = {"SNIPPETS_MODE": "DISABLE"}
 """One kernel for each operator, none generated for several."""
 NO_KERNEL = ("bad combination", "inner product")
 """What OpenVINO says of a processor without the instructions that a graph needs."""
 PARTIAL_BLOCK = "cannot be divided by block_size"
-"""What OpenVINO says of a layer whose inputs are no whole number of blocks."""
+"""What OpenVINO says of a layer whose inputs are not a whole number of blocks."""
 
 
 class OpenvinoSession(Engine):
@@ -52,10 +52,10 @@ class OpenvinoSession(Engine):
         path: The ONNX file; external data is found beside it.
         threads: Threads; the cores that this process may use when None.
         compute: Dtype of what is not quantized: ``float32`` (also when empty) or ``bfloat16``.
-        opened: What is opened in the place of ``path``: the content of the file, or another name of it.
+        opened: What is opened instead of ``path``: the content of the file, or another name of it.
 
     Raises:
-        GraphError: when OpenVINO refuses the file or computes in another dtype than it was told to.
+        GraphError: when OpenVINO refuses the file or computes in another dtype than asked for.
         MissingExtra: when openvino is not installed.
     """
 
@@ -76,16 +76,16 @@ class OpenvinoSession(Engine):
     ) -> None:
         openvino = require("openvino", "openvino")
         settings = settings_for(threads, compute)
-        wanted = path if opened is None else opened
+        content = path if opened is None else opened
         try:
             core = openvino.Core()
-            model = core.read_model(io.BytesIO(wanted) if isinstance(wanted, bytes) else str(wanted))
+            model = core.read_model(io.BytesIO(content) if isinstance(content, bytes) else str(content))
             declared = [[port.get_any_name() for port in ports] for ports in (model.inputs, model.outputs)]
             self._compiled = compiled(core, model, settings)
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
-            words = f"OpenVINO {version_of(openvino)} refuses {path}: {_last_line(error)}"
-            raise GraphError(words, _remedy(error) or _without_float8(wanted)) from error
+            words = f"OpenVINO {self.version()} refuses {path}: {_last_line(error)}"
+            raise GraphError(words, _remedy(error) or _without_float8(content)) from error
         self.path = path
         self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
         if self.precision != HINTS[compute]:
@@ -95,11 +95,10 @@ class OpenvinoSession(Engine):
             )
         ports = self._compiled.inputs, self._compiled.outputs
         self._inputs, outputs = (
-            dict(zip(names, each, strict=True)) for names, each in zip(declared, ports, strict=True)
+            dict(zip(names, side, strict=True)) for names, side in zip(declared, ports, strict=True)
         )
         self.outputs = list(outputs)
         self._outputs = [(name, number) for number, name in enumerate(outputs)]
-        self.inputs = {name: _described(port) for name, port in self._inputs.items()}
         self.takes = {name: _port(port) for name, port in self._inputs.items()}
         self.gives = {name: _port(port) for name, port in outputs.items()}
         self.deadline: float | None = None
@@ -151,7 +150,7 @@ class OpenvinoSession(Engine):
         raise TimeoutError
 
     def _bound(self, openvino: Any) -> dict[str, NDArray[Any]]:
-        """Give the request arrays of ours as its inputs, once; none when a shape is dynamic or a type not numpy's.
+        """Set our own arrays as the request's inputs, once; none when a shape is dynamic or a type not numpy's.
 
         Python's ``infer(feeds)`` checks and wraps every array at every call.
         """
@@ -166,7 +165,7 @@ class OpenvinoSession(Engine):
         return buffers
 
     def _fill(self, feeds: Mapping[str, Any]) -> bool:
-        """Copy the feeds into the request's inputs; say no, for OpenVINO to name the mistake, when one does not fit."""
+        """Copy the feeds into the request's inputs; False when one does not fit, so that OpenVINO names the mistake."""
         if len(feeds) != len(self._buffers):
             return False
         for name, buffer in self._buffers.items():
@@ -179,32 +178,18 @@ class OpenvinoSession(Engine):
     def _check(self, feeds: Mapping[str, Any]) -> None:
         """Refuse what OpenVINO takes: a missing input (an earlier run's is left there), another dtype (it casts)."""
         for name, port in self._inputs.items():
-            wanted = np.dtype(port.element_type.to_dtype())
+            dtype = np.dtype(port.element_type.to_dtype())
             value = feeds.get(name)
-            if not isinstance(value, np.ndarray) or value.dtype != wanted:
+            if not isinstance(value, np.ndarray) or value.dtype != dtype:
                 got = "missing" if value is None else str(getattr(value, "dtype", type(value).__name__))
-                raise GraphError(f"OpenVINO failed in {self.path.name}: the input '{name}' is {got}; wanted {wanted}.")
-            axes = self.inputs[name][0]
-            fits = len(axes) == value.ndim and all(isinstance(axis, str) or axis == got for axis, got in zip(
-                axes, value.shape, strict=True))  # fmt: skip
-            if not fits:
-                raise GraphError(
-                    f"OpenVINO failed in {self.path.name}: the input '{name}' has the shape {list(value.shape)}; "
-                    f"wanted {axes}."
-                )
-
-    @staticmethod
-    def version() -> str:
-        """Version of the engine.
-
-        Raises:
-            MissingExtra: when openvino is not installed.
-        """
-        return version_of(require("openvino", "openvino"))
+                raise GraphError(f"OpenVINO failed in {self.path.name}: the input '{name}' is {got}; wanted {dtype}.")
+            actual, expected = Port(value.shape, str(dtype)), self.takes[name]
+            if not actual.fits(expected):
+                raise GraphError(f"OpenVINO failed in {self.path.name}: '{name}' is {actual}; wanted {expected}.")
 
     @staticmethod
     def arithmetic() -> str:
-        """Say whether integer products are exact on this machine, or saturate. Takes a fraction of a second.
+        """Return whether integer products are exact on this machine, or saturate. Takes a fraction of a second.
 
         Raises:
             MissingExtra: when openvino is not installed.
@@ -213,7 +198,7 @@ class OpenvinoSession(Engine):
         try:
             core = openvino.Core()
             compiled = core.compile_model(core.read_model(io.BytesIO(arithmetic.model())), DEVICE, settings_for(1, ""))
-            return arithmetic.said(float(compiled(arithmetic.operand())[0].min()))
+            return arithmetic.exactness(float(compiled(arithmetic.operand())[0].min()))
         except Exception:  # the seam: older processors lack the kernels of any int8 product
             return arithmetic.UNKNOWN
 
@@ -224,19 +209,19 @@ class OpenvinoSession(Engine):
         With matrix units (AMX) products are written as convolutions, too, as ``quantize._conv1x1`` says; where int8
         products saturate, there is a plan of 7 bits.
         """
-        found: dict[str, Stages] = {}
+        plans: dict[str, Stages] = {}
         forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if has(*AMX) else {"": {}}
         bfloat16 = has(*BF16)
         for form, how in forms.items() if bfloat16 else ():
-            found[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
+            plans[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
         rest = {"compute": "bfloat16"} if bfloat16 else {}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
             for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
                 stage = {"layout": "openvino", **rest, **how, **options}
-                found[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
+                plans[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
         if calibrated and has("avx2") and not has(*VNNI):
-            found["openvino_int8_reduced"] = ({"quantize.static_int8": {"layout": "openvino", "reduce_range": True}},)
-        return found
+            plans["openvino_int8_reduced"] = ({"quantize.static_int8": {"layout": "openvino", "reduce_range": True}},)
+        return plans
 
     @classmethod
     def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
@@ -267,19 +252,17 @@ class OpenvinoSession(Engine):
 
 
 def _remedy(error: Exception) -> str:
-    """Return what to do where OpenVINO takes no such graph, or has no kernel for this processor.
+    """Return what to do where OpenVINO refuses such a graph, or has no kernel for this processor.
 
     The kernel may also be missing in what a variable confines it to.
     """
     if PARTIAL_BLOCK in str(error):
-        return "OpenVINO takes whole blocks alone: use the engine ort_cpu, or leave the narrower layers out (--exclude)"
+        return "OpenVINO only takes whole blocks: use the engine ort_cpu, or leave the narrower layers out (--exclude)"
     if not any(sign in str(error) for sign in NO_KERNEL):
         return ""
     lacks = "instructions that OpenVINO needs for it: quantize with --layout ort"
     if confined := onednn_max_cpu_isa():
-        return (
-            f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if it stands for no board"
-        )
+        return f"{MAX_CPU_ISA} confines OpenVINO to {confined}, which lacks {lacks}, or unset it if no board is meant"
     return f"this processor lacks {lacks}"
 
 
@@ -325,16 +308,6 @@ def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
         "PERFORMANCE_HINT": "LATENCY",
         "ENABLE_CPU_PINNING": False,
     }
-
-
-def version_of(openvino: Any) -> str:
-    """Return the release number without the build."""
-    return str(openvino.__version__).partition("-")[0]
-
-
-def _described(port: Any) -> tuple[list[Any], str]:
-    shape = [dimension.get_length() if dimension.is_static else str(dimension) for dimension in port.partial_shape]
-    return shape, str(port.element_type.get_type_name())
 
 
 def _port(port: Any) -> Port:

@@ -51,10 +51,10 @@ class OrtCpuSession(Engine):
         path: The ONNX file; external data is found beside it.
         threads: Intra-op threads; the cores that this process may use when None.
         compute: ``float32`` or empty.
-        opened: What is opened in the place of ``path``: the content of the file, or another name of it.
+        opened: What is opened instead of ``path``: the content of the file, or another name of it.
 
     Raises:
-        GraphError: when ONNX Runtime refuses the file, opened it on another provider, or shall compute in another
+        GraphError: when ONNX Runtime refuses the file, opened it on another provider, or is to compute in another
             dtype: it has no other one.
         MissingExtra: when onnxruntime is not installed.
     """
@@ -88,10 +88,9 @@ class OrtCpuSession(Engine):
         self.deadline: float | None = None
         self._run = self._session.run
         self.outputs = [node.name for node in self._session.get_outputs()]
-        self.inputs = {node.name: (list(node.shape), str(node.type)) for node in self._session.get_inputs()}
         self.takes = {node.name: _port(node) for node in self._session.get_inputs()}
         self.gives = {node.name: _port(node) for node in self._session.get_outputs()}
-        self._bound = _Bound.of(self._session, ort)
+        self._bound = _BoundBuffers.of(self._session, ort)
         self.bound = self._bound is not None
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -135,18 +134,18 @@ class OrtCpuSession(Engine):
 
     @classmethod
     def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
-        """Open a session, with other options where the first break the graph; their error is the one that is told."""
-        ways = cls._ways(ort, threads)
+        """Open a session, with other options where the first break the graph; the first error is reported."""
+        first, *others = cls._option_sets(ort, threads)
         try:
-            return _session(ort, model, ways[0])
+            return _session(ort, model, first)
         except Exception:
-            for way in ways[1:]:
+            for options in others:
                 with contextlib.suppress(Exception):
-                    return _session(ort, model, way)
+                    return _session(ort, model, options)
             raise
 
     @staticmethod
-    def _ways(ort: Any, threads: int | None) -> list[Any]:
+    def _option_sets(ort: Any, threads: int | None) -> list[Any]:
         """Return the options to try, one after the other.
 
         Exact products of uint8 activations refuse a graph with int8 ones, which are exact as long as they stay int8.
@@ -154,36 +153,21 @@ class OrtCpuSession(Engine):
         no such type.
         """
         saturates = arithmetic.ort_product(ort) < arithmetic.WANTED
-        first = [arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]
-        entries = [*first, arithmetic.UNFUSED]
-        ways = [session_options(ort, threads) for _ in entries]
-        for options, entry in zip(ways, entries, strict=True):
+        option_sets = []
+        for entry in (*([arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]), arithmetic.UNFUSED):
+            option_sets.append(session_options(ort, threads))
             if entry is not None:
-                options.add_session_config_entry(*entry)
-        return ways
-
-    @staticmethod
-    def version() -> str:
-        """Version of the engine.
-
-        Raises:
-            MissingExtra: when onnxruntime is not installed.
-        """
-        return str(require("onnxruntime", "ort").__version__)
+                option_sets[-1].add_session_config_entry(*entry)
+        return option_sets
 
     @staticmethod
     def arithmetic() -> str:
-        """Say whether integer products are exact on this machine, or saturate.
+        """Return whether integer products are exact on this machine, or saturate.
 
         Raises:
             MissingExtra: when onnxruntime is not installed.
         """
-        ort = require("onnxruntime", "ort")
-        plain = arithmetic.said(arithmetic.ort_product(ort))
-        if plain != arithmetic.SATURATING:
-            return plain
-        exact = arithmetic.ort_product(ort, precise=True) == arithmetic.WANTED
-        return arithmetic.EXACT_BY_OPTION if exact else plain
+        return arithmetic.ort_exactness(require("onnxruntime", "ort"))
 
     @classmethod
     def execution_providers(cls) -> list[str]:
@@ -197,10 +181,10 @@ class OrtCpuSession(Engine):
     @classmethod
     def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
         """Return int8 at run time, and with ranges from a recording: plain, by their error, attention too."""
-        found: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
+        plans: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
-            found[f"static_int8{name}"] = ({"quantize.static_int8": dict(options)},)
-        return found
+            plans[f"static_int8{name}"] = ({"quantize.static_int8": dict(options)},)
+        return plans
 
     @classmethod
     def profiled(cls, path: Path, threads: int, compute: str, scratch: Path) -> Profiled:
@@ -209,7 +193,8 @@ class OrtCpuSession(Engine):
         Raises:
             GraphError: when ONNX Runtime refuses it.
         """
-        return OrtProfiled(cls.library(), path, threads, scratch, left_out(path))
+        ort = cls.library()
+        return OrtProfiled(ort, path, session_options(ort, threads), scratch, left_out(path))
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
@@ -224,10 +209,10 @@ class OrtCpuSession(Engine):
         return SIGNED_PRODUCT if signed and platform.machine() in X86 else ""
 
 
-class _Bound:
+class _BoundBuffers:
     """Buffers that are bound to the inputs and outputs of a small graph once, for all runs.
 
-    ``run()`` of ONNX Runtime wraps every array anew; writing into bound buffers instead takes some 20 us less right
+    ``run()`` of ONNX Runtime wraps every array again; writing into bound buffers instead takes some 20 us less right
     after an inference, when the processor's caches hold the network (``vlatool benchmark overhead``). Large tensors
     would pay more for the copy than that.
     """
@@ -246,7 +231,7 @@ class _Bound:
             self._start, self._bindings = session._sess.run_with_iobinding, binding._iobinding
 
     @classmethod
-    def of(cls, session: Any, ort: Any) -> _Bound | None:
+    def of(cls, session: Any, ort: Any) -> _BoundBuffers | None:
         """Return buffers for a session, or None when a shape is dynamic, a type is not numpy's, or they are large."""
         inputs = {node.name: _buffer(node) for node in session.get_inputs()}
         outputs = {node.name: _buffer(node) for node in session.get_outputs()}
@@ -258,7 +243,7 @@ class _Bound:
         return cls(session, ort, small, results)
 
     def takes(self, feeds: Mapping[str, Any]) -> bool:
-        """Copy the feeds into the buffers; say no, for ONNX Runtime to name the mistake, when one does not fit."""
+        """Copy the feeds into the buffers; False when one does not fit, so that ONNX Runtime names the mistake."""
         for name, buffer, shape, dtype in self._inputs:
             value = feeds.get(name)
             if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype != dtype:
@@ -274,8 +259,8 @@ class _Bound:
 
 def _port(node: Any) -> Port:
     dtype = NUMPY_OF.get(str(node.type))
-    told = str(node.type) if dtype is None else dtype.name
-    return port(node.shape, told) if node.shape else Port(None, told)  # a scalar looks like an unknown number of axes
+    name = str(node.type) if dtype is None else dtype.name
+    return port(node.shape, name) if node.shape else Port(None, name)  # a scalar looks like an unknown number of axes
 
 
 def _buffer(node: Any) -> Array | None:
@@ -310,9 +295,9 @@ def left_out(model: Path | bytes) -> list[str]:
 
 
 def _session(ort: Any, model: Path | bytes, options: Any) -> Any:
-    wanted = model if isinstance(model, bytes) else str(model)
-    given = {"disabled_optimizers": left_out(model)}
-    session = ort.InferenceSession(wanted, options, providers=[PROVIDER], enable_fallback=0, **given)
+    content = model if isinstance(model, bytes) else str(model)
+    optimizers = {"disabled_optimizers": left_out(model)}
+    session = ort.InferenceSession(content, options, providers=[PROVIDER], enable_fallback=0, **optimizers)
     if getattr(session, "_model_bytes", None):
         session._model_bytes = b""  # Python's wrapper would keep the whole content for a fallback, which is off
     return session

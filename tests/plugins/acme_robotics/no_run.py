@@ -1,0 +1,7 @@
+"""A method that was begun."""
+
+from vlatool.quantize import Quantization
+
+
+class NoRun(Quantization):
+    """Do nothing yet."""

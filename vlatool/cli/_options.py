@@ -1,0 +1,22 @@
+"""Options and arguments that several commands have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlatool.cli import _complete
+
+BundleOrSource = Annotated[
+    str, typer.Argument(help="a bundle or a policy source", show_default=False, autocompletion=_complete.sources)
+]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON on stdout")]
+Force = Annotated[bool, typer.Option("--force", help="replace an output that exists")]
+Raw = Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")]
+ReportFolder = Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")]
+BundlePath = Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)]
+ProfileName = Annotated[
+    str, typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles)
+]

@@ -1,0 +1,89 @@
+"""What the processes of a benchmark are asked to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the measured processes may use.
+
+    Args:
+        cpus: Numbers of the processors; every one that the process may use anyway when empty.
+        cores: How many of them, the first ones; all when 0.
+        memory_mb: Memory of a process in MB (10^6 bytes); 0 is no limit.
+        cgroup: Directory of the control group that holds the limit; empty when the process limits itself.
+    """
+
+    cpus: tuple[int, ...] = ()
+    cores: int = 0
+    memory_mb: float = 0.0
+    cgroup: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.cpus or self.cores or self.memory_mb)
+
+
+@dataclass(frozen=True)
+class LatencyJob:
+    """A benchmark of the latency.
+
+    Args:
+        bundles: Directories; the first is the reference of ratios.
+        engine: Of the runtime; that which each bundle was made for when empty.
+        threads: Intra-op threads.
+        iterations: Calls of each that count, at least.
+        duration: Seconds that the calls of each last, at least; with ``iterations`` the later of both.
+        warmup: Calls before the first that counts.
+        rate: Ticks in a second of a control loop; 0 calls back to back. One bundle only.
+        phases: Also time the parts of an inference.
+        cold: Fresh processes for the cold start of each.
+        check: Also look for answers that differ between runs, and for answers from memory.
+        limits: Of every process.
+    """
+
+    bundles: tuple[str, ...]
+    engine: str = ""
+    threads: int = 1
+    iterations: int = 200
+    duration: float = 0.0
+    warmup: int = 10
+    rate: float = 0.0
+    phases: bool = False
+    cold: int = 0
+    check: bool = True
+    limits: Limits = Limits()
+
+
+@dataclass(frozen=True)
+class WorkerJob:
+    """What the agent asks of the worker.
+
+    Args:
+        job: The benchmark.
+        named: Folders whose code the user lets run (``trust.named_so_far``).
+    """
+
+    job: LatencyJob
+    named: tuple[tuple[Any, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class ColdStartJob:
+    """One cold start.
+
+    Args:
+        bundle: Directory.
+        engine: Of the runtime; that which the bundle was made for when empty.
+        threads: Intra-op threads.
+        begun_ns: When the process was started, on the clock that is the same in every process of a machine.
+        observations: File of observations (``save_drawn``) to infer on after the golden one; none when empty.
+    """
+
+    bundle: str
+    engine: str
+    threads: int
+    begun_ns: int
+    observations: str = ""

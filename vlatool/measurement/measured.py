@@ -1,0 +1,131 @@
+"""What the processes of a benchmark answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from vlatool.measurement.answers import AnswerCheck, Memory
+from vlatool.measurement.cold_start import ColdStart
+from vlatool.telemetry import Recorded
+
+
+@dataclass(frozen=True)
+class GraphEngine:
+    """What runs a graph, as its session says.
+
+    Args:
+        graph: Its name in the bundle.
+        engine: Of the runtime.
+        version: Of the engine's library; empty when it does not tell.
+        providers: What the library runs it on.
+        computes_in: The dtype of what is not quantized.
+        macs_in: The share of the multiplications in each precision, in words.
+    """
+
+    graph: str
+    engine: str
+    version: str
+    providers: str
+    computes_in: str
+    macs_in: str
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A part of an inference: how often an action takes it, a call's median, and its share of the action's time."""
+
+    name: str
+    calls: int
+    p50_ms: float
+    share_percent: float
+
+
+@dataclass(frozen=True)
+class Pace:
+    """What a control loop saw.
+
+    Args:
+        period_ms: Between two ticks.
+        wakeup_ms: How late the loop woke up for each tick that it slept until.
+        age_ms: How old the observation behind the newest action was at each tick.
+        misses: Ticks whose action came after the next tick was due.
+        passed_over: Ticks that began and ended while the policy computed.
+        inferences: How many served all ticks.
+        effective_sample_size: Independent samples that the ticks are worth, since some share an inference.
+    """
+
+    period_ms: float
+    wakeup_ms: tuple[float, ...]
+    age_ms: tuple[float, ...]
+    misses: int
+    passed_over: int
+    inferences: int
+    effective_sample_size: float
+
+
+@dataclass(frozen=True)
+class PolicyRun:
+    """What was measured of one policy.
+
+    Args:
+        name: Of its stage; with its directory where two are of one stage.
+        blocks_ms: Milliseconds of each call, by round.
+        at_s: When each call began, in seconds since the run did.
+        engine: Of the runtime.
+        engines: For each graph what runs it; none in eager torch.
+        golden_error: Relative difference of the golden action; None without one.
+        answers: Of the timed calls; None when they were not looked at.
+        memory: None when it was not looked for, or cannot be.
+        phases: The parts of an inference; none when they were not timed.
+        pace: Of a control loop; None for calls back to back.
+        cold: Of each fresh process.
+        cold_error: Why there is none, where one was asked for and failed.
+    """
+
+    name: str
+    blocks_ms: tuple[tuple[float, ...], ...]
+    at_s: tuple[float, ...]
+    engine: str = ""
+    engines: tuple[GraphEngine, ...] = ()
+    golden_error: float | None = None
+    answers: AnswerCheck | None = None
+    memory: Memory | None = None
+    phases: tuple[Phase, ...] = ()
+    pace: Pace | None = None
+    cold: tuple[ColdStart, ...] = ()
+    cold_error: str = ""
+
+    @property
+    def samples(self) -> list[float]:
+        """Milliseconds of all calls in the order in which they were taken."""
+        return [value for block in self.blocks_ms for value in block]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a benchmark found.
+
+    Args:
+        begun_s, ended_s: The timed part, on the clock of ``telemetry``.
+        cpu_s, wall_s, switches: User and system time, duration and involuntary context switches of the timed part.
+        canary_ms: A fixed piece of work, timed now and then (``clock_drift``).
+        policies: One for each bundle.
+        host: The machine before the run (``before_run``).
+        telemetry: What the board told during the run.
+        log: The end of what the processes wrote to standard error.
+        target: The other machine, where one was measured on: python, architecture, kernel and packages.
+    """
+
+    begun_s: float
+    ended_s: float
+    cpu_s: float
+    wall_s: float
+    switches: int
+    canary_ms: tuple[float, ...]
+    policies: tuple[PolicyRun, ...]
+    host: Mapping[str, Any] = field(default_factory=dict)
+    telemetry: Recorded | None = None
+    log: str = ""
+    target: Mapping[str, Any] = field(default_factory=dict)

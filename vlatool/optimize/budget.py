@@ -1,0 +1,79 @@
+"""What a plan may cost in accuracy, in a measure that recorded observations give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from vlatool.errors import RecipeError, nearest
+from vlatool.optimize.recipe import Limits
+from vlatool.report import Measurement, Row
+
+if TYPE_CHECKING:
+    from vlatool.bundle.spec import PolicySpec
+
+PROXY = 0.05
+"""Error against float32 up to which a plan is worth an evaluation, where the closed loop or the expert decides."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a plan may cost in accuracy, in a measure that recorded observations give.
+
+    Args:
+        name: The measurement, or ``unit:UNIT`` for the worst action element of that unit.
+        value: The largest allowed.
+    """
+
+    name: str
+    value: float
+
+    def of(self, row: Row) -> Measurement | None:
+        """Return the measurement of a row that the budget is about, None when there is none."""
+        if self.name == "disagreement":
+            agreement = row.get("agreement_baseline")
+            return None if agreement is None else replace(agreement, name=self.name, value=1.0 - agreement.value)
+        if self.name.startswith("unit:"):
+            unit = self.name.partition(":")[2]
+            alike = [m for m in row.measurements if m.name.startswith("error_baseline.") and m.unit == unit]
+            return max(alike, key=lambda m: m.value, default=None)
+        return row.get(self.name) or row.get(f"error_baseline.{self.name}")
+
+    def required(self, row: Row) -> Measurement:
+        """Return the measurement of a row that the budget is about.
+
+        Raises:
+            RecipeError: when the row has none of that name; names those that it has.
+        """
+        measurement = self.of(row)
+        if measurement is not None:
+            return measurement
+        known = [m.name.removeprefix("error_baseline.") for m in row.measurements if m.origin == "measured"]
+        units = {f"unit:{m.unit}" for m in row.measurements if m.name.startswith("error_baseline.")}
+        raise RecipeError(
+            f"--max-drop names '{self.name}', which is not measured on this policy; "
+            f"{nearest(self.name, [*known, *sorted(units)])}."
+        )
+
+
+def budget_of(limits: Limits, spec: PolicySpec, proxy: bool = True) -> Budget:
+    """Return the budget on recorded observations.
+
+    Args:
+        limits: What was asked for.
+        spec: The policy's.
+        proxy: Whether something else decides in the end (episodes, the expert's actions), so that a plan is only worth
+            a look when it is near float32.
+    """
+    if limits.metric:
+        return Budget(limits.metric, limits.max_metric or 0.0)
+    name = "disagreement" if spec.action.kind == "discrete" else "error_baseline"
+    return Budget(name, min(max(PROXY, limits.max_drop), limits.max_distance) if proxy else limits.max_drop)
+
+
+def distance_of(row: Row) -> Measurement | None:
+    """Return how far a row's actions are from float32's own, None when that is not measured.
+
+    Continuous: the mean |difference| by float32's standard deviation; discrete: the share of other answers.
+    """
+    return Budget("disagreement", 0.0).of(row) or row.get("error_baseline")

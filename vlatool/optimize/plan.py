@@ -1,0 +1,150 @@
+"""Everything that ``optimize`` will do, checked before anything runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vlatool.errors import RecipeError
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.hardware.profile import Profile
+from vlatool.machine.host import fingerprint, matches
+from vlatool.machine.instruction_sets import BoardSet, board_set
+from vlatool.module.description import read_description
+from vlatool.optimize.recipe import Limits, Recipe, StageList, stage_entries
+from vlatool.sources import Source, source_stage
+from vlatool.stage.base import Stage, Transform, build_stage
+
+BASELINE = "float32"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Stages, candidates and limits of one run.
+
+    Args:
+        source: Of the policy.
+        export: Stages from the policy to the float32 bundle; none where the source has graphs.
+        candidates: Name -> stages from there, or from the policy for those that change its modules.
+        recipe: What was asked for.
+        profile: The board; None for this host.
+        cache: Where finished stages are kept.
+        fresh: Measure again, even what was measured before.
+        typed: The source as the user named it.
+    """
+
+    source: Source
+    export: tuple[Transform, ...]
+    candidates: dict[str, tuple[Transform, ...]]
+    recipe: Recipe
+    profile: Profile | None
+    cache: Path
+    fresh: bool = False
+    typed: str = ""
+
+    @property
+    def board_set(self) -> BoardSet:
+        """What OpenVINO computes in on the board, beside what it computes in here."""
+        return board_set(self.profile)
+
+    @property
+    def board(self) -> str:
+        """Name of the profile, or of what stands in for it."""
+        return self.profile.name if self.profile else "this host"
+
+    @property
+    def on_board(self) -> bool:
+        """Whether this host is the board, so that what is measured here holds there."""
+        return self.profile is None or matches(self.profile.model_strings, fingerprint())
+
+    @property
+    def closed_loop(self) -> ClosedLoop | None:
+        """The closed-loop evaluation, None when the policy names no environment or no episodes are wanted."""
+        if self.source.policy is None or not self.recipe.effort.episodes:
+            return None
+        described = read_description(self.source.policy)
+        if not described.environment:
+            return None
+        return ClosedLoop(policy=self.source.policy, episodes=self.recipe.effort.episodes)
+
+    def lines(self) -> Iterator[str]:
+        """Describe the plan, a line for each stage."""
+        yield f"source      {self.source.name()} {self.source.policy or ''}".rstrip()
+        for stage in self.export:
+            yield f"export      {stage.name()} {_options(stage)}".rstrip()
+        for name, stages in self.candidates.items():
+            yield f"candidate   {name}: " + ", ".join(f"{stage.name()} {_options(stage)}".rstrip() for stage in stages)
+        effort = self.recipe.effort
+        yield f"benchmark   {effort.iterations} inferences of each, interleaved, {effort.threads} thread(s), this host"
+        loop = self.closed_loop
+        yield "evaluate    recorded observations" + (f", {loop.episodes} paired closed-loop episodes" if loop else "")
+        limits = self.recipe.limits
+        if self.recipe.search:
+            yield "search      engines, methods, mixed-precision plans; the fastest inside the budget become candidates"
+        yield f"limits      {', '.join(_limits(limits))}"
+        origin = "predicted, unless this host is that board" if self.profile else "measured"
+        yield f"profile     {self.board} ({origin})"
+        if computed := self.board_set.plan():
+            yield f"computes    {computed}"
+        yield f"cache       {self.cache}"
+
+
+def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path, *, fresh: bool = False) -> Plan:
+    """Build and check every stage; nothing has run when this returns.
+
+    Args:
+        source: See ``source_stage``.
+        profile: The board; None for this host.
+        recipe: Candidates, limits and effort.
+        cache: Where finished stages are kept.
+        fresh: Measure again, even what was measured before.
+
+    Raises:
+        VlatoolError: for the first thing that cannot work.
+    """
+    stage = source_stage(source)
+    stage.check(None, profile)
+    export = () if stage.has_graphs else transforms(recipe.export)
+    candidates = {name: transforms(stages) for name, stages in recipe.candidates.items()}
+    for name, stages in candidates.items():
+        changing = [stage.takes_modules for stage in stages]
+        if changing != sorted(changing, reverse=True) or any(stage.kind() == "export" for stage in stages):
+            raise RecipeError(
+                f"The candidate '{name}' changes modules after a graph was made, or exports.",
+                "put the stages of prune and distill first, and options of the export under 'export'",
+            )
+        if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
+            raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
+    return Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
+
+
+def transforms(stages: StageList) -> tuple[Transform, ...]:
+    """Return the stages of a list of entries.
+
+    Raises:
+        RecipeError: when one reads a policy or measures; UsageError when there is no such stage or option.
+    """
+    built = []
+    for name, options in stage_entries(stages):
+        stage = build_stage(name, options or {})
+        if stage.kind() == "sources":
+            raise RecipeError(f"The stage {name} reads a policy; the policy is named on the command line.")
+        if not isinstance(stage, Transform):
+            raise RecipeError(f"The stage {name} measures; a recipe lists stages that make a bundle.")
+        built.append(stage)
+    return tuple(built)
+
+
+def _limits(limits: Limits) -> list[str]:
+    """Return the limits in words."""
+    drop = f"drop <= {100 * limits.max_drop:g} points"
+    words = [f"{limits.metric} <= {limits.max_metric:g}" if limits.metric else drop]
+    words += [f"{limits.hz:g} Hz"] if limits.hz else []
+    words += [f"latency <= {limits.max_latency_ms:g} ms"] if limits.max_latency_ms else []
+    words += [f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else []
+    return words + ([] if limits.metric else [f"distance from float32 <= {100 * limits.max_distance:g} %"])
+
+
+def _options(stage: Stage) -> str:
+    return " ".join(f"{key}={value}" for key, value in stage.options().items())

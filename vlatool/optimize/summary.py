@@ -1,0 +1,118 @@
+"""The report of a run: what was chosen and why, with everything that was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from vlatool.accuracy.credibility import Credibility
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import install
+from vlatool.machine.host import fingerprint
+from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
+from vlatool.optimize.choice import chosen_of
+from vlatool.optimize.judge import Judged
+from vlatool.optimize.plan import Plan
+from vlatool.optimize.timings import IN_OPENVINO, engine_of, now
+from vlatool.report import ON_BOARD, Report, Row
+from vlatool.runtime.engine import DEFAULT_ENGINE
+
+
+def report_of(
+    plan: Plan,
+    baseline: Bundle,
+    bundles: Mapping[str, Bundle],
+    judged: list[Judged],
+    failures: Sequence[Row],
+    notes: Sequence[str],
+    trust: Credibility,
+    command: str,
+) -> Report:
+    """Return the report.
+
+    Args:
+        plan: With the limits and the board.
+        baseline: The float32 bundle.
+        bundles: Name -> bundle of each candidate.
+        judged: The rows, float32 first, one of them chosen.
+        failures: Rows of candidates that could not be made.
+        notes: What a reader should know of the measurements.
+        trust: Whether float32 does its task.
+        command: The command line.
+    """
+    chosen, where = chosen_of(judged), plan.board_set
+    engine = engine_of(bundles.get(chosen.row.name, baseline))
+    rows = {item.row.name: item.row for item in judged}
+    warnings = [*where.warnings(), *notes, *trust.warnings, *(text for item in judged for text in item.warnings)]
+    return Report(
+        "optimize",
+        f"{baseline.manifest.name} for {plan.board}",
+        verdict_of(judged, trust),
+        summary=(
+            *trust.sentences, *chosen.sentences, *filter(None, [trust.floor]),
+            *about_int8(rows, in_int8(bundles), where), *about_onnx_runtime(plan.profile), *where.sentences(),
+            *_needs(engine),
+        ),
+        rows=(*rows.values(), *failures),
+        limits=_limits(plan),
+        command=command,
+        created=now(),
+        environment={**fingerprint(), **({ON_BOARD: plan.board} if plan.profile and plan.on_board else {})},
+        warnings=tuple(dict.fromkeys(warnings)),
+    )  # fmt: skip
+
+
+def verdict_of(judged: list[Judged], trust: Credibility) -> str:
+    """Return ``pass``, ``fail``, or ``inconclusive`` where nothing can be held against the reference."""
+    kept = chosen_of(judged).within and any(item.within for item in judged[1:])
+    return "inconclusive" if trust.fails else "pass" if kept else "fail"
+
+
+def _limits(plan: Plan) -> dict[str, float | str]:
+    """Return the limits that were asked for, each with its unit in the name."""
+    limits = plan.recipe.limits
+    drop = "max_success_drop_points" if plan.closed_loop else "max_drop_points"
+    accuracy = {limits.metric: limits.max_metric} if limits.metric else {drop: 100 * limits.max_drop}
+    distance = {} if limits.metric else {"max_distance_percent": 100 * limits.max_distance}
+    named = {
+        **accuracy, "hz": limits.hz, "profile": plan.board, "max_latency_ms": limits.max_latency_ms,
+        "max_memory_mb": limits.max_memory_mb, **distance,
+    }  # fmt: skip
+    return {name: value for name, value in named.items() if value is not None}
+
+
+def in_int8(bundles: Mapping[str, Bundle]) -> dict[str, str]:
+    """Return the engines of the bundles that multiply in int8, by name; weights alone in int8 do not count."""
+    return {
+        name: engine_of(bundle)
+        for name, bundle in bundles.items()
+        if any("int8" in graph.precision for graph in bundle.manifest.graphs.values())
+    }
+
+
+def about_int8(rows: Mapping[str, Row], engines: Mapping[str, str], where: BoardSet) -> tuple[str, ...]:
+    """Say of a board without VNNI that int8 may lose, and how the fastest int8 plan of OpenVINO did; else nothing."""
+    if not where.saturates:
+        return ()
+    words = (
+        f"{where.board} has no VNNI: int8 products are added in pairs of 16 bits there, which can saturate, and int8 "
+        "may be slower than float32. "
+    )
+    if not (where.confined or where.alike):
+        return (f"{words}Whether it is was not measured: OpenVINO does not compute in that set here.",)
+    words += "It was tried all the same: "
+    tried = {name: speedup for name, row in rows.items()
+             if engines.get(name) == ENGINE and (speedup := row.get("speedup"))}  # fmt: skip
+    if not tried:
+        return (f"{words}no int8 plan of OpenVINO could be made.",)
+    name, fastest = max(tried.items(), key=lambda pair: pair[1].value)
+    low, high = fastest.low or fastest.value, fastest.high or fastest.value
+    verdict = "it loses there" if high < 1 else "it wins there" if low > 1 else "it is not shown to win there"
+    of = f"{IN_OPENVINO}, of {where.ratio}" if where.confined else "float32"
+    return (f"{words}{name} is {fastest.value:.2f}x ({low:.2f} to {high:.2f}) as fast as {of}; {verdict}.",)
+
+
+def _needs(engine: str) -> tuple[str, ...]:
+    """Say what the robot must have installed beside the default engine."""
+    if engine == DEFAULT_ENGINE:
+        return ()
+    return (f"It runs on the engine {engine}: {install(engine, 'vlatool-runtime')} on the robot.",)

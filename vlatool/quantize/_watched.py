@@ -1,0 +1,83 @@
+"""Run a policy on recorded observations while chosen values inside its graphs are looked at; none of them is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import DataError, GraphError, require
+from vlatool.graph.files import write_beside
+from vlatool.graph.onnx_graph import OnnxGraph
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.policy import Policy
+from vlatool.runtime.program import Program
+from vlatool.stage.base import Context
+
+SAMPLE = "Calibration sample"
+
+
+class Watcher:
+    """A session of a graph with further outputs, which the program does not see.
+
+    Args:
+        path: The graph; large weights stay where they are.
+        copy: Where it is written with the further outputs.
+        show: Adds them.
+    """
+
+    def __init__(self, path: Path, copy: Path, show: Callable[[OnnxGraph], None]) -> None:
+        graph = OnnxGraph(require("onnx", "build").load(str(path), load_external_data=False))
+        self.sample = 0
+        self._outputs = [value.name for value in graph.graph.output]
+        show(graph)
+        self._session = engine_class()(write_beside(graph.model, path, copy), 1)
+
+    def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+        """Look at what one run was fed and gave."""
+        raise NotImplementedError
+
+    def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Run, look at the values, return the graph's own outputs."""
+        values = self._session.run(feeds)
+        self.watch(feeds, values)
+        return {name: values[name] for name in self._outputs}
+
+
+def run_watched(
+    bundle: Bundle,
+    watchers: Mapping[str, Watcher],
+    observations: Iterable[Mapping[str, Any]],
+    context: Context,
+    what: str,
+    numbers: Sequence[int] = (),
+) -> None:
+    """Run a policy whose graphs are watched.
+
+    Args:
+        bundle: A float32 bundle.
+        watchers: Graph name -> session; graphs without one run as they are.
+        observations: Raw observations, consumed one at a time.
+        context: For progress.
+        what: Is being done, before the words "sample 3".
+        numbers: What messages call the observations: their places in the recording; counted from 0 when empty.
+
+    Raises:
+        DataError: when an observation does not fit the spec, or a watcher refuses a value; names the sample.
+    """
+    graphs = bundle.manifest.graphs
+    others = {name: engine_class()(bundle.file(graphs[name].file), 1) for name in graphs if name not in watchers}
+    policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
+    for place, observation in enumerate(observations):
+        number = numbers[place] if numbers else place
+        if place % 8 == 0:
+            context.tell(f"{what} sample {number}", place / len(numbers) if numbers else None)
+        for watcher in watchers.values():
+            watcher.sample = number
+        try:
+            policy.infer(observation)
+        except (GraphError, DataError) as error:
+            if error.message.startswith(SAMPLE):
+                raise
+            raise DataError(f"{SAMPLE} {number}: {error.message}", error.fix) from error

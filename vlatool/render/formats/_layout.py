@@ -1,0 +1,77 @@
+"""A table as plain text: what qualifies a number stands below it, or beside it where there is room for a column."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from vlatool.render._format import plain
+from vlatool.render.cells import texts
+from vlatool.render.document import Cell, Column, Line, Table
+
+SHARED = "shared"
+"""The role of a line that holds the counts which all numbers of a column share."""
+
+
+def layout(table: Table, most: int) -> Table:
+    """Return the first ``most`` lines of a table as one whose cells are text alone."""
+    kept = table.worded()
+    columns = tuple(replace(table.columns[place], title=plain(table.columns[place].title)) for place in kept)
+    lines = [replace(line, cells=tuple(line.cells[place] for place in kept)) for line in table.lines[:most]]
+    if any(cell.aside for line in lines for cell in line.cells[1:]):
+        if len(lines) == 1 and len(columns) > 2:
+            columns, lines = _turned(columns, lines[0].cells)
+        if len(columns) == 2:
+            return _list(columns, lines, table.beside or "interval")
+    return Table(columns, tuple(_joined(lines) if table.beside else _stacked(lines)))
+
+
+def _turned(columns: Sequence[Column], cells: Sequence[Cell]) -> tuple[tuple[Column, ...], list[Line]]:
+    """Return a table of one line as a list: a number a line."""
+    title = ", ".join(part for part in (cells[0].text, cells[0].note) if part)
+    numbers = zip(columns[1:], cells[1:], strict=True)
+    return (Column(title, False), Column("value")), [Line((Cell(column.title), cell)) for column, cell in numbers]
+
+
+def _list(columns: Sequence[Column], lines: Sequence[Line], beside: str) -> Table:
+    """Return one number a line, with its interval and its count beside it."""
+    body = []
+    for name, cell in (line.cells for line in lines):
+        last = ", ".join(part for part in (cell.count, cell.note if cell.known else "") if part)
+        body.append((name.text, cell.text, cell.interval, last))
+    kept = [place for place in range(4) if place < 2 or any(line[place] for line in body)]
+    heads = (*columns, Column(beside), Column(""))
+    shown = (Line(texts(line[place] for place in kept)) for line in body)
+    return Table(tuple(heads[place] for place in kept), tuple(shown))
+
+
+def _joined(lines: Sequence[Line]) -> list[Line]:
+    """Return number and interval in one cell, aligned within a column."""
+    shown = []
+    for cells in zip(*(line.cells for line in lines), strict=True):
+        wide = max(len(cell.interval) for cell in cells)
+        shown.append([f"{cell.text}  {cell.interval.rjust(wide)}" if wide else cell.text for cell in cells])
+    return [Line(texts(line)) for line in zip(*shown, strict=True)]
+
+
+def _stacked(lines: Sequence[Line]) -> list[Line]:
+    """Return number, interval and count below each other; a count that a column or a line shares stands once."""
+    shared = [_shared(cells) if len(lines) > 1 else "" for cells in zip(*(line.cells for line in lines), strict=True)]
+    body = [Line(texts(shared), SHARED)] if any(shared) else []
+    return body + [Line(texts(part), best=line.best) for line in lines for part in _parts(line.cells, shared)]
+
+
+def _shared(cells: Sequence[Cell]) -> str:
+    counts = {cell.count for cell in cells if cell.known}
+    return counts.pop() if len(counts) == 1 else ""
+
+
+def _parts(cells: Sequence[Cell], shared: Sequence[str]) -> list[list[str]]:
+    counts = ["" if once else cell.count for cell, once in zip(cells, shared, strict=True)]
+    intervals, notes = [cell.interval for cell in cells], [cell.note if cell.known else "" for cell in cells]
+    same = {count for count in counts if count}
+    if cells[0].note:
+        intervals[0], notes[0] = f"  {cells[0].note}", ""
+    elif len(same) == 1 and not any(shared):
+        intervals[0], counts = f"  {same.pop()}", [""] * len(cells)
+    return [[cell.text for cell in cells], intervals, counts, notes]

@@ -1,0 +1,27 @@
+"""The details of the rows as tables; the same table of several variants becomes one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from vlatool.render._view import ABSENT, ranks_boards
+from vlatool.render.cells import records_table
+from vlatool.render.document import Section, Table
+from vlatool.render.sections.parts import PARTS
+from vlatool.report import Report
+
+
+class Details:
+    """What else the rows hold."""
+
+    def build(self, report: Report) -> Iterator[Section]:
+        """Return every table of details that no other section draws."""
+        if not ranks_boards(report) and (shown := tables(report)):
+            yield Section("Details", tuple(shown), 100, brief=False, folded=True)
+
+
+def tables(report: Report) -> list[Table]:
+    """Return the tables, that of the telemetry first."""
+    titles = dict.fromkeys(("telemetry", *(title for row in report.rows for title in row.details)))
+    shown = (title for title in titles if title not in (ABSENT, *PARTS))
+    return [table for title in shown if (table := records_table(report, title))]

@@ -1,0 +1,21 @@
+"""Memory by part, time by phase and cold start by part: every number, and a bar beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from vlatool.render.cells import records_table
+from vlatool.render.document import Section
+from vlatool.report import Report
+
+PARTS = {"memory by part": "MB", "time by phase": "share %", "cold start by part": "ms"}
+"""Title of a details table -> the column of which bars are drawn."""
+
+
+class Parts:
+    """Tables of what a benchmark takes apart."""
+
+    def build(self, report: Report) -> Iterator[Section]:
+        """Return the tables that there are."""
+        if tables := tuple(table for title, key in PARTS.items() if (table := records_table(report, title, key))):
+            yield Section("Where memory and time go", tables, 70, "measured", brief=False, folded=True)
