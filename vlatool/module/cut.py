@@ -16,7 +16,7 @@ from vlatool.module.to_onnx import quiet_exporter
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-    from vlatool.module.edits import Edit
+    from vlatool.module.edit import Edit
 
 SIZED = {"reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "unflatten": 2}
 """Operator -> which of its arguments lists sizes of what it gives."""

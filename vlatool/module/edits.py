@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
 from vlatool.files.json import read_json
 from vlatool.module.cut import cut
+from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
 
 if TYPE_CHECKING:
@@ -29,25 +30,6 @@ CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
 AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d")
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
-
-
-@dataclass(frozen=True)
-class Edit:
-    """Channels or blocks of one module that are kept.
-
-    Args:
-        graph: Name of the graph whose module it is in.
-        module: Its name, as ``named_modules`` gives it.
-        axis: ``outputs`` (rows of the weight, the bias), ``inputs`` (columns of the weight) or ``blocks`` (the modules
-            of an ``nn.ModuleList`` or ``nn.Sequential``); ``units A.P`` (then ``module`` names a weight) is factor P of
-            its axis A, as ``vlatool.module.axes`` finds it, with all that goes along.
-        keep: Indices of what stays, in the order in which it stays.
-    """
-
-    graph: str
-    module: str
-    axis: str
-    keep: tuple[int, ...]
 
 
 def is_changed(bundle: Bundle) -> bool:

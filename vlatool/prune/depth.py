@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 PROTECTED = ("vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action")
 """Parts of module names whose blocks stay unless --include names them: what sees and what acts is less redundant than
-the trunk between (two action blocks of pi0.5 cost most of its success, see docs/guides/smaller-policies.md)."""
+the trunk between (two action blocks of pi0.5 cost most of its success, see docs/guides/prune-and-fine-tune.md)."""
 SEED = 0
 PROBES = 4
 """Random directions of the action that a gate's sensitivity is taken along."""

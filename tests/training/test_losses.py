@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from vlatool import registry
-from vlatool.losses.huber import Huber
-from vlatool.losses.kl import Kl
-from vlatool.losses.l1 import L1
-from vlatool.losses.l2 import L2
+from vlatool.training.losses.huber import Huber
+from vlatool.training.losses.kl import Kl
+from vlatool.training.losses.l1 import L1
+from vlatool.training.losses.l2 import L2
 
 RANDOM = torch.Generator().manual_seed(0)
 STUDENT, TEACHER = torch.randn(5, 4, generator=RANDOM), torch.randn(5, 4, generator=RANDOM)
