@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,15 @@ def test_teacher_and_student_play_and_the_result_is_exported_and_made_again(
         "the teacher plays 4 episodes", "the student plays 2 episodes", "the student plays 2 episodes",
     ]  # fmt: skip
     assert not list((cache_directory() / "streams").glob("*/*")), "nothing is left"
+    training = json.loads((made.path / "module/training.json").read_text())
+    assert [(each["step"], each["actor"], each["episodes"]) for each in training["rounds"]] == [
+        (0, "teacher", 4), (5, "student", 2), (10, "student", 2),
+    ]  # fmt: skip
+    assert len(training["losses"]) == 12
+    first, second, *_ = PolicyDistillation(**SHORT).lines(made)
+    assert first.startswith("l1 ")
+    assert " in 12 steps on " in first
+    assert second.startswith("episodes that succeeded, with noise: teacher ")
     exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context())
     assert load(exported.path).infer(recorded_observations(exported, 1)[0]).chunk.shape == (4, 2)
     assert rebuild(exported, Context(), source=str(policy_template), cache=tmp_path / "cache").identical

@@ -50,7 +50,7 @@ class Net(nn.Module):
 def test_what_adds_least_goes_first(source_bundle: Bundle, rank: str):
     def kept(**options):
         stage = Depth(rank=rank, samples=4, **options)
-        return stage.change({"main": Net().eval()}, source_bundle, Context())
+        return stage.change({"main": Net().eval()}, source_bundle, Context()).edits
 
     assert kept(blocks=3) == (Edit("main", "trunk", "blocks", (0, 2, 3)),)
     assert kept(ratio=0.5) == (Edit("main", "trunk", "blocks", (0, 2)),)
@@ -79,7 +79,7 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     modules = {"main": Net("action_expert").eval()}
     with pytest.raises(RecipeError, match=r"has no other stack of blocks: action_expert \(4\)"):
         Depth(samples=2).change(modules, source_bundle, Context())
-    chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context())
+    chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context()).edits
     assert len(chosen[0].keep) == 2
     assert protected("model.vision_tower.layers")
     assert protected("ActionHead.blocks")

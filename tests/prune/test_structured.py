@@ -62,7 +62,7 @@ def test_units_that_do_nothing_go_first(source_bundle: Bundle, rank: str):
     with torch.no_grad():
         linear.weight[:, 5:] = 0
     stage = Structured(ratio=0.2, rank=rank, include=("blocks.0.mlp.*",), least=0.1, **FINE)
-    (edit,) = stage.change(modules, source_bundle, Context())
+    (edit,) = stage.change(modules, source_bundle, Context()).edits
     assert set(range(5)) <= set(edit.keep)
     assert len(edit.keep) < 32
 
@@ -78,7 +78,7 @@ def test_a_random_choice_is_the_same_each_time(source_bundle: Bundle):
 
 def test_widths_stay_multiples(source_bundle: Bundle):
     stage = Structured(ratio=0.3, multiple=8, samples=2)
-    for edit in stage.change(load_modules(source_bundle), source_bundle, Context()):
+    for edit in stage.change(load_modules(source_bundle), source_bundle, Context()).edits:
         assert len(edit.keep) % 8 == 0
 
 

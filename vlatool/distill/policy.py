@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import shutil
 from collections.abc import Mapping
 from functools import partial
@@ -21,7 +22,7 @@ from vlatool.files.work import forget, work_directory
 from vlatool.machine.host import cache_directory
 from vlatool.module.batched import BatchedProgram
 from vlatool.module.edits import Edit, read_edits
-from vlatool.module.stage import ModuleStage, write_changed
+from vlatool.module.stage import TRAINING, Changed, ModuleStage, write_changed
 from vlatool.module.torch_policy import load_modules, unedited_modules
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
@@ -39,6 +40,8 @@ FIRST_SEED = 1_000_000
 """Of the first episode to train on; evaluations begin at 5,000,000."""
 LAST_SHARE = 0.9
 """Share of the steps after which no further episodes are played: what they bring could hardly be learnt any more."""
+ROUND = "round-{:03d}.json"
+"""File that says who acted in a round, and how well."""
 SEEDS = 100_000
 """Seeds between rounds."""
 RECORDED = 100_000
@@ -85,7 +88,28 @@ class PolicyDistillation(ModuleStage):
         if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
             raise RecipeError("The loss kl compares discrete actions; the policy's are continuous.", "try --loss l1")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+    def loss_for(self, source: Bundle) -> str:
+        """Return the name of the loss; where it is left to vlatool, the one that fits the action."""
+        automatic = "kl" if source.manifest.spec.action.kind == "discrete" else "l1"
+        return automatic if self.loss == "auto" else self.loss
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Say what the student learnt from, and how far it came."""
+        training = json.loads(made.file(TRAINING).read_bytes())
+        losses, last = training["losses"], max(1, len(training["losses"]) // 20)
+        seen = sum(round_["observations"] for round_ in training["rounds"])
+        first, end = np.mean(losses[:last]), np.mean(losses[-last:])
+        played = ", ".join(
+            f"{round_['actor']} {round_['successes'] / round_['episodes']:.1%} of {round_['episodes']}"
+            for round_ in training["rounds"] if round_.get("episodes")
+        )  # fmt: skip
+        return (
+            f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
+            *([f"episodes that succeeded, with noise: {played}"] if played else []),
+            *super().lines(made),
+        )
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Train the modules in place."""
         torch = require("torch", "build")
         before = torch.get_num_threads()
@@ -93,11 +117,11 @@ class PolicyDistillation(ModuleStage):
         place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
         try:
             with work_directory(place):
-                _Distillation(self, modules, source, place, context).run()
+                training = _Distillation(self, modules, source, place, context).run()
         finally:
             torch.set_num_threads(before)
         forget(place)
-        return ()
+        return Changed(training=training)
 
 
 class _Distillation:
@@ -114,13 +138,14 @@ class _Distillation:
         self._teacher = BatchedProgram(self._taught_by.manifest.program, teacher)
         self._student = BatchedProgram(source.manifest.program, modules)
         self._scene = scene_of(source) if stage.episodes or stage.student_episodes else None
-        self._loss = _loss_of(stage, source)
+        self._loss_name = stage.loss_for(source)
+        self._loss = _loss_of(stage, self._loss_name)
         self._frames = Frames(place)
         settings = Settings(stage.steps, stage.learning_rate, stage.weight_decay, stage.average, stage.seed)
         self._trainer = Trainer(modules, settings, place)
 
-    def run(self) -> None:
-        """Play, label and train until all steps are done."""
+    def run(self) -> dict[str, Any]:
+        """Play, label and train until all steps are done; return what there is to know of it."""
         next_round(self._frames, 0, self._first)
         ends = [*self._pauses(), self._stage.steps]
         for number, end in enumerate(ends):
@@ -129,6 +154,8 @@ class _Distillation:
             self._trainer.train(end, self._draw, self._tell)
             self._trainer.save()
         self._trainer.finish()
+        rounds = [json.loads((self._place / ROUND.format(number)).read_text()) for number in range(len(ends))]
+        return {"loss": self._loss_name, "losses": self._trainer.losses, "rounds": rounds}
 
     def _pauses(self) -> list[int]:
         """Return before which steps the student plays."""
@@ -153,16 +180,19 @@ class _Distillation:
     def _play(self, target: Path, number: int, episodes: int) -> None:
         stage, seed = self._stage, self._stage.first_seed + number * SEEDS
         folder = target / "episodes"
+        about: dict[str, Any] = {"step": self._trainer.step, "actor": "student" if number else "teacher"}
         if self._scene is not None and episodes:
             who = "student" if number else "teacher"
             self._context.tell(f"the {who} plays {episodes} episodes", None)
             jobs = self._scene.jobs(episodes, seed, stage.noise, folder)
-            run_jobs(self._actor(target / "actor", number), jobs, "", self._context)
-        joined((target / "recorded", *sorted(folder.glob("*"))), target)
+            outcomes = run_jobs(self._actor(target / "actor", number), jobs, "", self._context)
+            about |= {"episodes": len(outcomes), "successes": sum(outcome.success for outcome in outcomes)}
+        about["observations"] = joined((target / "recorded", *sorted(folder.glob("*"))), target)
         for part in ("recorded", "episodes", "actor"):
             shutil.rmtree(target / part, ignore_errors=True)
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
+        (self._place / ROUND.format(number)).write_text(json.dumps(about))
         label(target, names, outputs, self._teacher, (stage.seed, number), self._context)
 
     def _actor(self, place: Path, number: int) -> Bundle:
@@ -195,11 +225,8 @@ def _teacher_of(stage: PolicyDistillation, source: Bundle) -> tuple[Bundle, tupl
     return source, (), unedited_modules(source)
 
 
-def _loss_of(stage: PolicyDistillation, source: Bundle) -> Any:
+def _loss_of(stage: PolicyDistillation, name: str) -> Any:
     """Return the loss with the options that it takes."""
-    name = stage.loss
-    if name == "auto":
-        name = "kl" if source.manifest.spec.action.kind == "discrete" else "l1"
     kind = registry.load("losses", name)
     takes = inspect.signature(kind).parameters
     return kind(**{option: getattr(stage, option) for option in ("temperature", "delta") if option in takes})

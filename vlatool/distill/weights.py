@@ -10,8 +10,8 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError
-from vlatool.module.edits import Edit, load_tensors, read_tensors
-from vlatool.module.stage import ModuleStage
+from vlatool.module.edits import load_tensors, read_tensors
+from vlatool.module.stage import Changed, ModuleStage
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Weights(ModuleStage):
             raise SourceError(f"No such file: {self.file}.")
         super().check(source, profile)
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Load the weights.
 
         Raises:
@@ -49,4 +49,4 @@ class Weights(ModuleStage):
         for graph, module in modules.items():
             context.tell(f"loading the weights of {graph}", None)
             load_tensors(graph, module, stored, str(self.file))
-        return ()
+        return Changed()

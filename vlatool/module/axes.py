@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -176,17 +176,6 @@ class Walk:
                     if not self.factors.is_frozen(leaf):
                         found.setdefault(leaf, []).append(Member(weight, number, place, sizes))
         return found
-
-    def macs(self, keep: Mapping[int, int]) -> int:
-        """Return the multiply-accumulates of one run of the operators that are known.
-
-        Args:
-            keep: Factor -> elements that stay, of those that lose some.
-        """
-        return sum(
-            math.prod(keep.get(leaf, self.factors.sizes[leaf]) for axis in axes for leaf in self.factors.leaves(axis))
-            for axes in self.products
-        )
 
     def _placeholder(self, node: Any, weight: str) -> None:
         value = node.meta.get("val")

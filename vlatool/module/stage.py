@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,7 +13,7 @@ from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, require
 from vlatool.module.description import read_location
-from vlatool.module.edits import Edit, apply, joined_edits, read_edits, write_module
+from vlatool.module.edits import FOLDER, Edit, apply, joined_edits, read_edits, write_module
 from vlatool.module.origin import factory_of
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.stage.base import Context, Transform, source_of
@@ -22,6 +23,22 @@ if TYPE_CHECKING:
     from torch import nn
 
     from vlatool.hardware.profile import Profile
+
+
+TRAINING = f"{FOLDER}/training.json"
+
+
+@dataclass(frozen=True)
+class Changed:
+    """What a stage did to modules, beside the weights that it changed in place.
+
+    Args:
+        edits: What is kept of the structure; the caller cuts the modules.
+        training: How they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
+    """
+
+    edits: tuple[Edit, ...] = ()
+    training: Mapping[str, Any] | None = None
 
 
 class ModuleStage(Transform):
@@ -42,8 +59,8 @@ class ModuleStage(Transform):
         """The policy's factory is called."""
         return factory_of(source)
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
-        """Change weights in place and return which channels are kept; the modules are cut by the caller.
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+        """Change weights in place, and return what else is to be changed.
 
         Args:
             modules: Graph name -> module, as the source has it.
@@ -67,16 +84,23 @@ class ModuleStage(Transform):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         modules = load_modules(bundle)
-        edits = self.change(modules, bundle, context)
-        modules = apply(modules, edits, bundle)
-        changed = write_changed(bundle, out, joined_edits(read_edits(bundle), edits), modules, self.made_by())
+        done = self.change(modules, bundle, context)
+        modules = apply(modules, done.edits, bundle)
+        changed = write_changed(
+            bundle, out, joined_edits(read_edits(bundle), done.edits), modules, self.made_by(), done.training
+        )
         context.tell("running the changed policy", None)
         torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
 
 
 def write_changed(
-    source: Bundle, out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module], made_by: dict[str, Any]
+    source: Bundle,
+    out: Path,
+    edits: Sequence[Edit],
+    modules: Mapping[str, nn.Module],
+    made_by: dict[str, Any],
+    training: Mapping[str, Any] | None = None,
 ) -> Bundle:
     """Write a source bundle with other modules.
 
@@ -86,8 +110,11 @@ def write_changed(
         edits: All edits since the factory.
         modules: Graph name -> module after the edits.
         made_by: Stage, options and versions.
+        training: How they were trained, if they were.
     """
     write_module(out, edits, modules)
+    if training is not None:
+        (out / TRAINING).write_text(json.dumps(training) + "\n", encoding="utf-8")
     carry_over(source, out)
     shutil.copyfile(source.path / LOCATION, out / LOCATION)
     build = (*history(source), {**made_by, "input": source.hash})

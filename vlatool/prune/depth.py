@@ -16,7 +16,7 @@ from vlatool.errors import RecipeError, SourceError, nearest, require
 from vlatool.graph.nodes import matches
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.edits import BLOCKS, Edit
-from vlatool.module.stage import ModuleStage
+from vlatool.module.stage import Changed, ModuleStage
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context
@@ -52,7 +52,7 @@ class Depth(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of stacks to prune; the trunk's when empty")
     exclude: tuple[str, ...] = Field((), description="globs of stacks to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Choose the blocks that stay.
 
         Raises:
@@ -68,7 +68,7 @@ class Depth(ModuleStage):
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):
             left[graph, name].remove(block)
-        return tuple(Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items())
+        return Changed(tuple(Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()))
 
     def _goes(self, size: int) -> int:
         """Return how many blocks of a stack go; one always stays."""

@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest, require
 from vlatool.graph.nodes import matches
 from vlatool.module.edits import Edit
-from vlatool.module.stage import ModuleStage
+from vlatool.module.stage import Changed, ModuleStage
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class Magnitude(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of module names (of the first Linear); all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Choose the neurons that stay.
 
         Raises:
@@ -61,7 +61,7 @@ class Magnitude(ModuleStage):
                 "elementwise modules between them.",
                 "look at --include and --exclude; other structures cannot be pruned yet",
             )
-        return tuple(edits)
+        return Changed(tuple(edits))
 
     def _kept(self, incoming: Any, outgoing: Any) -> tuple[int, ...]:
         """Return the indices of the neurons that stay, in their order."""

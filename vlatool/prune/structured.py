@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,7 +20,7 @@ from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.cut import traced
 from vlatool.module.edits import UNITS, Edit
 from vlatool.module.feeds import first_feeds
-from vlatool.module.stage import ModuleStage
+from vlatool.module.stage import Changed, ModuleStage
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 
@@ -53,6 +54,11 @@ class _Group:
     importance: NDArray[Any]
     keep: list[int]
 
+    def edit(self) -> Edit:
+        """Return what is to be kept, by the first of the weights."""
+        first = self.members[0]
+        return Edit(self.graph, first.weight, f"{UNITS}{first.axis}.{first.place}", tuple(self.keep))
+
 
 class Structured(ModuleStage):
     """Remove the least important heads, neurons and channels, until a share of the multiply-accumulates is gone.
@@ -72,7 +78,7 @@ class Structured(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> tuple[Edit, ...]:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Choose the units that stay.
 
         Raises:
@@ -85,13 +91,9 @@ class Structured(ModuleStage):
         context.tell(f"ranking the units of {len(groups)} groups", None)
         self._rank(groups, modules, source)
         runs = {step.graph: step.repeat for step in source.manifest.program}
-        work = _Work(walks, runs)
+        work = _Work(walks, runs, groups)
         self._remove(groups, work, context)
-        return tuple(
-            Edit(group.graph, group.members[0].weight, f"{UNITS}{group.members[0].axis}.{group.members[0].place}",
-                 tuple(group.keep))
-            for group in groups if len(group.keep) < group.size
-        )  # fmt: skip
+        return Changed(tuple(group.edit() for group in groups if len(group.keep) < group.size))
 
     def _groups(self, walks: Mapping[str, Walk], source: Bundle) -> list[_Group]:
         groups = []
@@ -142,21 +144,26 @@ class Structured(ModuleStage):
 
     def _remove(self, groups: Sequence[_Group], work: _Work, context: Context) -> None:
         """Take away units, those first that cost least for the work that they save."""
-        whole = work.macs(groups)
+        sizes = [group.size for group in groups]
+        whole = left = work.macs(sizes)
         goal = whole * (1 - self.ratio)
-        while (left := work.macs(groups)) > goal:
+        while left > goal:
             context.tell("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
-            prices = [(cost / (left - work.macs(groups, group, loses)), number, loses)
-                      for number, group in enumerate(groups)
-                      for cost, loses in [_cheapest(group, self.least)]
-                      if loses and left > work.macs(groups, group, loses)]  # fmt: skip
+            prices = []
+            for number, group in enumerate(groups):
+                cost, loses = _cheapest(group, self.least)
+                saved = left - work.macs([*sizes[:number], sizes[number] - len(loses), *sizes[number + 1 :]])
+                prices += [(cost / saved, number, loses)] if saved > 0 else []
             if not prices:
                 raise RecipeError(
                     f"No more than {1 - left / whole:.1%} of the multiply-accumulates can go.",
                     f"ask for less: --ratio {1 - left / whole:.2f}; let less stay: --least; or vlatool prune depth",
                 )
             _, number, loses = min(prices)
-            groups[number].keep = [unit for unit in groups[number].keep if unit not in set(loses)]
+            gone = set(loses)
+            groups[number].keep = [unit for unit in groups[number].keep if unit not in gone]
+            sizes[number] = len(groups[number].keep)
+            left = work.macs(sizes)
 
 
 class _Work:
@@ -165,17 +172,22 @@ class _Work:
     Args:
         walks: Graph name -> walk.
         runs: Graph name -> how often it runs.
+        groups: Whose units may go.
     """
 
-    def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int]) -> None:
-        self._walks, self._runs = walks, runs
+    def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[_Group]) -> None:
+        numbers = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
+        self._terms: list[tuple[int, list[int]]] = []
+        for graph, walk in walks.items():
+            for product in walk.products:
+                leaves = [leaf for axis in product for leaf in walk.factors.leaves(axis)]
+                loses = [numbers[graph, leaf] for leaf in leaves if (graph, leaf) in numbers]
+                fixed = [walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in numbers]
+                self._terms.append((runs[graph] * math.prod(fixed), loses))
 
-    def macs(self, groups: Sequence[_Group], losing: _Group | None = None, loses: Sequence[int] = ()) -> int:
-        """Return the work with what groups keep, and one of them without some more."""
-        keep: dict[str, dict[int, int]] = {graph: {} for graph in self._walks}
-        for group in groups:
-            keep[group.graph][group.leaf] = len(group.keep) - (len(loses) if group is losing else 0)
-        return sum(walk.macs(keep[graph]) * self._runs[graph] for graph, walk in self._walks.items())
+    def macs(self, sizes: Sequence[int]) -> int:
+        """Return the work with so many units of each group."""
+        return sum(fixed * math.prod(sizes[number] for number in loses) for fixed, loses in self._terms)
 
 
 def _is_slowest(walk: Walk, members: Sequence[Member]) -> bool:
