@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -19,7 +19,7 @@ from vlatool.data import recorded_observations
 from vlatool.episodes.play import run_jobs
 from vlatool.errors import RecipeError, nearest, require
 from vlatool.files.work import forget, work_directory
-from vlatool.machine.host import cache_directory
+from vlatool.machine import host
 from vlatool.module.batched import BatchedProgram
 from vlatool.module.edits import Edit, read_edits
 from vlatool.module.stage import TRAINING, Changed, ModuleStage, write_changed
@@ -28,7 +28,7 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.stage.cache import STREAMS
 from vlatool.training.frames import Frames, joined
-from vlatool.training.loop import Settings, Trainer
+from vlatool.training.loop import Settings, Trainer, has_bfloat16
 from vlatool.training.rounds import LABEL, NOISE, label, next_round, scene_of, tensors, write_recorded
 
 if TYPE_CHECKING:
@@ -73,6 +73,9 @@ class PolicyDistillation(ModuleStage):
     noise: float = Field(0.1, ge=0, le=1, description="disturbs the actions in these episodes: share of their spread")
     first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode to train on")
     seed: int = Field(0, ge=0, description="of batches and noise")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="of matrix products in training; bfloat16 where the processor has it"
+    )
     threads: int = Field(0, ge=0, description="of torch; all cores of this process when 0")
 
     def inputs(self) -> tuple[Path, ...]:
@@ -114,7 +117,7 @@ class PolicyDistillation(ModuleStage):
         torch = require("torch", "build")
         before = torch.get_num_threads()
         torch.set_num_threads(self.threads or before)
-        place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+        place = host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
         try:
             with work_directory(place):
                 training = _Distillation(self, modules, source, place, context).run()
@@ -141,7 +144,10 @@ class _Distillation:
         self._loss_name = stage.loss_for(source)
         self._loss = _loss_of(stage, self._loss_name)
         self._frames = Frames(place)
-        settings = Settings(stage.steps, stage.learning_rate, stage.weight_decay, stage.average, stage.seed)
+        self._bfloat16 = stage.precision == "bfloat16" or (stage.precision == "auto" and has_bfloat16(host.isa()))
+        settings = Settings(
+            stage.steps, stage.learning_rate, stage.weight_decay, stage.average, stage.seed, self._bfloat16
+        )
         self._trainer = Trainer(modules, settings, place)
 
     def run(self) -> dict[str, Any]:
@@ -155,7 +161,8 @@ class _Distillation:
             self._trainer.save()
         self._trainer.finish()
         rounds = [json.loads((self._place / ROUND.format(number)).read_text()) for number in range(len(ends))]
-        return {"loss": self._loss_name, "losses": self._trainer.losses, "rounds": rounds}
+        precision = "bfloat16" if self._bfloat16 else "float32"
+        return {"loss": self._loss_name, "precision": precision, "losses": self._trainer.losses, "rounds": rounds}
 
     def _pauses(self) -> list[int]:
         """Return before which steps the student plays."""
@@ -210,7 +217,7 @@ class _Distillation:
         rows = self._frames.batch(random.integers(len(self._frames), size=self._stage.batch))
         values = self._student.run(tensors(rows), tensors(rows, NOISE))
         name = self._spec.action.name
-        loss: Tensor = self._loss(values[name], tensors(rows, LABEL)[name])
+        loss: Tensor = self._loss(values[name].float(), tensors(rows, LABEL)[name])
         return loss
 
     def _tell(self, step: int, loss: float) -> None:
