@@ -30,7 +30,7 @@ from vlatool.graph.workload import workload
 from vlatool.hardware.profile import load_profile, names
 from vlatool.latency_model.model import shipped
 from vlatool.machine.host import cache_directory
-from vlatool.prune.magnitude import Magnitude
+from vlatool.prune.neurons import Neurons
 from vlatool.render.sections.boards import limit_ms
 from vlatool.stage.base import Context
 from vlatool.stage.run import run_transform
@@ -128,7 +128,7 @@ def test_a_carried_count_with_odd_values_is_made_again(change: dict[str, Any], p
 def test_a_pruned_policy_does_not_take_the_count_of_the_whole_one(policy_dir: Path, tmp_path: Path) -> None:
     carry_count(str(policy_dir), Context())
     whole = opened(str(policy_dir), Context())
-    pruned = run_transform(Magnitude(ratio=0.5), whole, tmp_path / "pruned", Context())
+    pruned = run_transform(Neurons(ratio=0.5), whole, tmp_path / "pruned", Context())
     assert counted(pruned, Context()) == torch_workload(pruned)
     assert counted(pruned, Context()).graphs["main"].weights < counted(whole, Context()).graphs["main"].weights
     with pytest.raises(UsageError, match="is a bundle; only a policy with code carries a count"):

@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 import typer
 from _acts import POLICY_YAML, policy
+from safetensors.torch import load_file, save_file
 
 from vlatool.cli import app, main
 from vlatool.cli._document import document, output, report_document
@@ -37,7 +38,11 @@ QUICK = "--iterations 20 --duration 0"
 LINES = {
     "optimize": "{policy} -o {out} --episodes 0 --no-search --iterations 20",
     "export onnx": "{policy} -o {out}",
-    "prune magnitude": "{policy} -o {out}",
+    "prune": "{policy} -o {out} --samples 2",
+    "prune neurons": "{policy} -o {out}",
+    "prune structured": "{policy} -o {out} --samples 2 --multiple 1",
+    "prune depth": "{deep} -o {out} --samples 2",
+    "distill policy": "{policy} -o {out} --steps 2 --batch 2 --episodes 1 --student-episodes 0",
     "distill weights": "{policy} --file {tuned} -o {out}",
     "quantize bfloat16": "{policy} -o {out}",
     "quantize float8": "{policy} -o {out}",
@@ -125,15 +130,27 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
     original = "import vlatool\npolicy = vlatool.load(BUNDLE)\ndef act(given):\n    return policy.infer(given).chunk\n"
     (here / "original.py").write_text(original.replace("BUNDLE", repr(str(here / "bundle"))))
     with pytest.raises(SystemExit) as left:
-        main(["prune", str(noisy), "-o", str(here / "pruned"), "--ratio", "0.01"])
+        main(["prune", "neurons", str(noisy), "-o", str(here / "pruned"), "--ratio", "0.01"])
     assert not left.value.code
     made = {
+        "deep": deeper(noisy, here / "deep"),
         "bundle": here / "bundle",
         "tuned": here / "pruned/module/main.safetensors",
         "original": here / "original.py",
         "gate": here / "gate.yaml",
     }
     return SimpleNamespace(policy=noisy, **made, here=here)
+
+
+def deeper(policy: Path, folder: Path) -> Path:
+    """Copy a policy with a second block like the first."""
+    shutil.copytree(policy, folder)
+    description = folder / "policy.yaml"
+    description.write_text(description.read_text().replace("layers: 1", "layers: 2"))
+    weights = load_file(folder / "weights.safetensors")
+    second = {name.replace("blocks.0", "blocks.1"): value.clone() for name, value in weights.items()}
+    save_file({**second, **weights}, folder / "weights.safetensors")
+    return folder
 
 
 def validate(value: Any, name: str) -> None:

@@ -18,7 +18,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.machine.host import cache_directory
 from vlatool.module.edits import read_edits
 from vlatool.module.torch_policy import torch_policy
-from vlatool.prune.magnitude import Magnitude
+from vlatool.prune.neurons import Neurons
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
@@ -35,7 +35,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def pruned(source_bundle: Bundle, tmp_path: Path) -> Bundle:
-    return run_transform(Magnitude(ratio=0.7), source_bundle, tmp_path / "pruned", Context())
+    return run_transform(Neurons(ratio=0.7), source_bundle, tmp_path / "pruned", Context())
 
 
 def error(bundle: Bundle, whole: Bundle) -> float:
@@ -53,7 +53,7 @@ def test_it_recovers_what_pruning_lost(pruned: Bundle, source_bundle: Bundle, tm
     made = distilled(pruned, tmp_path / "out", steps=60, batch=16, average=0.9, episodes=0, student_episodes=0)
     assert error(made, source_bundle) < 0.5 * error(pruned, source_bundle)
     assert read_edits(made) == read_edits(pruned)
-    assert [step["stage"] for step in made.manifest.build[-2:]] == ["prune.magnitude", "distill.policy"]
+    assert [step["stage"] for step in made.manifest.build[-2:]] == ["prune.neurons", "distill.policy"]
 
 
 def test_teacher_and_student_play_and_the_result_is_exported_and_made_again(

@@ -115,7 +115,7 @@ def test_wrong_options_are_told(source_bundle: Bundle, options: dict[str, object
 def test_without_a_stack_widths_are_proposed(source_bundle: Bundle, float_bundle: Bundle, tmp_path: Path):
     with pytest.raises(RecipeError, match="has no stack of blocks") as caught:
         run_transform(Depth(), source_bundle, tmp_path / "out", Context())
-    assert "vlatool prune magnitude" in caught.value.fix
+    assert "vlatool prune neurons" in caught.value.fix
     with pytest.raises(BundleError, match="has no torch modules"):
         run_transform(Depth(), float_bundle, tmp_path / "out", Context())
 

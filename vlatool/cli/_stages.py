@@ -24,8 +24,8 @@ DEFAULTS = {
     "export": "onnx",
     "quantize": "static-int8",
     "benchmark": "latency",
-    "prune": "magnitude",
-    "distill": "weights",
+    "prune": "structured",
+    "distill": "policy",
     "evaluate": "recorded",
 }
 """The method of a command that names none."""

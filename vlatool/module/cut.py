@@ -45,7 +45,7 @@ def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
         reason = (message_of(error).splitlines() or [""])[0]
         raise SourceError(
             f"torch.export cannot trace {type(module).__name__}: {type(error).__name__}: {reason}.",
-            "prune what needs no trace: vlatool prune depth, vlatool prune magnitude",
+            "prune what needs no trace: vlatool prune depth, vlatool prune neurons",
         ) from error
 
 

@@ -97,7 +97,7 @@ class Depth(ModuleStage):
             raise RecipeError(
                 f"{source.manifest.name} has no stack of blocks: an nn.ModuleList or nn.Sequential of modules of one "
                 "class, each of which gives what it takes.",
-                "prune widths instead: vlatool prune magnitude",
+                "prune widths instead: vlatool prune neurons",
             )
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):

@@ -1,95 +1,24 @@
-"""Structured pruning by magnitude: whole neurons are removed, so that every engine is faster without sparse kernels."""
+"""Magnitude pruning: the smallest weights become zero."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, ClassVar
 
-from pydantic import Field
-
-from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, nearest, require
-from vlatool.graph.nodes import matches
-from vlatool.module.edits import Edit
-from vlatool.module.stage import Changed, ModuleStage
-from vlatool.stage.base import Context
+from vlatool.prune._sparse import Sparse
 
 if TYPE_CHECKING:
-    from torch import nn
-
-ELEMENTWISE = (
-    "CELU", "Dropout", "ELU", "GELU", "Hardsigmoid", "Hardswish", "Hardtanh", "Identity", "LeakyReLU", "Mish", "ReLU",
-    "ReLU6", "SELU", "SiLU", "Sigmoid", "Softplus", "Softsign", "Tanh",
-)  # fmt: skip
-"""Modules of torch that treat every element alike, so that a neuron before them is one behind them."""
+    from torch import Tensor
 
 
-class Magnitude(ModuleStage):
-    """Remove the neurons of least magnitude from the hidden layers of MLPs.
+class Magnitude(Sparse):
+    """Set the smallest weights of each layer to zero (Han et al., arXiv 1506.02626).
 
-    A hidden layer is what is between two Linear layers of an ``nn.Sequential`` with nothing but elementwise modules
-    between them. A neuron's magnitude is the product of the L2 norms of its incoming and of its outgoing weights: what
-    it can add to the output. Train the policy further afterwards (``vlatool distill weights`` takes the result).
+    Shapes stay: processors multiply zeros like other numbers, so that nothing is faster there. It is here to compare
+    with, and for sparse tensor cores (--pattern 2:4).
     """
 
-    ratio: float = Field(0.25, gt=0, lt=1, description="share of the neurons of each hidden layer to remove")
-    multiple: int = Field(8, ge=1, description="the neurons that stay are a multiple of this, for vector units")
-    include: tuple[str, ...] = Field((), description="globs of module names (of the first Linear); all when empty")
-    exclude: tuple[str, ...] = Field((), description="globs of module names to leave as they are")
+    looks: ClassVar[bool] = False
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
-        """Choose the neurons that stay.
-
-        Raises:
-            RecipeError: when no hidden layer can be pruned, or a pattern matches none.
-        """
-        layers = [(graph, *layer) for graph, module in modules.items() for layer in hidden_layers(module)]
-        names = [first for _, first, *_ in layers]
-        for pattern in (*self.include, *self.exclude):
-            if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(f"No hidden layer matches '{pattern}'; {nearest(pattern, names)}.")
-        edits: list[Edit] = []
-        for graph, first, second, incoming, outgoing in layers:
-            if (not self.include or matches(first, self.include)) and not matches(first, self.exclude):
-                context.tell(f"pruning {first}", None)
-                keep = self._kept(incoming, outgoing)
-                edits += [Edit(graph, first, "outputs", keep), Edit(graph, second, "inputs", keep)]
-        if not edits:
-            raise RecipeError(
-                f"{source.manifest.name} has no hidden layer to prune: two Linear layers of an nn.Sequential, with "
-                "elementwise modules between them.",
-                "look at --include and --exclude; other structures cannot be pruned yet",
-            )
-        return Changed(tuple(edits))
-
-    def _kept(self, incoming: Any, outgoing: Any) -> tuple[int, ...]:
-        """Return the indices of the neurons that stay, in their order."""
-        torch = require("torch", "build")
-        size = incoming.out_features
-        share = max(1, round(size * (1 - self.ratio)))
-        count = min(size, max(self.multiple, self.multiple * round(share / self.multiple)))
-        magnitude = incoming.weight.detach().double().norm(dim=1) * outgoing.weight.detach().double().norm(dim=0)
-        chosen = torch.argsort(magnitude, descending=True, stable=True)[:count]
-        return tuple(sorted(int(index) for index in chosen))
-
-
-def hidden_layers(module: nn.Module) -> Iterator[tuple[str, str, Any, Any]]:
-    """Yield (name, name of the next, Linear, next Linear) of each hidden layer; weights that others share are left."""
-    torch = require("torch", "build")
-    held = [value for part in module.modules() for value in (*part._parameters.values(), *part._modules.values())]
-    seen = Counter(map(id, held))
-    for name, part in module.named_modules():
-        if type(part) is not torch.nn.Sequential:
-            continue
-        first: tuple[str, Any] | None = None
-        for key, child in part._modules.items():
-            place = f"{name}.{key}" if name else key
-            if type(child) is torch.nn.Linear:
-                if first is not None and all(
-                    seen[id(weight)] < 2 for layer in (first[1], child) for weight in (layer, layer.weight)
-                ):
-                    yield first[0], place, first[1], child
-                first = place, child
-            elif type(child).__name__ not in ELEMENTWISE or not type(child).__module__.startswith("torch.nn"):
-                first = None
+    def sparse(self, weight: Tensor, given: Tensor | None) -> Tensor:
+        """Return the weight without its smallest values."""
+        return weight.masked_fill(self.goes(weight.abs(), rows=False), 0)

@@ -85,6 +85,8 @@ class Engine:
     """Whether ``ONEDNN_MAX_CPU_ISA`` says what it computes in."""
     searched: ClassVar[bool] = False
     """Whether ``optimize`` looks for further plans beside its candidates where a board runs this engine."""
+    sparse: ClassVar[tuple[str, ...]] = ()
+    """Patterns of zeros in weights that its kernels skip, such as ``2:4``."""
     layouts: ClassVar[Mapping[str, Int8Layout]] = {}
     """Layouts of its own for int8 graphs, beside the standard one: name -> what is written."""
     int8: ClassVar[Mapping[str, Any]] = {"layout": "qdq", "activations": "int8"}

@@ -17,7 +17,7 @@ from vlatool.errors import BundleError, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.module.edits import read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
-from vlatool.prune.magnitude import Magnitude, hidden_layers
+from vlatool.prune.neurons import Neurons, hidden_layers
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
@@ -32,7 +32,7 @@ def actions(policy, bundle: Bundle) -> np.ndarray:
 @pytest.fixture
 def pruned(source_bundle: Bundle, tmp_path: Path) -> Bundle:
     """The tiny policy with half of its hidden neurons."""
-    return run_transform(Magnitude(ratio=0.5), source_bundle, tmp_path / "pruned", Context())
+    return run_transform(Neurons(ratio=0.5), source_bundle, tmp_path / "pruned", Context())
 
 
 def test_neurons_of_least_magnitude_go(pruned: Bundle, source_bundle: Bundle):
@@ -52,7 +52,7 @@ def test_it_is_exported_run_and_made_again(pruned: Bundle, policy_template: Path
     assert relative_error(got, actions(torch_policy(pruned, 0), made)) < 1e-5
     assert [entry["stage"] for entry in made.manifest.build] == [
         "sources.torch_module",
-        "prune.magnitude",
+        "prune.neurons",
         "export.onnx",
     ]
     again = rebuild(made, Context(), source=str(policy_template), cache=tmp_path / "cache")
@@ -65,7 +65,7 @@ def test_it_is_smaller_and_counted_as_such(pruned: Bundle, source_bundle: Bundle
 
 
 def test_pruning_again_starts_where_it_was(pruned: Bundle, tmp_path: Path):
-    again = run_transform(Magnitude(ratio=0.5), pruned, tmp_path / "again", Context())
+    again = run_transform(Neurons(ratio=0.5), pruned, tmp_path / "again", Context())
     assert [len(edit.keep) for edit in read_edits(again)] == [16, 16, 8, 8]
     assert again.manifest.parent == pruned.hash
     torch_policy(again, 0).infer(recorded_observations(again, 1)[0])
@@ -80,8 +80,8 @@ def test_other_weights_take_the_structure_that_is_left(pruned: Bundle, tmp_path:
 
 def test_the_share_is_rounded_to_what_vector_units_want():
     layer, after = nn.Linear(4, 30), nn.Linear(30, 2)
-    assert [len(Magnitude(ratio=ratio)._kept(layer, after)) for ratio in (0.01, 0.25, 0.5, 0.99)] == [30, 24, 16, 8]
-    assert len(Magnitude(ratio=0.5, multiple=1)._kept(layer, after)) == 15
+    assert [len(Neurons(ratio=ratio)._kept(layer, after)) for ratio in (0.01, 0.25, 0.5, 0.99)] == [30, 24, 16, 8]
+    assert len(Neurons(ratio=0.5, multiple=1)._kept(layer, after)) == 15
 
 
 def test_layers_are_hidden_where_nothing_else_reads_them():
@@ -107,10 +107,10 @@ def test_patterns_choose_and_wrong_ones_are_named(source_bundle: Bundle, tmp_pat
         ({"exclude": ("*",)}, "no hidden layer"),
     ):
         with pytest.raises(RecipeError, match=says):
-            run_transform(Magnitude(**options), source_bundle, tmp_path / "out", Context())
+            run_transform(Neurons(**options), source_bundle, tmp_path / "out", Context())
     assert not (tmp_path / "out").exists()
 
 
 def test_what_has_graphs_cannot_be_pruned(float_bundle: Bundle, tmp_path: Path):
     with pytest.raises(BundleError, match=r"has no torch modules that prune\.magnitude could change"):
-        run_transform(Magnitude(), float_bundle, tmp_path / "out", Context())
+        run_transform(Neurons(), float_bundle, tmp_path / "out", Context())

@@ -1,0 +1,101 @@
+"""Zeros in weights: how many, where, what they cost, and that nobody is told that they are faster."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.errors import RecipeError
+from vlatool.export.onnx import ExportOnnx
+from vlatool.module.torch_policy import load_modules
+from vlatool.prune._sparse import Sparse, _rows
+from vlatool.prune.magnitude import Magnitude
+from vlatool.prune.sparsegpt import SparseGpt
+from vlatool.prune.wanda import Wanda
+from vlatool.runtime import load
+from vlatool.stage.base import Context
+from vlatool.stage.run import run_transform
+
+METHODS = (Magnitude, Wanda, SparseGpt)
+
+
+def layer_data(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """A weight, and inputs whose elements go together and differ in size."""
+    random = torch.Generator().manual_seed(seed)
+    mixed = torch.randn(400, 24, generator=random, dtype=torch.float64) @ torch.randn(
+        24, 24, generator=random, dtype=torch.float64
+    )
+    return torch.randn(16, 24, generator=random), mixed * torch.logspace(-1, 1, 24)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("ratio", [0.25, 0.5, 0.7])
+def test_as_many_weights_as_asked_are_zero(method: type[Sparse], ratio: float):
+    weight, rows = layer_data()
+    made = method(ratio=ratio).sparse(weight.clone(), rows.T @ rows / len(rows))
+    assert float((made == 0).float().mean()) == pytest.approx(ratio, abs=0.02)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("pattern", "of"), [("2:4", 4), ("4:8", 8)])
+def test_patterns_hold_among_neighbours(method: type[Sparse], pattern: str, of: int):
+    weight, rows = layer_data()
+    made = method(pattern=pattern).sparse(weight.clone(), rows.T @ rows / len(rows))
+    zeros = (made == 0).reshape(len(made), -1, of).sum(-1)
+    assert set(zeros.unique().tolist()) == {of // 2}
+
+
+def test_what_looks_at_the_inputs_loses_less_and_correcting_loses_least():
+    weight, rows = layer_data()
+    wanted = rows @ weight.double().T
+    errors = [
+        float(torch.linalg.norm(rows @ method().sparse(weight.clone(), rows.T @ rows / len(rows)).double().T - wanted))
+        for method in METHODS
+    ]
+    assert errors[2] < 0.8 * errors[1]
+    assert errors[1] < errors[0]
+
+
+@pytest.mark.parametrize("layer", [
+    nn.Linear(6, 4), nn.Conv2d(6, 4, 3, stride=2, padding=1), nn.Conv2d(6, 4, 3, padding="same"),
+    nn.Conv1d(6, 4, 3, padding=1, dilation=1),
+])  # fmt: skip
+def test_rows_are_what_the_weight_is_multiplied_with(layer: nn.Module):
+    shape = {nn.Linear: (2, 5, 6), nn.Conv1d: (2, 6, 9), nn.Conv2d: (2, 6, 9, 9)}[type(layer)]
+    given = torch.randn(shape)
+    product = _rows(layer, given) @ layer.weight.detach().reshape(4, -1).T
+    wanted = layer(given) - layer.bias.reshape((4, *[1] * (len(shape) - 2)) if len(shape) > 2 and not isinstance(
+        layer, nn.Linear) else (4,))  # fmt: skip
+    wanted = wanted if isinstance(layer, nn.Linear) else wanted.movedim(1, -1)
+    torch.testing.assert_close(product.reshape(wanted.shape), wanted.detach(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_policy_is_exported_with_its_zeros_and_nobody_is_told_that_it_is_faster(
+    method: type[Sparse], source_bundle: Bundle, tmp_path: Path
+):
+    stage = method(samples=4, include=("blocks.*",))
+    pruned = run_transform(stage, source_bundle, tmp_path / "pruned", Context())
+    linear = load_modules(pruned)["main"].blocks[0].mlp[1]
+    assert float((linear.weight == 0).float().mean()) == pytest.approx(0.5, abs=0.02)
+    first, second, *_ = stage.lines(pruned)
+    assert "of the weights are zero; no tensor is smaller" in first
+    assert "nothing is faster" in second
+    if method is Wanda:
+        made = run_transform(ExportOnnx(), pruned, tmp_path / "out", Context())
+        assert load(made.path).infer(recorded_observations(made, 1)[0]).chunk.shape == (4, 2)
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"include": ("blok.*",)}, r"No layer matches 'blok.\*'"),
+    ({"exclude": ("*",)}, "has no layer to prune"),
+    ({"pattern": "2:4", "ratio": 0.7}, "The pattern 2:4 keeps half of the weights"),
+])  # fmt: skip
+def test_wrong_options_are_told(source_bundle: Bundle, options: dict[str, object], says: str):
+    with pytest.raises(RecipeError, match=says):
+        Magnitude(**options).change(load_modules(source_bundle), source_bundle, Context())

@@ -1,0 +1,177 @@
+"""What methods share that set single weights to zero."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import observations_for
+from vlatool.errors import RecipeError, nearest, require
+from vlatool.graph.nodes import matches
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.edits import read_tensors
+from vlatool.module.stage import Changed, ModuleStage
+from vlatool.runtime.engine import usable_engines
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.stage.base import Context
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+PATTERNS = {"2:4": (2, 4), "4:8": (4, 8)}
+"""Pattern -> how many of how many neighbours along the inputs stay."""
+PROTECTED = ("embed", "norm", "head", "action")
+"""Parts of names of layers that stay dense unless --include names them."""
+
+
+class Sparse(ModuleStage):
+    """Sets single weights of Linear and convolution layers to zero; shapes stay, and so does the time on processors."""
+
+    looks: ClassVar[bool] = True
+    """Whether the method looks at what layers are given."""
+
+    ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that becomes zero")
+    pattern: Literal["unstructured", "2:4", "4:8"] = Field(
+        "unstructured",
+        description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
+    )
+    samples: int = Field(32, ge=1, description="recorded observations to look at")
+    include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
+    exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+        """Set weights to zero.
+
+        Raises:
+            RecipeError: when no layer is chosen, or the ratio is not that of the pattern.
+        """
+        if self.pattern != "unstructured" and self.ratio != 0.5:
+            raise RecipeError(f"The pattern {self.pattern} keeps half of the weights.", "leave --ratio out")
+        layers = self._layers(modules, source)
+        given = self._given(layers, modules, source, context) if self.looks else {}
+        for number, (name, layer) in enumerate(layers.items()):
+            context.tell(f"pruning {name}", number / len(layers))
+            flat = layer.weight.detach().reshape(len(layer.weight), -1)
+            layer.weight.data = self.sparse(flat, given.get(name)).reshape(layer.weight.shape).to(layer.weight.dtype)
+        return Changed()
+
+    def sparse(self, weight: Tensor, given: Tensor | None) -> Tensor:
+        """Return a weight with zeros.
+
+        Args:
+            weight: (outputs, inputs).
+            given: Gram matrix of what the layer is given, (inputs, inputs), where the method looks at it.
+        """
+        raise NotImplementedError(self.name())
+
+    def goes(self, score: Tensor, rows: bool) -> Tensor:
+        """Return which weights go: those of the least scores.
+
+        Args:
+            score: (outputs, inputs).
+            rows: Whether weights compete within their row, rather than in the whole layer.
+        """
+        torch = require("torch", "build")
+        if self.pattern != "unstructured":
+            stay, of = PATTERNS[self.pattern]
+            padded = torch.nn.functional.pad(score, (0, -score.shape[1] % of), value=torch.inf)
+            ranks = padded.reshape(len(score), -1, of).argsort(dim=-1, stable=True).argsort(dim=-1)
+            whole = (ranks < of - stay).reshape(len(score), -1)
+            within: Tensor = whole[:, : score.shape[1]]
+            return within
+        flat = score if rows else score.reshape(1, -1)
+        count = round(flat.shape[1] * self.ratio)
+        ranks = flat.argsort(dim=1, stable=True).argsort(dim=1)
+        least: Tensor = (ranks < count).reshape(score.shape)
+        return least
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Say how many weights are zero, and which engine gains by it."""
+        zeros = total = 0
+        for name in made.manifest.files:
+            for tensor in read_tensors(made.file(name)).values() if name.endswith(".safetensors") else ():
+                zeros += int((tensor == 0).sum()) if tensor.dim() > 1 else 0
+                total += tensor.numel() if tensor.dim() > 1 else 0
+        engines = usable_engines().values()
+        gains = [engine.title for engine in engines if self.pattern in engine.sparse]
+        others = " and ".join(engine.title for engine in engines)
+        return (
+            f"{zeros / max(1, total):.1%} of the weights are zero; no tensor is smaller",
+            f"faster in {', '.join(gains)}" if gains else f"{others} multiply zeros like other numbers: nothing is "
+            "faster (measure it: vlatool compare). 2:4 is for sparse tensor cores; for speed: vlatool prune structured",
+            *super().lines(made),
+        )  # fmt: skip
+
+    def _layers(self, modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Any]:
+        nn = require("torch", "build").nn
+        kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
+        named = {
+            name: part
+            for module in modules.values()
+            for name, part in module.named_modules()
+            if isinstance(part, kinds)
+        }
+        for pattern in (*self.include, *self.exclude):
+            if not any(matches(name, (pattern,)) for name in named):
+                raise RecipeError(f"No layer matches '{pattern}'; {nearest(pattern, list(named))}.")
+        chosen = {name: part for name, part in named.items() if self._may_lose(name)}
+        if not chosen:
+            raise RecipeError(f"{source.manifest.name} has no layer to prune.", "look at --include and --exclude")
+        return chosen
+
+    def _may_lose(self, name: str) -> bool:
+        protected = any(word in part for part in name.lower().split(".") for word in PROTECTED)
+        asked = matches(name, self.include) if self.include else not protected
+        return asked and not matches(name, self.exclude)
+
+    def _given(
+        self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context
+    ) -> dict[str, Tensor]:
+        """Return name of a layer -> mean of x xT over what it is given on recorded observations."""
+        torch = require("torch", "build")
+        encode = ObservationEncoder(source.manifest.spec, source)
+        program = BatchedProgram(source.manifest.program, modules)
+        noise = drawn(program.noise, 1, np.random.default_rng(0))
+        sums: dict[str, Any] = {}
+        counts: dict[str, int] = {}
+
+        def hook(name: str) -> Any:
+            def look(layer: Any, arguments: tuple[Any, ...]) -> None:
+                rows = _rows(layer, arguments[0]).double()
+                sums[name] = sums.get(name, 0) + rows.T @ rows
+                counts[name] = counts.get(name, 0) + len(rows)
+
+            return look
+
+        with contextlib.ExitStack() as stack, torch.no_grad():
+            for name, layer in layers.items():
+                stack.callback(layer.register_forward_pre_hook(hook(name)).remove)
+            observations = observations_for(source, self.samples)
+            for number, observation in enumerate(observations):
+                context.tell("looking at what layers are given", number / len(observations))
+                inputs = {name: torch.from_numpy(np.array(value)) for name, value in encode(observation).items()}
+                program.run(inputs, noise)
+        return {name: total / counts[name] for name, total in sums.items()}
+
+
+def _rows(layer: Any, given: Tensor) -> Tensor:
+    """Return what a layer's weight is multiplied with, a row for each product: (N, inputs)."""
+    torch = require("torch", "build")
+    if not hasattr(layer, "kernel_size"):
+        return given.reshape(-1, given.shape[-1])
+    size, steps, holes = layer.kernel_size, layer.stride, layer.dilation
+    pads = layer.padding
+    if isinstance(pads, str):
+        pads = tuple(hole * (side - 1) // 2 if pads == "same" else 0 for hole, side in zip(holes, size, strict=True))
+    if given.dim() == 3:  # one dimension: a picture of one row
+        given, size, pads, steps, holes = given[:, :, None], (1, *size), (0, *pads), (1, *steps), (1, *holes)
+    columns = torch.nn.functional.unfold(given.float(), size, holes, pads, steps)
+    groups = layer.groups
+    parts = columns.reshape(len(given), groups, -1, columns.shape[-1]).mean(1) if groups > 1 else columns
+    rows: Tensor = parts.transpose(1, 2).reshape(-1, parts.shape[1])
+    return rows
