@@ -162,7 +162,14 @@ class _Distillation:
         self._trainer.finish()
         rounds = [json.loads((self._place / ROUND.format(number)).read_text()) for number in range(len(ends))]
         precision = "bfloat16" if self._bfloat16 else "float32"
-        return {"loss": self._loss_name, "precision": precision, "losses": self._trainer.losses, "rounds": rounds}
+        threads = require("torch", "build").get_num_threads()
+        return {
+            "loss": self._loss_name,
+            "precision": precision,
+            "threads": threads,
+            "losses": self._trainer.losses,
+            "rounds": rounds,
+        }
 
     def _pauses(self) -> list[int]:
         """Return before which steps the student plays."""
