@@ -51,7 +51,7 @@ def test_a_bundle_answers_and_one_that_load_refuses_is_told_with_how_wrong_it_is
     assert found["right"].engine.startswith("ort_cpu 1.")
     assert found["right"].arithmetic
     assert found["wrong one"].refused == "GraphError"
-    assert "another golden action" in found["wrong one"].why
+    assert "a different golden action" in found["wrong one"].why
     assert found["wrong one"].golden == pytest.approx(0.3 / 1.3, abs=1e-3)
     np.testing.assert_array_equal(found["wrong one"].actions, found["right"].actions)
     assert (found["none"].refused, found["none"].actions) == ("BundleError", None)

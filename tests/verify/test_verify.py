@@ -188,7 +188,7 @@ def test_one_observation_is_named_in_the_singular(bundles, against):
 def test_the_terminal_begins_with_numbers_and_has_no_table_without_any(bundles, against):
     shown = TerminalRenderer().render(found(bundles["source"], against(), samples=1))
     assert "variant" not in shown
-    assert "error max, dx" in shown
+    assert "Action error max by dimension" in shown
 
 
 def test_small_errors_keep_their_digits(float_bundle):
@@ -267,7 +267,7 @@ BAD = {
     "leaves": ("raise SystemExit(0)", "sys.exit"),
     "dies": ("import os; os._exit(0)", "ended"),
     "text": ("return 'left'", "wanted an array of numbers"),
-    "bfloat16": ("import torch; return torch.zeros(4, 2, dtype=torch.bfloat16)", "is no array: .*BFloat16"),
+    "bfloat16": ("import torch; return torch.zeros(4, 2, dtype=torch.bfloat16)", "is not an array: .*BFloat16"),
 }
 
 

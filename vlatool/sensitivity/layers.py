@@ -215,7 +215,10 @@ class Switchboard:
             DataError: when there is no observation.
         """
         if not observations:
-            raise DataError("No observations to measure the layers on.", "record some: see docs/data")
+            raise DataError(
+                "No observations to measure the layers on.",
+                "record some, and name them in policy.yaml: calibration: FILE.npz; see docs/guides/your-own-policy.md",
+            )
         spec = self.policy.spec.action
         rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
         start = time.monotonic()

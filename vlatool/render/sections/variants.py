@@ -29,6 +29,9 @@ class Variants:
             yield Section("Variants", (Text("The report has no rows."),), 20)
             return
         shown = columns(report)
+        numbers = any(item.known for row in report.rows for item in row.measurements if item.origin == "measured")
+        if not shown and numbers and not any(row.reason for row in report.rows):
+            return  # what was measured stands in another section
         heads = (Column(title, bars=name == LATENCY) for name, title in shown.items())
         lines = []
         for (row, css), bar in zip(tinted(report.rows), _bars(report), strict=True):
