@@ -13,7 +13,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.distill import policy
 from vlatool.distill.policy import PolicyDistillation
-from vlatool.errors import RecipeError
+from vlatool.errors import DataError, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.machine.host import cache_directory
 from vlatool.module.edits import read_edits
@@ -128,6 +128,21 @@ def test_a_teacher_that_does_something_else_is_refused(source_bundle: Bundle, po
     with pytest.raises(RecipeError, match="The teacher gives 'action' as "):
         distilled(source_bundle, tmp_path / "out", teacher=str(other.path))
     assert torch.get_num_threads() >= 1
+
+
+def test_a_teacher_that_is_exported_is_refused(source_bundle: Bundle, float_bundle: Bundle, tmp_path: Path):
+    with pytest.raises(RecipeError, match="has no torch modules that could teach"):
+        distilled(source_bundle, tmp_path / "out", teacher=str(float_bundle.path))
+
+
+def test_without_recordings_and_episodes_there_is_nothing_to_learn_from(policy_dir: Path, tmp_path: Path):
+    from vlatool.sources.torch_module import TorchModule
+
+    (policy_dir / "calibration.npz").unlink()
+    (policy_dir / "evaluation.npz").unlink(missing_ok=True)
+    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
+    with pytest.raises(DataError, match="no observations to train on"):
+        distilled(source, tmp_path / "out", episodes=0)
 
 
 def test_the_class_is_the_stage():

@@ -112,5 +112,5 @@ def test_patterns_choose_and_wrong_ones_are_named(source_bundle: Bundle, tmp_pat
 
 
 def test_what_has_graphs_cannot_be_pruned(float_bundle: Bundle, tmp_path: Path):
-    with pytest.raises(BundleError, match=r"has no torch modules that prune\.magnitude could change"):
+    with pytest.raises(BundleError, match=r"has no torch modules that prune\.neurons could change"):
         run_transform(Neurons(), float_bundle, tmp_path / "out", Context())

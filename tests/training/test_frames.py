@@ -48,5 +48,5 @@ def test_a_round_that_is_whole_is_not_written_again_and_a_draft_is(tmp_path: Pat
 
 def test_nothing_to_train_on_is_an_error(tmp_path: Path):
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="gave no observation to train on"):
+    with pytest.raises(DataError, match="no observations to train on"):
         joined((tmp_path / "empty", tmp_path / "none"), tmp_path)

@@ -235,6 +235,11 @@ def _teacher_of(stage: PolicyDistillation, source: Bundle) -> tuple[Bundle, tupl
     """Return the teacher's bundle, its edits, and its modules."""
     if stage.teacher:
         bundle = Bundle.open(stage.teacher)
+        if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
+            raise RecipeError(
+                f"{stage.teacher} has no torch modules that could teach: it is exported, or an ONNX file.",
+                "name the bundle that it was exported from",
+            )
         return bundle, read_edits(bundle), load_modules(bundle)
     return source, (), unedited_modules(source)
 

@@ -74,7 +74,10 @@ def joined(parts: Iterable[Path], target: Path) -> int:
     """
     folders = [part for part in parts if part.is_dir() and any(part.iterdir())]
     if not folders:
-        raise DataError("The episodes gave no observation to train on.", "let more of them be played: --episodes")
+        raise DataError(
+            "There are no observations to train on.",
+            "record some and name them in policy.yaml (calibration: FILE.npz), or name an environment there",
+        )
     names = sorted(file.name for file in folders[0].glob("*.npy"))
     for name in names:
         arrays = [np.load(folder / name, mmap_mode="r") for folder in folders]
