@@ -8,9 +8,10 @@ from torch import nn
 from torch.nn import functional
 
 from vlatool.errors import SourceError
-from vlatool.module.axes import Factors, Walk
+from vlatool.module.axes import Walk
 from vlatool.module.cut import RETRACE, cut, traced
 from vlatool.module.edits import Edit
+from vlatool.module.factors import Factors
 
 WIDTH, HEADS = 24, 4
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
-from vlatool.module.axes import Shape, Walk
+from vlatool.module.axes import Walk
+from vlatool.module.factors import Shape
 from vlatool.module.to_onnx import quiet_exporter
 
 if TYPE_CHECKING:
