@@ -42,7 +42,7 @@ LINES = {
     "prune neurons": "{policy} -o {out}",
     "prune structured": "{policy} -o {out} --samples 2 --multiple 1",
     "prune depth": "{deep} -o {out} --samples 2",
-    "distill policy": "{policy} -o {out} --steps 2 --batch 2 --episodes 1 --student-episodes 0",
+    "distill policy": "{pruned} -o {out} --trust {policy} --steps 2 --batch 2 --episodes 1 --student-episodes 0",
     "distill weights": "{policy} --file {tuned} -o {out}",
     "quantize bfloat16": "{policy} -o {out}",
     "quantize float8": "{policy} -o {out}",
@@ -135,6 +135,7 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
     made = {
         "deep": deeper(noisy, here / "deep"),
         "bundle": here / "bundle",
+        "pruned": here / "pruned",
         "tuned": here / "pruned/module/main.safetensors",
         "original": here / "original.py",
         "gate": here / "gate.yaml",

@@ -58,7 +58,9 @@ def test_it_is_the_runtimes_program(alone: bool):
 
 def test_a_module_that_fails_is_named():
     modules = {"encode": Encode(), "denoise": Denoise()}
-    with pytest.raises(SourceError, match=r"fails on a batch of observations: RuntimeError.*given seen \[1, 5\]"):
+    with pytest.raises(
+        SourceError, match=r"fails on an observation that fits its spec: RuntimeError.*given seen \[1, 5\]"
+    ):
         BatchedProgram(STEPS, modules).run({"x": torch.ones(2, 5)}, {"state": torch.ones(2, 3)})
 
 

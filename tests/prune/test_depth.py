@@ -12,7 +12,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
-from vlatool.prune.depth import Depth, protected, stacks
+from vlatool.prune._selection import Selection
+from vlatool.prune.depth import PROTECTED, Depth, stacks
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform
 
@@ -81,10 +82,11 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
         Depth(samples=2).change(modules, source_bundle, Context())
     chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context()).edits
     assert len(chosen[0].keep) == 2
-    assert protected("model.vision_tower.layers")
-    assert protected("ActionHead.blocks")
-    assert not protected("fusion")
-    assert not protected("language_model.layers")
+    protects = Selection((), (), PROTECTED).protects
+    assert protects("model.vision_tower.layers")
+    assert protects("ActionHead.blocks")
+    assert not protects("fusion")
+    assert not protects("language_model.layers")
 
 
 def test_stacks_are_blocks_of_one_kind():

@@ -1,24 +1,16 @@
 """What the robot imports, and what the command line does not: each in a fresh process."""
 
 import json
+import runpy
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 
-BUILD_PACKAGES = (
-    "torch",
-    "onnx",
-    "onnxscript",
-    "onnx_ir",
-    "pydantic",
-    "typer",
-    "rich",
-    "yaml",
-    "psutil",
-    "jinja2",
-    "scipy",
-)
+CONTROLLER = Path(__file__).parents[1] / "robot/controller.py"
+BUILD_PACKAGES = tuple(sorted(runpy.run_path(str(CONTROLLER))["BLOCKED"]))
+"""What a robot does not have."""
 ROBOT = f"""
 import sys
 

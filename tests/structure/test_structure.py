@@ -26,6 +26,12 @@ def test_the_root_holds_few_modules():
     assert counts()["modules at the root"] <= 5
 
 
+def test_test_files_have_names_of_their_own():
+    """Pytest imports a test file by its name alone: two of one name are a collection error."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert {name for name in names if names.count(name) > 1} == set()
+
+
 def test_what_is_private_stays_in_its_package():
     assert private_imports() == []
 

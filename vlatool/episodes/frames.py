@@ -22,7 +22,7 @@ def file_of(folder: Path, name: str) -> Path:
     return folder / f"{quote(name, safe='')}.npy"
 
 
-class Frames(ObservationEncoder):
+class KeepingEncoder(ObservationEncoder):
     """An encoder that keeps what it encodes, when asked.
 
     Args:

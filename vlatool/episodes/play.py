@@ -7,8 +7,8 @@ changes the directory does that there (see ``vlatool.user_code.children``).
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.environment import GUIDE, World
-from vlatool.episodes.frames import Frames, Noisy
+from vlatool.episodes.frames import KeepingEncoder, Noisy
 from vlatool.errors import DataError, VlatoolError, require
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import message_of
@@ -27,6 +27,8 @@ from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context
 from vlatool.user_code.children import spread
 
+SLICE = 10
+"""Episodes of one task that a worker plays at a time."""
 STEP_LIMIT = 100_000
 PRELOAD = ("numpy", "onnxruntime", __name__)
 
@@ -73,6 +75,24 @@ class Played:
     """What a child answers: how the episodes of a job ended, in the order of its seeds."""
 
     outcomes: tuple[Outcome, ...]
+
+
+def jobs_for(job: EpisodesJob, tasks: Sequence[str], episodes: int, first_seed: int) -> list[EpisodesJob]:
+    """Return jobs of ``SLICE`` episodes at most: so many in all, spread evenly over tasks, of the same seeds.
+
+    Args:
+        job: What all of them have in common; task and seeds are of no account.
+        tasks: Of the environment.
+        episodes: Rounded up to a multiple of the tasks.
+        first_seed: Of each task.
+    """
+    end = first_seed - (-episodes // len(tasks))
+    starts = range(first_seed, end, SLICE)
+    return [
+        replace(job, task=task, seeds=tuple(range(start, min(end, start + SLICE))))
+        for task in tasks
+        for start in starts
+    ]
 
 
 def run_jobs(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context) -> list[Outcome]:
@@ -140,7 +160,7 @@ class Worker:
 
     def __init__(self, path: str, engine: str) -> None:
         policy = _opened(Bundle.open(Path(path)), engine)
-        self._frames = Frames(policy.encode)
+        self._frames = KeepingEncoder(policy.encode)
         policy.encode = self._frames
         self.queue = BoundedQueue(policy)
         self._answers: Array | None = None

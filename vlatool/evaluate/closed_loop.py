@@ -11,7 +11,7 @@ from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.paired import compare_success, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.play import EpisodesJob, run_jobs
+from vlatool.episodes.play import EpisodesJob, jobs_for, run_jobs
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.machine.host import fingerprint
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 FIRST_SEED = 5_000_000
 CONTROL_EPISODES = 20
 """Episodes of each control, or a tenth of the policy's where that is more."""
-SLICE = 10
-"""Episodes of one task that a worker runs at a time."""
 
 
 class ClosedLoop(Measure):
@@ -143,11 +141,5 @@ class ClosedLoop(Measure):
         for task in self.tasks:
             if known and task not in known and not self.environment:
                 raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.")
-        count = -(-self.episodes // len(tasks))
-        seeds = range(self.first_seed, self.first_seed + count)
-        slices = [tuple(seeds[start : start + SLICE]) for start in range(0, count, SLICE)]
-        return [
-            EpisodesJob(where, str(folder), task, part, self.instruction, self.control)
-            for task in tasks
-            for part in slices
-        ]
+        job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control)
+        return jobs_for(job, tasks, self.episodes, self.first_seed)

@@ -14,6 +14,7 @@ from vlatool.module.cut import RETRACE
 from vlatool.module.factory import exits_caught
 from vlatool.module.failures import remedy_for
 from vlatool.module.modules import outputs_of
+from vlatool.runtime.program import draw
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -127,20 +128,26 @@ def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
     torch = require("torch", "build")
     try:
         with exits_caught("the policy's forward()"):
-            given = module(*arguments)
+            result = module(*arguments)
     except SourceError:
         raise
     except Exception as error:  # the seam: the user's module may raise anything
-        shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(step.feeds, arguments, strict=True))
-        reason = (message_of(error).splitlines() or [""])[0]
+        given = zip(step.feeds, arguments, strict=True)
+        shapes = ", ".join(
+            f"{name} {list(value.shape)} {str(value.dtype).removeprefix('torch.')}" for name, value in given
+        )
         raise SourceError(
-            f"The policy fails on a batch of observations: {type(error).__name__}: {reason} (given {shapes}).",
+            f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
+            f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
             remedy_for(error),
         ) from error
-    outputs = outputs_of(given, step)
-    if not all(isinstance(output, torch.Tensor) for output in outputs):
-        kinds = ", ".join(type(output).__name__ for output in outputs)
-        raise SourceError(f"The module of '{step.graph}' gives {kinds}; wanted tensors.")
+    outputs = outputs_of(result, step)
+    for name, value in zip(step.gives, outputs, strict=True):
+        if not isinstance(value, torch.Tensor):
+            raise SourceError(
+                f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.",
+                "return a tensor, or a tuple of tensors in the order of 'gives'",
+            )
     return outputs
 
 
@@ -153,10 +160,12 @@ def drawn(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.G
         random: Where it is drawn from.
     """
     torch = require("torch", "build")
-    values = {}
-    for name, wanted in noise.items():
-        shape = (size, *wanted["shape"][1:])
-        kind = wanted.get("distribution", "normal")
-        uniform = random.uniform(-1, 1, shape) if kind == "uniform" else random.standard_normal(shape)
-        values[name] = torch.from_numpy(np.asarray(uniform if kind != "zeros" else np.zeros(shape), np.float32))
-    return values
+    batches = {name: {**wanted, "shape": (size, *wanted["shape"][1:])} for name, wanted in noise.items()}
+    return {name: torch.from_numpy(draw(wanted, random)) for name, wanted in batches.items()}
+
+
+def no_gradient(fix: str) -> SourceError:
+    """Return the error of a policy whose action does not depend on its weights."""
+    return SourceError(
+        "The policy gives its action without gradients: forward() detaches it, or runs under torch.no_grad().", fix
+    )

@@ -12,6 +12,7 @@ from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
 from vlatool.module.axes import Walk
 from vlatool.module.factors import Shape
+from vlatool.module.factory import exits_caught
 from vlatool.module.to_onnx import quiet_exporter
 
 if TYPE_CHECKING:
@@ -40,8 +41,10 @@ def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
     kinds = [parameter.kind for parameter in inspect.signature(module.forward).parameters.values()]
     free = (axes,) if inspect.Parameter.VAR_POSITIONAL in kinds else axes
     try:
-        with quiet_exporter(), torch.no_grad():
+        with quiet_exporter(), torch.no_grad(), exits_caught("the policy's forward()"):
             return torch.export.export(module, tuple(feeds), dynamic_shapes=free, strict=False)
+    except SourceError:
+        raise
     except Exception as error:  # the seam: torch.export raises many foreign types
         reason = (message_of(error).splitlines() or [""])[0]
         raise SourceError(
@@ -79,7 +82,8 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
 def _for_any_batch(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module | None:
     """Return the cut module for batches of any size, None where its code fixes the size."""
     torch = require("torch", "build")
-    with contextlib.suppress(Exception), torch.no_grad():  # the seam: a user's module raises what it likes
+    calls = exits_caught("the policy's forward()")
+    with contextlib.suppress(Exception), torch.no_grad(), calls:  # the seam: a user's module raises what it likes
         module(*_repeated(feeds, 2))
         made = _cut(module, _repeated(feeds, 2), edits)
         for size in (1, 3):

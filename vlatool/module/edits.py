@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import groupby
@@ -30,6 +31,10 @@ CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
 AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d")
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
+
+
+_CHANGED: weakref.WeakSet[Any] = weakref.WeakSet()
+"""Modules that were changed in this process."""
 
 
 def is_changed(bundle: Bundle) -> bool:
@@ -77,8 +82,14 @@ def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = 
         weights: Whether its weights are loaded, too; without them, only the structure counts.
 
     Raises:
-        SourceError: when an edit or a tensor does not fit the module.
+        SourceError: when an edit or a tensor does not fit the module, or the factory gives one that was changed before.
     """
+    for graph, module in modules.items():
+        if module in _CHANGED:
+            raise SourceError(
+                f"The factory gives the same module each time that it is called: '{graph}' was changed already.",
+                "let it make a new module each time",
+            )
     made = apply(modules, read_edits(bundle), bundle)
     for graph, module in made.items() if weights else ():
         if (name := f"{FOLDER}/{graph}.safetensors") in bundle.manifest.files:
@@ -95,14 +106,16 @@ def apply(
     Args:
         modules: Graph name -> module, changed in place, or replaced where it must be traced.
         edits: Of any graphs.
-        bundle: Whose policy runs once; only where a module loses units it is needed, since it is traced then.
+        bundle: Whose policy runs once where a module loses units, since it is traced then; no other edit needs it.
 
     Raises:
-        SourceError: when there is no such module, it has no such axis, or fewer channels or blocks.
+        SourceError: when there is no such module, it has no such axis or fewer channels or blocks.
     """
     made = dict(modules)
     for units, group in groupby(edits, lambda edit: edit.axis.startswith(UNITS)):
-        if units and bundle is not None:
+        if units:
+            if bundle is None:
+                raise ValueError("a module that loses units is traced, which takes an observation: name the bundle")
             made = _without_units(made, tuple(group), bundle)
             continue
         for edit in group:
@@ -110,6 +123,7 @@ def apply(
             if edit.module not in parts:
                 known = list(parts)[:500]
                 raise SourceError(f"An edit names the module '{edit.module}'; {nearest(edit.module, known)}.")
+            _CHANGED.add(made[edit.graph])
             (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
     return made
 

@@ -17,6 +17,16 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 
+def recorded_inputs(bundle: Bundle, count: int) -> list[dict[str, Tensor]]:
+    """Return recorded observations (or synthetic ones) as modules are given them: value name -> (1, ...)."""
+    torch = require("torch", "build")
+    encode = ObservationEncoder(bundle.manifest.spec, bundle)
+    return [
+        {name: torch.from_numpy(np.array(value)) for name, value in encode(observation).items()}
+        for observation in observations_for(bundle, count)
+    ]
+
+
 def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, list[Tensor]]:
     """Run a policy on its first observation; return graph name -> what its module is given first, in order.
 
@@ -24,8 +34,6 @@ def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, l
         SourceError: when a module fails.
     """
     torch = require("torch", "build")
-    encode = ObservationEncoder(bundle.manifest.spec, bundle)
-    values = encode(observations_for(bundle, 1)[0])
     program = BatchedProgram(bundle.manifest.program, modules)
     given: dict[str, list[Any]] = {}
 
@@ -38,8 +46,7 @@ def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, l
     handles = [module.register_forward_pre_hook(note(graph)) for graph, module in modules.items()]
     try:
         with torch.no_grad():
-            inputs = {name: torch.from_numpy(np.array(value)) for name, value in values.items()}
-            program.run(inputs, drawn(program.noise, 1, np.random.default_rng(0)))
+            program.run(recorded_inputs(bundle, 1)[0], drawn(program.noise, 1, np.random.default_rng(0)))
     finally:
         for handle in handles:
             handle.remove()

@@ -29,6 +29,7 @@ class Origin:
         arguments: Of the factory.
         weights: Glob of the shards that vlatool loads; empty when the factory does.
         code: File beside the factory -> its SHA-256 when the source bundle was made.
+        environment: ``make`` and ``tasks`` of the environment that the policy's description names.
     """
 
     folder: Path
@@ -36,6 +37,7 @@ class Origin:
     arguments: dict[str, Any] = field(default_factory=dict)
     weights: str = ""
     code: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, Any] = field(default_factory=dict)
 
     def check(self, endings: tuple[str, ...] = ()) -> None:
         """Raise when a file is not what it was: every one, or those with these endings.
@@ -110,7 +112,7 @@ def origin_of(bundle: Bundle) -> Origin:
             raise SourceError(
                 f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", AGAIN
             )
-    return Origin(folder, factory, described.arguments, described.weights, _code(bundle))
+    return Origin(folder, factory, described.arguments, described.weights, _code(bundle), described.environment)
 
 
 def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:

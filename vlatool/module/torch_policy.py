@@ -10,12 +10,10 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import SourceError, require
-from vlatool.files.printable import message_of
+from vlatool.errors import require
+from vlatool.module.batched import run_module
 from vlatool.module.edits import edited, load_tensors, read_tensors
-from vlatool.module.factory import exits_caught
-from vlatool.module.failures import remedy_for
-from vlatool.module.modules import modules_of, outputs_of
+from vlatool.module.modules import modules_of
 from vlatool.module.origin import origin_of
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
@@ -94,29 +92,12 @@ class TorchSession:
         """Run the module on numpy arrays.
 
         Raises:
-            SourceError: when the module fails, or gives another number of outputs than the program says.
+            SourceError: as ``run_module`` does.
         """
         torch = require("torch", "build")
         if self.first_feeds is None:
             self.first_feeds = dict(feeds)
         arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
-        try:
-            with torch.inference_mode(), exits_caught("the policy's forward()"):
-                result = self.module(*arguments)
-        except SourceError:
-            raise
-        except Exception as error:  # the seam: the user's module may raise anything
-            shapes = ", ".join(f"{name} {list(value.shape)} {value.dtype}" for name, value in feeds.items())
-            raise SourceError(
-                f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
-                f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
-                remedy_for(error),
-            ) from error
-        outputs = outputs_of(result, self.step)
-        for name, value in zip(self.step.gives, outputs, strict=True):
-            if not isinstance(value, torch.Tensor):
-                raise SourceError(
-                    f"The module gives a {type(value).__name__} for '{name}'; wanted a tensor.",
-                    "return a tensor, or a tuple of tensors in the order of 'gives'",
-                )
+        with torch.inference_mode():
+            outputs = run_module(self.module, self.step, arguments)
         return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}

@@ -10,14 +10,13 @@ import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for
-from vlatool.errors import RecipeError, nearest, require
-from vlatool.graph.nodes import matches
+from vlatool.errors import RecipeError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.edits import read_tensors
+from vlatool.module.feeds import recorded_inputs
 from vlatool.module.stage import Changed, ModuleStage
+from vlatool.prune._selection import Selection
 from vlatool.runtime.engine import usable_engines
-from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -116,25 +115,18 @@ class Sparse(ModuleStage):
             for name, part in module.named_modules()
             if isinstance(part, kinds)
         }
-        for pattern in (*self.include, *self.exclude):
-            if not any(matches(name, (pattern,)) for name in named):
-                raise RecipeError(f"No layer matches '{pattern}'; {nearest(pattern, list(named))}.")
-        chosen = {name: part for name, part in named.items() if self._may_lose(name)}
+        selection = Selection(self.include, self.exclude, PROTECTED)
+        selection.check(list(named), "layer")
+        chosen = {name: part for name, part in named.items() if selection.has((name,))}
         if not chosen:
             raise RecipeError(f"{source.manifest.name} has no layer to prune.", "look at --include and --exclude")
         return chosen
-
-    def _may_lose(self, name: str) -> bool:
-        protected = any(word in part for part in name.lower().split(".") for word in PROTECTED)
-        asked = matches(name, self.include) if self.include else not protected
-        return asked and not matches(name, self.exclude)
 
     def _given(
         self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context
     ) -> dict[str, Tensor]:
         """Return name of a layer -> mean of x xT over what it is given on recorded observations."""
         torch = require("torch", "build")
-        encode = ObservationEncoder(source.manifest.spec, source)
         program = BatchedProgram(source.manifest.program, modules)
         noise = drawn(program.noise, 1, np.random.default_rng(0))
         sums: dict[str, Any] = {}
@@ -151,10 +143,9 @@ class Sparse(ModuleStage):
         with contextlib.ExitStack() as stack, torch.no_grad():
             for name, layer in layers.items():
                 stack.callback(layer.register_forward_pre_hook(hook(name)).remove)
-            observations = observations_for(source, self.samples)
-            for number, observation in enumerate(observations):
-                context.tell("looking at what layers are given", number / len(observations))
-                inputs = {name: torch.from_numpy(np.array(value)) for name, value in encode(observation).items()}
+            recorded = recorded_inputs(source, self.samples)
+            for number, inputs in enumerate(recorded):
+                context.tell("looking at what layers are given", number / len(recorded))
                 program.run(inputs, noise)
         return {name: total / counts[name] for name, total in sums.items()}
 

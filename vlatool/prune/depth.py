@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for
-from vlatool.errors import RecipeError, SourceError, nearest, require
-from vlatool.graph.nodes import matches
+from vlatool.errors import RecipeError, SourceError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.edits import BLOCKS, Edit
+from vlatool.module.feeds import recorded_inputs
 from vlatool.module.stage import Changed, ModuleStage
-from vlatool.runtime.observation import ObservationEncoder
+from vlatool.prune._selection import Selection
+from vlatool.prune._slopes import slopes_of
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context
 
@@ -26,10 +26,9 @@ if TYPE_CHECKING:
 
 PROTECTED = ("vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action")
 """Parts of module names whose blocks stay unless --include names them: what sees and what acts is less redundant than
-the trunk between (two action blocks of pi0.5 cost most of its success, see docs/guides/prune-and-fine-tune.md)."""
+the trunk between: with two of its action blocks left, pi0.5 succeeds in 26 %, with as few others in 91 % (DTR, arXiv
+2606.27755)."""
 SEED = 0
-PROBES = 4
-"""Random directions of the action that a gate's sensitivity is taken along."""
 Stack = tuple[str, str]
 """Blocks one behind the other: their graph and the name of the list."""
 Place = tuple[str, str, int]
@@ -64,7 +63,7 @@ class Depth(ModuleStage):
         if not goes:
             asked = f"--ratio {self.ratio:g}" if self.blocks is None else f"--blocks {self.blocks}"
             raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
-        ranking = _Ranking(modules, source, observations_for(source, self.samples))
+        ranking = _Ranking(modules, source, self.samples)
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):
             left[graph, name].remove(block)
@@ -99,15 +98,9 @@ class Depth(ModuleStage):
                 "class, each of which gives what it takes.",
                 "prune widths instead: vlatool prune neurons",
             )
-        for pattern in (*self.include, *self.exclude):
-            if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(f"No stack of blocks matches '{pattern}'; {nearest(pattern, names)}.")
-        chosen = {
-            (graph, name): size
-            for (graph, name), size in sizes.items()
-            if (matches(name, self.include) if self.include else not protected(name))
-            and not matches(name, self.exclude)
-        }
+        selection = Selection(self.include, self.exclude, PROTECTED)
+        selection.check(names, "stack of blocks")
+        chosen = {(graph, name): size for (graph, name), size in sizes.items() if selection.has((name,))}
         if not chosen:
             raise RecipeError(
                 f"What sees and what acts is protected, and {source.manifest.name} has no other stack of blocks: "
@@ -119,11 +112,6 @@ class Depth(ModuleStage):
 
 def _listed(sizes: Mapping[Stack, int]) -> str:
     return ", ".join(f"{name or 'the module itself'} ({size})" for (_, name), size in sizes.items())
-
-
-def protected(name: str) -> bool:
-    """Say whether a stack belongs to what sees or acts, as far as its name says."""
-    return any(word in part for part in name.lower().split(".") for word in PROTECTED)
 
 
 def stacks(module: nn.Module) -> Iterator[tuple[str, Any]]:
@@ -145,17 +133,13 @@ class _Ranking:
     Args:
         modules: Graph name -> module.
         source: For the program and the encoding of observations.
-        observations: As the controller has them.
+        samples: Observations at most.
     """
 
-    def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, observations: Sequence[Any]) -> None:
-        torch = require("torch", "build")
-        encode = ObservationEncoder(source.manifest.spec, source)
+    def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
         self._program = BatchedProgram(source.manifest.program, modules)
         self._action = source.manifest.spec.action.name
-        self._inputs = [
-            {name: torch.from_numpy(np.array(value)) for name, value in encode(each).items()} for each in observations
-        ]
+        self._inputs = recorded_inputs(source, samples)
         self._noise = drawn(self._program.noise, 1, np.random.default_rng(SEED))
         self._blocks = {
             (graph, name, number): block
@@ -186,8 +170,8 @@ class _Ranking:
         turned: dict[Place, list[float]] = {place: [] for place in candidates}
 
         def looking(place: Place) -> Any:
-            def look(_module: Any, given: Any, gives: Any) -> None:
-                similar = torch.nn.functional.cosine_similarity(given[0], _first(gives), dim=-1)
+            def look(_module: Any, given: Any, named: Any, gives: Any) -> None:
+                similar = torch.nn.functional.cosine_similarity(_stream(given, named), _first(gives), dim=-1)
                 turned[place].append(1 - float(similar.mean()))
 
             return look
@@ -195,7 +179,7 @@ class _Ranking:
         with torch.no_grad(), self._hooked(candidates, looking):
             for _ in self.actions():
                 pass
-        return {place: float(np.mean(shares)) for place, shares in turned.items()}
+        return {place: float(np.mean(shares)) if shares else 0.0 for place, shares in turned.items()}
 
     def gate(self, candidates: Sequence[Place], _removed: Collection[Place]) -> dict[Place, float]:
         """Return the expected square of what the action moves by when a block's contribution is scaled.
@@ -204,31 +188,26 @@ class _Ranking:
         over random directions v: the diagonal of the Fisher information for an action with Gaussian noise.
         """
         torch = require("torch", "build")
-        random = torch.Generator().manual_seed(SEED)
         gates = {place: torch.ones((), requires_grad=True) for place in candidates}
 
         def gated(place: Place) -> Any:
-            def scale(_module: Any, given: Any, gives: Any) -> Any:
-                mixed = given[0] + gates[place] * (_first(gives) - given[0])
+            def scale(_module: Any, given: Any, named: Any, gives: Any) -> Any:
+                stream = _stream(given, named)
+                mixed = stream + gates[place] * (_first(gives) - stream)
                 return (mixed, *gives[1:]) if isinstance(gives, tuple) else mixed
 
             return scale
 
         total = dict.fromkeys(candidates, 0.0)
         with self._hooked(candidates, gated):
-            for action in self.actions():
-                for probe in range(PROBES):
-                    direction = torch.randn(action.shape, generator=random)
-                    slopes = torch.autograd.grad(
-                        (direction * action).sum(), list(gates.values()), retain_graph=probe < PROBES - 1
-                    )
-                    for place, slope in zip(gates, slopes, strict=True):
-                        total[place] += float(slope) ** 2
+            for slopes in slopes_of(self.actions(), gates):
+                for place, slope in slopes.items():
+                    total[place] += float(slope) ** 2
         return total
 
     @contextlib.contextmanager
     def _hooked(self, places: Collection[Place], hook: Callable[[Place], Any]) -> Iterator[None]:
-        handles = [self._blocks[place].register_forward_hook(hook(place)) for place in places]
+        handles = [self._blocks[place].register_forward_hook(hook(place), with_kwargs=True) for place in places]
         try:
             yield
         finally:
@@ -240,11 +219,17 @@ def _first(gives: Any) -> Any:
     return gives[0] if isinstance(gives, tuple | list) else gives
 
 
-def _passes_on(_module: Any, given: Any, gives: Any) -> Any:
+def _stream(given: Any, named: Any) -> Any:
+    """Return what passes through a block: its first argument."""
+    return given[0] if given else next(iter(named.values()))
+
+
+def _passes_on(_module: Any, given: Any, named: Any, gives: Any) -> Any:
     """Take the place of a block that is removed: what it is given, beside what else it gives."""
-    if _first(gives).shape != given[0].shape:
+    stream = _stream(given, named)
+    if _first(gives).shape != stream.shape:
         raise SourceError(
-            f"A block gives {list(_first(gives).shape)} for {list(given[0].shape)}: without it, shapes would not fit.",
+            f"A block gives {list(_first(gives).shape)} for {list(stream.shape)}: without it, shapes would not fit.",
             "leave its stack out: --exclude NAME",
         )
-    return (given[0], *gives[1:]) if isinstance(gives, tuple) else given[0]
+    return (stream, *gives[1:]) if isinstance(gives, tuple) else stream

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, nearest, require
-from vlatool.graph.nodes import matches
+from vlatool.errors import RecipeError, require
 from vlatool.module.edits import Edit
 from vlatool.module.stage import Changed, ModuleStage
+from vlatool.prune._selection import Selection
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -46,12 +46,11 @@ class Neurons(ModuleStage):
         """
         layers = [(graph, *layer) for graph, module in modules.items() for layer in hidden_layers(module)]
         names = [first for _, first, *_ in layers]
-        for pattern in (*self.include, *self.exclude):
-            if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(f"No hidden layer matches '{pattern}'; {nearest(pattern, names)}.")
+        selection = Selection(self.include, self.exclude)
+        selection.check(names, "hidden layer")
         edits: list[Edit] = []
         for graph, first, second, incoming, outgoing in layers:
-            if (not self.include or matches(first, self.include)) and not matches(first, self.exclude):
+            if selection.has((first,)):
                 context.tell(f"pruning {first}", None)
                 keep = self._kept(incoming, outgoing)
                 edits += [Edit(graph, first, "outputs", keep), Edit(graph, second, "inputs", keep)]

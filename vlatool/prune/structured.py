@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,24 +12,21 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for
-from vlatool.errors import RecipeError, nearest, require
-from vlatool.graph.nodes import matches
+from vlatool.errors import RecipeError
 from vlatool.module.axes import Member, Walk
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.cut import traced
 from vlatool.module.edits import UNITS, Edit
-from vlatool.module.feeds import first_feeds
+from vlatool.module.feeds import first_feeds, recorded_inputs
 from vlatool.module.stage import Changed, ModuleStage
-from vlatool.runtime.observation import ObservationEncoder
+from vlatool.prune._selection import Selection
+from vlatool.prune._slopes import slopes_of
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
 SEED = 0
-PROBES = 4
-"""Random directions of the action that a unit's sensitivity is taken along."""
 
 
 @dataclass
@@ -66,8 +63,8 @@ class Structured(ModuleStage):
     Which weights are coupled is found in a trace of the policy, through reshapes: heads go as a whole, with their rows
     of the projections. What is normalised over, inputs, outputs and embeddings stay. ``gate`` ranks by how much the
     action moves when a unit is scaled (one backward pass an observation); ``magnitude`` by the norms of what writes and
-    what reads a unit; ``random`` is the control. Train the result
-    afterwards (``vlatool distill policy`` takes it as it is).
+    what reads a unit; ``random`` is the control. Train the result afterwards
+    (``vlatool distill policy`` takes it as it is).
     """
 
     ratio: float = Field(0.3, gt=0, lt=1, description="share of the multiply-accumulates that goes")
@@ -98,29 +95,23 @@ class Structured(ModuleStage):
     def _groups(self, walks: Mapping[str, Walk], source: Bundle) -> list[_Group]:
         groups = []
         names: list[str] = []
+        selection = Selection(self.include, self.exclude)
         for graph, walk in walks.items():
             for leaf, members in walk.members().items():
                 size = walk.factors.sizes[leaf]
                 names += [member.weight for member in members]
-                if not _is_slowest(walk, members) or not self._may_lose(members):
+                if not _is_slowest(walk, members) or not selection.has(member.weight for member in members):
                     continue
                 heads = any(member.place < len(member.sizes) - 1 for member in members)
                 step = 1 if heads or size <= self.multiple else self.multiple
                 groups.append(_Group(graph, leaf, size, members, step, np.zeros(size), list(range(size))))
-        for pattern in (*self.include, *self.exclude):
-            if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(f"No weight that can be pruned matches '{pattern}'; {nearest(pattern, names)}.")
+        selection.check(names, "weight that can be pruned")
         if not groups:
             raise RecipeError(
                 f"{source.manifest.name} has no heads, neurons or channels that could go.",
                 "look at --include and --exclude; whole blocks: vlatool prune depth",
             )
         return groups
-
-    def _may_lose(self, members: Sequence[Member]) -> bool:
-        named = [member.weight for member in members]
-        asked = not self.include or any(matches(name, self.include) for name in named)
-        return asked and not any(matches(name, self.exclude) for name in named)
 
     def _rank(self, groups: Sequence[_Group], modules: Mapping[str, nn.Module], source: Bundle) -> None:
         """Fill in the importance of all units."""
@@ -134,13 +125,19 @@ class Structured(ModuleStage):
             for group in groups:
                 group.importance = _magnitude(group, weights[group.graph])
             return
-        for slopes in _slopes(weights, modules, source, self.samples):
-            for group in groups:
-                moved = sum(
-                    _by_unit(weights[group.graph][member.weight].detach() * slopes[group.graph, member.weight], member)
-                    for member in _readers(group) if (group.graph, member.weight) in slopes
-                )  # fmt: skip
-                group.importance = group.importance + np.asarray(moved) ** 2
+        values = {(graph, name): value.requires_grad_() for graph, named in weights.items()
+                  for name, value in named.items() if value.is_floating_point()}  # fmt: skip
+        try:
+            for slopes in slopes_of(_actions(modules, source, self.samples), values):
+                for group in groups:
+                    moved = np.zeros(group.size)
+                    for member in _readers(group):
+                        if (key := (group.graph, member.weight)) in slopes:
+                            moved += _by_unit(values[key].detach() * slopes[key], member).numpy()
+                    group.importance = group.importance + moved**2
+        finally:
+            for value in values.values():
+                value.requires_grad_(False)
 
     def _remove(self, groups: Sequence[_Group], work: _Work, context: Context) -> None:
         """Take away units, those first that cost least for the work that they save."""
@@ -236,27 +233,9 @@ def _by_unit(values: Tensor, member: Member) -> Tensor:
     return parts.double().sum(dim=[axis for axis in range(parts.dim()) if axis != unit])
 
 
-def _slopes(
-    weights: Mapping[str, Mapping[str, Any]], modules: Mapping[str, nn.Module], source: Bundle, samples: int
-) -> Any:
-    """Yield gradients of the action along random directions: (graph, weight) -> like the weight."""
-    torch = require("torch", "build")
-    encode = ObservationEncoder(source.manifest.spec, source)
+def _actions(modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> Iterator[Any]:
+    """Yield the raw action of each recorded observation."""
     program = BatchedProgram(source.manifest.program, modules)
     noise = drawn(program.noise, 1, np.random.default_rng(SEED))
-    random = torch.Generator().manual_seed(SEED)
-    keys = [(graph, name) for graph, named in weights.items() for name in named]
-    values = [weights[graph][name].requires_grad_() for graph, name in keys]
-    try:
-        for observation in observations_for(source, samples):
-            inputs = {name: torch.from_numpy(np.array(value)) for name, value in encode(observation).items()}
-            action = program.run(inputs, noise)[source.manifest.spec.action.name]
-            for probe in range(PROBES):
-                direction = torch.randn(action.shape, generator=random)
-                slopes = torch.autograd.grad(
-                    (direction * action).sum(), values, retain_graph=probe < PROBES - 1, allow_unused=True
-                )
-                yield {key: slope for key, slope in zip(keys, slopes, strict=True) if slope is not None}
-    finally:
-        for value in values:
-            value.requires_grad_(False)
+    for inputs in recorded_inputs(source, samples):
+        yield program.run(inputs, noise)[source.manifest.spec.action.name]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -66,6 +67,18 @@ class Frames:
         return self._folder / f"round-{number:03d}"
 
 
+def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
+    """Return an array in a new ``.npy`` file, whose place on the disk is taken: a full disk would kill a later write.
+
+    Raises:
+        OSError: when there is no room for it.
+    """
+    array: Array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+    with path.open("r+b") as stream:
+        os.posix_fallocate(stream.fileno(), 0, path.stat().st_size)
+    return array
+
+
 def joined(parts: Iterable[Path], target: Path) -> int:
     """Join the arrays of several folders, ``NAME.npy`` each; return the number of rows.
 
@@ -82,12 +95,9 @@ def joined(parts: Iterable[Path], target: Path) -> int:
     for name in names:
         arrays = [np.load(folder / name, mmap_mode="r") for folder in folders]
         rows = sum(map(len, arrays))
-        whole = np.lib.format.open_memmap(
-            target / name, mode="w+", dtype=arrays[0].dtype, shape=(rows, *arrays[0].shape[1:])
-        )
+        whole = new_array(target / name, arrays[0].dtype, (rows, *arrays[0].shape[1:]))
         for at, block in _blocks(arrays):
             whole[at : at + len(block)] = block
-        whole.flush()
     return rows
 
 

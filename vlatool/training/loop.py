@@ -18,6 +18,7 @@ import numpy as np
 
 from vlatool.errors import DataError, require
 from vlatool.files.edited import whole_file
+from vlatool.module.batched import no_gradient
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -110,12 +111,15 @@ class Trainer:
 
         Raises:
             DataError: when the loss is not finite.
+            SourceError: when it does not depend on the weights.
         """
         torch = require("torch", "build")
         saved = time.monotonic()
         while self.step < until:
             with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.bfloat16):
                 loss = draw(np.random.default_rng((self._settings.seed, self.step)))
+            if not loss.requires_grad:
+                raise no_gradient("let make() return the module that was trained, as it was trained")
             value = float(loss.detach())
             if not math.isfinite(value):
                 raise DataError(

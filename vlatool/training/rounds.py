@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +13,9 @@ from vlatool.episodes.frames import file_of
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
 from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.description import read_description, read_location
+from vlatool.module.origin import origin_of
 from vlatool.stage.base import Context
-from vlatool.training.frames import Frames
+from vlatool.training.frames import Array, Frames, new_array
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,55 +24,24 @@ LABEL, NOISE = "teacher.", "noise."
 """Prefixes of what is kept beside the inputs: the teacher's outputs, and the noise that they were made from."""
 ROWS = 32
 """Rows that the teacher labels at a time."""
-SLICE = 10
-"""Episodes of one task that a worker plays at a time."""
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Where episodes are played.
-
-    Args:
-        make: Factory of the environment.
-        folder: Where its file lies.
-        tasks: Of the environment.
-    """
-
-    make: str
-    folder: Path
-    tasks: tuple[str, ...]
-
-    def jobs(self, episodes: int, first_seed: int, noise: float, record: Path) -> list[EpisodesJob]:
-        """Return the jobs of so many episodes, spread evenly over the tasks."""
-        each = -(-episodes // len(self.tasks))
-        jobs: list[EpisodesJob] = []
-        for task in self.tasks:
-            for start in range(0, each, SLICE):
-                seeds = tuple(range(first_seed + start, first_seed + min(each, start + SLICE)))
-                place = str(record / f"{len(jobs):05d}")
-                jobs.append(EpisodesJob(self.make, str(self.folder), task, seeds, noise=noise, record=place))
-        return jobs
+def scene_of(source: Bundle) -> tuple[EpisodesJob, tuple[str, ...]] | None:
+    """Return where a policy's description says that it acts, and the tasks; None when it names no environment."""
+    origin = origin_of(source)
+    make, tasks = origin.environment.get("make"), origin.environment.get("tasks")
+    return (EpisodesJob(str(make), str(origin.folder), "", ()), tuple(tasks)) if make and tasks else None
 
 
-def scene_of(source: Bundle) -> Scene | None:
-    """Return where a policy's description says that it acts; None when it names no environment."""
-    folder = read_location(source.path)
-    named = read_description(folder).environment if (folder / "policy.yaml").is_file() else {}
-    if not named.get("make") or not named.get("tasks"):
-        return None
-    return Scene(str(named["make"]), folder, tuple(named["tasks"]))
-
-
-def write_recorded(encoded: Iterable[Mapping[str, Any]], target: Path) -> int:
-    """Write encoded observations as a part of a round; return their number."""
-    kept: dict[str, list[Any]] = {}
-    for values in encoded:
-        for name, value in values.items():
-            kept.setdefault(name, []).append(np.array(value))
+def write_recorded(encode: Callable[[Any], Mapping[str, Array]], observations: Sequence[Any], target: Path) -> None:
+    """Write encoded observations as a part of a round, one after the other: they need not fit into the memory."""
     target.mkdir(parents=True, exist_ok=True)
-    for name, arrays in kept.items():
-        np.save(file_of(target, name), np.concatenate(arrays))
-    return len(next(iter(kept.values()), []))
+    kept: dict[str, Array] = {}
+    for row, observation in enumerate(observations):
+        for name, value in encode(observation).items():
+            if name not in kept:
+                kept[name] = new_array(file_of(target, name), value.dtype, (len(observations), *value.shape[1:]))
+            kept[name][row] = value[0]
 
 
 def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram, seed: Sequence[int],
@@ -104,15 +72,11 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
             given = {LABEL + name: values[name] for name in outputs} | {NOISE + name: noise[name] for name in noise}
             for name, value in given.items():
                 if name not in kept:
-                    kept[name] = np.lib.format.open_memmap(
-                        file_of(frames, name), mode="w+", dtype=value.numpy().dtype, shape=(count, *value.shape[1:])
-                    )
+                    kept[name] = new_array(file_of(frames, name), value.numpy().dtype, (count, *value.shape[1:]))
                 if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
                 kept[name][start : start + len(value)] = value.numpy()
             context.tell(f"the teacher labels {count} observations", (start + 1) / count)
-    for values in kept.values():
-        values.flush()
 
 
 def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:

@@ -11,19 +11,21 @@ import torch
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.distill import policy
 from vlatool.distill.policy import PolicyDistillation
-from vlatool.errors import DataError, RecipeError
+from vlatool.errors import DataError, OutputError, RecipeError, SourceError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.machine.host import cache_directory
 from vlatool.module.edits import read_edits
-from vlatool.module.torch_policy import torch_policy
+from vlatool.module.torch_policy import torch_policy, unedited_modules
 from vlatool.prune.neurons import Neurons
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
+from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform
+from vlatool.training.loop import Trainer
+from vlatool.training.teacher import Teacher
 
 SHORT = {"steps": 12, "batch": 4, "episodes": 4, "student_episodes": 2, "every": 5, "learning_rate": 0.003}
 
@@ -96,8 +98,8 @@ def test_a_run_that_is_killed_goes_on_to_the_same_weights(
 
         train(self, until, draw, told)
 
-    train = policy.Trainer.train
-    monkeypatch.setattr(policy.Trainer, "train", dying)
+    train = Trainer.train
+    monkeypatch.setattr(Trainer, "train", dying)
     monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
     stage = build_stage("distill.policy", SHORT)
     while len(dies_at) > 1:
@@ -114,14 +116,12 @@ def test_a_run_that_is_killed_goes_on_to_the_same_weights(
     ({"loss": "hubert"}, r"Unknown loss 'hubert'; did you mean 'huber'"),
     ({"loss": "kl"}, "kl compares discrete actions"),
 ])  # fmt: skip
-def test_a_loss_that_does_not_fit_is_refused(source_bundle: Bundle, tmp_path: Path, options: dict[str, str], says: str):
+def test_a_loss_that_does_not_fit_is_refused(pruned: Bundle, tmp_path: Path, options: dict[str, str], says: str):
     with pytest.raises(RecipeError, match=says):
-        distilled(source_bundle, tmp_path / "out", **options)
+        distilled(pruned, tmp_path / "out", **options)
 
 
 def test_a_teacher_that_does_something_else_is_refused(source_bundle: Bundle, policy_dir: Path, tmp_path: Path):
-    from vlatool.sources.torch_module import TorchModule
-
     text = (policy_dir / "policy.yaml").read_text()
     (policy_dir / "policy.yaml").write_text(text.replace("[dx, dy]", "[dy, dx]"))
     other = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "other", Context())
@@ -136,13 +136,72 @@ def test_a_teacher_that_is_exported_is_refused(source_bundle: Bundle, float_bund
 
 
 def test_without_recordings_and_episodes_there_is_nothing_to_learn_from(policy_dir: Path, tmp_path: Path):
-    from vlatool.sources.torch_module import TorchModule
-
     (policy_dir / "calibration.npz").unlink()
     (policy_dir / "evaluation.npz").unlink(missing_ok=True)
     source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
     with pytest.raises(DataError, match="no observations to train on"):
-        distilled(source, tmp_path / "out", episodes=0)
+        distilled(run_transform(Neurons(), source, tmp_path / "pruned", Context()), tmp_path / "out", episodes=0)
+
+
+def test_a_policy_that_was_not_changed_has_no_teacher(source_bundle: Bundle, tmp_path: Path):
+    with pytest.raises(RecipeError, match="it would be its own teacher"):
+        distilled(source_bundle, tmp_path / "out")
+
+
+def test_the_student_is_not_its_own_teacher(pruned: Bundle, tmp_path: Path):
+    with pytest.raises(RecipeError, match="is the student itself"):
+        distilled(pruned, tmp_path / "out", teacher=str(pruned.path))
+
+
+def test_episodes_to_train_on_are_not_those_of_evaluations(pruned: Bundle, tmp_path: Path):
+    with pytest.raises(RecipeError, match=r"take the seeds 4999998 to 500\d+; evaluations begin at 5000000"):
+        distilled(pruned, tmp_path / "out", first_seed=4_999_998)
+
+
+def changed_code(policy_dir: Path, old: str, new: str, place: Path) -> Bundle:
+    """The tiny policy with other code, pruned."""
+    code = (policy_dir / "policy.py").read_text()
+    assert old in code
+    (policy_dir / "policy.py").write_text(code.replace(old, new))
+    source = run_transform(TorchModule(policy=policy_dir), None, place / "source", Context())
+    return run_transform(Neurons(ratio=0.7), source, place / "pruned", Context())
+
+
+def test_a_factory_that_gives_one_module_has_no_teacher(policy_dir: Path, tmp_path: Path):
+    cached = "import functools\n\n\n@functools.cache\ndef make("
+    with pytest.raises(SourceError, match="gives the same module each time"):
+        changed_code(policy_dir, "def make(", cached, tmp_path)
+
+
+def test_a_teacher_that_shares_weights_with_the_student_is_refused(pruned: Bundle, monkeypatch: pytest.MonkeyPatch):
+    modules = unedited_modules(pruned)
+    monkeypatch.setattr("vlatool.training.teacher.unedited_modules", lambda _source: modules)
+    with pytest.raises(SourceError, match="gives the same module each time"):
+        Teacher.of(pruned, None, modules)
+
+
+def test_a_policy_without_gradients_is_refused(policy_dir: Path, tmp_path: Path):
+    source = changed_code(policy_dir, "    def forward(", "    @torch.no_grad()\n    def forward(", tmp_path)
+    with pytest.raises(SourceError, match="gives its action without gradients"):
+        distilled(source, tmp_path / "out", episodes=0, student_episodes=0)
+
+
+def test_what_was_trained_is_kept_until_the_bundle_is_written(
+    pruned: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    options = {"episodes": 0, "student_episodes": 0, "steps": 3}
+    with monkeypatch.context() as patched:
+        patched.setattr("vlatool.module.stage.write_module", full)
+        with pytest.raises(OutputError):
+            distilled(pruned, tmp_path / "out", **options)
+    told: list[str] = []
+    distilled(pruned, tmp_path / "out", told, **options)
+    assert not [line for line in told if line.startswith("step ")], "no step is taken again"
+    assert not list((cache_directory() / "streams").glob("*/*")), "nothing is left"
 
 
 def test_the_class_is_the_stage():

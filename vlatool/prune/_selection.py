@@ -1,0 +1,43 @@
+"""Which parts a person lets go: ``--include`` and ``--exclude``, and what stays unless it is named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from vlatool.errors import RecipeError, nearest
+from vlatool.graph.nodes import matches
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Parts by name.
+
+    Args:
+        include, exclude: Globs of names; everything that is not protected when nothing is included.
+        protected: Words in names of what stays unless it is included.
+    """
+
+    include: tuple[str, ...]
+    exclude: tuple[str, ...]
+    protected: tuple[str, ...] = ()
+
+    def check(self, names: Sequence[str], what: str) -> None:
+        """Refuse a pattern that matches nothing.
+
+        Raises:
+            RecipeError: naming the pattern and the nearest name.
+        """
+        for pattern in (*self.include, *self.exclude):
+            if not any(matches(name, (pattern,)) for name in names):
+                raise RecipeError(f"No {what} matches '{pattern}'; {nearest(pattern, list(names))}.")
+
+    def has(self, names: Iterable[str]) -> bool:
+        """Return whether a part with these names may go: one of them is asked for, and none is excluded."""
+        listed = list(names)
+        asked = any(matches(name, self.include) if self.include else not self.protects(name) for name in listed)
+        return asked and not any(matches(name, self.exclude) for name in listed)
+
+    def protects(self, name: str) -> bool:
+        """Return whether a part stays unless it is included."""
+        return any(word in part for part in name.lower().split(".") for word in self.protected)

@@ -1,0 +1,132 @@
+"""A stage that trains a policy to do what a teacher does: its options, and its course."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError, require
+from vlatool.files.work import forget, work_directory
+from vlatool.machine import host
+from vlatool.module.edits import is_changed
+from vlatool.module.stage import TRAINING, Changed, ModuleStage
+from vlatool.stage.base import Context, source_of
+from vlatool.stage.cache import STREAMS
+from vlatool.training.loop import Settings, has_bfloat16
+from vlatool.training.session import Lesson, Plan, Session
+from vlatool.training.teacher import Teacher
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from vlatool.hardware.profile import Profile
+
+FIRST_SEED, EVALUATION_SEEDS = 1_000_000, 5_000_000
+"""Of the first episode to train on, and from where evaluations take theirs."""
+LAST_SHARE = 0.9
+"""Share of the steps after which no further episodes are played: what they bring could hardly be learnt any more."""
+
+
+class TrainingStage(ModuleStage):
+    """Trains on recordings and, where the policy names an environment, on episodes; the teacher says what is right.
+
+    No expert is needed: first the teacher acts, then again and again the student, and the teacher says what it would
+    have done wherever they came to (DAgger: Ross et al., arXiv 1011.0686).
+    """
+
+    teacher: Path | None = Field(
+        None, description="source bundle of the teacher; the policy before any edit when empty"
+    )
+    steps: int = Field(1500, ge=1, description="updates of the weights")
+    batch: int = Field(256, ge=1, description="observations in an update")
+    learning_rate: float = Field(5e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
+    weight_decay: float = Field(0.01, ge=0, le=10, description="of AdamW")
+    average: float = Field(0.995, ge=0, lt=1, description="decay of the moving average of the weights")
+    episodes: int = Field(1200, ge=0, description="episodes that the teacher plays first, over all tasks")
+    student_episodes: int = Field(300, ge=0, description="episodes that the student plays each time")
+    every: int = Field(250, ge=1, description="steps between the student's episodes")
+    noise: float = Field(0.1, ge=0, le=1, description="disturbs the actions in these episodes: share of their spread")
+    first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode to train on")
+    seed: int = Field(0, ge=0, description="of batches and noise")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="of matrix products in training; bfloat16 where the processor has it"
+    )
+    threads: int = Field(0, ge=0, description="of torch; all cores of this process when 0")
+
+    def inputs(self) -> tuple[Path, ...]:
+        """The teacher's manifest."""
+        return (self.teacher / "manifest.json",) if self.teacher else ()
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """No episode of the training is one of the evaluation's, and the teacher is another policy."""
+        super().check(source, profile)
+        last = self.first_seed + self.episodes + len(self.pauses()) * self.student_episodes
+        if self.first_seed < EVALUATION_SEEDS < last:
+            raise RecipeError(
+                f"The episodes to train on take the seeds {self.first_seed} to {last}; evaluations begin at "
+                f"{EVALUATION_SEEDS}, and would see episodes of the training.",
+                "take a smaller --first-seed, or fewer episodes",
+            )
+        if source is not None and self.teacher is None and not is_changed(source):
+            raise RecipeError(
+                f"{source.manifest.name} is as its factory makes it: without --teacher it would be its own teacher.",
+                "prune it first (vlatool prune structured), or name a --teacher",
+            )
+
+    def pauses(self) -> list[int]:
+        """Return before which steps the student plays."""
+        return list(range(self.every, round(self.steps * LAST_SHARE), self.every)) if self.student_episodes else []
+
+    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+        """Return what the student does with a batch, and how far that is from what the teacher says of it."""
+        raise NotImplementedError(self.name())
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Say what the student learnt from, and how far it came."""
+        training = json.loads(made.file(TRAINING).read_bytes())
+        losses, last = training["losses"], max(1, len(training["losses"]) // 20)
+        seen = sum(round_["observations"] for round_ in training["rounds"])
+        first, end = np.mean(losses[:last]), np.mean(losses[-last:])
+        played = ", ".join(
+            f"{round_['actor']} {round_['successes'] / round_['episodes']:.1%} of {round_['episodes']}"
+            for round_ in training["rounds"] if round_.get("episodes")
+        )  # fmt: skip
+        return (
+            f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
+            *([f"episodes that succeeded, with noise: {played}"] if played else []),
+            *super().lines(made),
+        )
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+        """Train the modules in place."""
+        torch = require("torch", "build")
+        before = torch.get_num_threads()
+        torch.set_num_threads(self.threads or before)
+        try:
+            with work_directory(self._place(source)) as place:
+                return self._trained(modules, source, place, context)
+        finally:
+            torch.set_num_threads(before)
+
+    def _trained(self, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context) -> Changed:
+        teacher = Teacher.of(source, self.teacher, modules)
+        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_bfloat16(host.isa()))
+        settings = Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, bfloat16)
+        plan = Plan(self.batch, self.episodes, self.student_episodes, self.pauses(), self.noise, self.first_seed)
+        lesson = self.lesson(modules, source, teacher)
+        return Changed(training=Session(plan, settings, lesson, source, teacher, place, context).run())
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Train; what a run that is killed goes on from is there until the result is written."""
+        made = super().run(source, out, context)
+        forget(self._place(source_of(source, self.name())))
+        return made
+
+    def _place(self, source: Bundle) -> Path:
+        return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
