@@ -51,15 +51,24 @@ def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
     if EDITS not in bundle.manifest.files:
         return ()
     path = bundle.file(EDITS)
-    listed = read_json(path.read_bytes(), str(path), SourceError, "make the bundle again")
+    return edits_from(path.read_bytes(), str(path))
+
+
+def edits_from(text: str | bytes, where: str) -> tuple[Edit, ...]:
+    """Return the edits of a JSON list.
+
+    Raises:
+        SourceError: when it is not one.
+    """
+    listed = read_json(text.encode() if isinstance(text, str) else text, where, SourceError, "make the bundle again")
     if not isinstance(listed, list):
-        raise SourceError(f"{path} must hold a list of edits; got {type(listed).__name__}.")
-    return tuple(_edit(entry, path) for entry in listed)
+        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.")
+    return tuple(_edit(entry, where) for entry in listed)
 
 
-def _edit(value: Any, path: Path) -> Edit:
+def _edit(value: Any, where: str) -> Edit:
     if not _is_edit(value):
-        raise SourceError(f"{path} has an invalid edit: {json.dumps(value)[:200]}.")
+        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}.")
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -35,10 +35,13 @@ class Changed:
     Args:
         edits: What is kept of the structure; the caller cuts the modules.
         training: How they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
+        options: What the stage found out on this machine, under names of options of its own, so that it is made again
+            in the same way wherever that is done.
     """
 
     edits: tuple[Edit, ...] = ()
     training: Mapping[str, Any] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 class ModuleStage(Transform):
@@ -86,9 +89,10 @@ class ModuleStage(Transform):
         modules = load_modules(bundle)
         done = self.change(modules, bundle, context)
         modules = apply(modules, done.edits, bundle)
-        changed = write_changed(
-            bundle, out, joined_edits(read_edits(bundle), done.edits), modules, self.made_by(), done.training
-        )
+        made_by = self.made_by()
+        made_by["options"] = {**made_by["options"], **done.options}
+        edits = joined_edits(read_edits(bundle), done.edits)
+        changed = write_changed(bundle, out, edits, modules, made_by, done.training)
         context.tell("running the changed policy", None)
         torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed

@@ -1,0 +1,66 @@
+"""How long pruned policies take on this machine: each is exported, and all of them take turns in one run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.measurement import agent
+from vlatool.measurement.jobs import LatencyJob
+from vlatool.module.edits import Edit, apply, joined_edits, read_edits
+from vlatool.module.stage import write_changed
+from vlatool.module.torch_policy import load_modules
+from vlatool.stage.base import Context, Transform, build_stage
+
+CALLS, SECONDS = 200, 3.0
+"""Of each policy in a run, at least."""
+UNDISTURBED = 25
+"""Percentile of the calls that is compared: where other programs run, more of them than half may be held up."""
+
+
+class Clock:
+    """Exports and times what edits leave of a policy, in float32.
+
+    Args:
+        source: The policy before the edits.
+        scratch: An empty directory.
+        engine: Of the runtime; the default one when empty.
+        threads: Intra-op threads.
+        made_by: For the manifests of what is exported.
+        context: For progress.
+    """
+
+    def __init__(
+        self, source: Bundle, scratch: Path, engine: str, threads: int, made_by: dict[str, Any], context: Context
+    ) -> None:
+        self._source, self._scratch, self._made_by = source, scratch, made_by
+        self._engine, self._threads, self._context = engine, threads, context
+        self._exported = 0
+        self._whole = self._export(())
+
+    def times(self, pruned: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
+        """Return the milliseconds of the whole policy, and of it with each list of edits, from one interleaved run."""
+        paths = [self._whole, *(self._export(edits) for edits in pruned)]
+        job = LatencyJob(tuple(map(str, paths)), self._engine, self._threads, CALLS, SECONDS, check=False)
+        measured = agent.measure(job, self._context.tell)
+        whole, *others = (float(np.percentile(policy.samples, UNDISTURBED)) for policy in measured.policies)
+        return whole, others
+
+    def _export(self, edits: Sequence[Edit]) -> Path:
+        """Return a bundle in ONNX of the policy after edits."""
+        self._exported += 1
+        made, exported = (self._scratch / f"{self._exported}-{what}" for what in ("modules", "graphs"))
+        made.mkdir()
+        exported.mkdir()
+        modules = apply(load_modules(self._source), edits, self._source)
+        everything = joined_edits(read_edits(self._source), edits)
+        bundle = write_changed(self._source, made, everything, modules, self._made_by)
+        stage = build_stage("export.onnx", {})
+        assert isinstance(stage, Transform)
+        stage.run(bundle, exported, replace(self._context, tell=lambda _what, _share: None))
+        return exported

@@ -1,0 +1,240 @@
+"""Units that can go, together with all weights that they are coupled to, and how important each is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError
+from vlatool.module.axes import Member, Walk
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.cut import traced
+from vlatool.module.edits import UNITS, Edit
+from vlatool.module.feeds import first_feeds, recorded_inputs
+from vlatool.prune._selection import Selection
+from vlatool.prune._slopes import slopes_of
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+SEED = 0
+Rank = Literal["gate", "magnitude", "random"]
+
+
+@dataclass
+class Group:
+    """Units that go together with all their weights: heads of an attention, neurons of an MLP, channels.
+
+    Args:
+        graph: Name of the graph.
+        leaf: The factor of ``vlatool.module.axes``.
+        size: Number of units.
+        members: Axes of weights that they are a part of.
+        step: How many go at a time.
+        importance: Of each unit, in the order of their numbers.
+        keep: Numbers of those that stay.
+    """
+
+    graph: str
+    leaf: int
+    size: int
+    members: list[Member]
+    step: int
+    importance: NDArray[Any]
+    keep: list[int]
+
+    @property
+    def stays(self) -> int:
+        """Number of units that are left."""
+        return len(self.keep)
+
+    def without(self, units: Sequence[int]) -> None:
+        """Remove units."""
+        gone = set(units)
+        self.keep = [unit for unit in self.keep if unit not in gone]
+
+    def cheapest(self, least: float) -> tuple[float, list[int]]:
+        """Return what the next units that would go are worth together, and which they are; none when all must stay.
+
+        Args:
+            least: Share of the units that stays.
+        """
+        count = self.stays % self.step or self.step
+        if self.stays - count < max(1, round(self.size * least)):
+            return 0.0, []
+        order = sorted(self.keep, key=lambda unit: (self.importance[unit], unit))[:count]
+        return float(sum(self.importance[unit] for unit in order)), order
+
+    @property
+    def axis(self) -> str:
+        """How edits name the units, in the first of the weights."""
+        return f"{UNITS}{self.members[0].axis}.{self.members[0].place}"
+
+    def edit(self) -> Edit:
+        """Return what is to be kept."""
+        return Edit(self.graph, self.members[0].weight, self.axis, tuple(self.keep))
+
+
+def walks_of(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk]:
+    """Trace the modules of a policy; return graph name -> its axes.
+
+    Raises:
+        SourceError: when torch.export cannot.
+    """
+    return {graph: Walk(traced(modules[graph], feeds)) for graph, feeds in first_feeds(modules, source).items()}
+
+
+def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, name: str) -> list[Group]:
+    """Return all units that can go.
+
+    Args:
+        walks: Graph name -> axes.
+        selection: Of weights.
+        multiple: Neurons and channels go so many at a time; heads one by one.
+        name: Of the policy.
+
+    Raises:
+        RecipeError: when there are none, or a pattern matches no weight.
+    """
+    groups = []
+    names: list[str] = []
+    for graph, walk in walks.items():
+        for leaf, members in walk.members().items():
+            size = walk.factors.sizes[leaf]
+            names += [member.weight for member in members]
+            if not _is_slowest(walk, members) or not selection.has(member.weight for member in members):
+                continue
+            heads = any(member.place < len(member.sizes) - 1 for member in members)
+            step = 1 if heads or size <= multiple else multiple
+            groups.append(Group(graph, leaf, size, members, step, np.zeros(size), list(range(size))))
+    selection.check(names, "weight that can be pruned")
+    if not groups:
+        raise RecipeError(
+            f"{name} has no heads, neurons or channels that could go.",
+            "look at --include and --exclude; whole blocks: vlatool prune depth",
+        )
+    return groups
+
+
+def rank_units(
+    groups: Sequence[Group], rank: Rank, modules: Mapping[str, nn.Module], source: Bundle, samples: int
+) -> None:
+    """Fill in the importance of all units.
+
+    Args:
+        groups: Of the modules.
+        rank: ``gate``: the expected square of what the action moves by when a unit is scaled; ``magnitude``: the norms
+            of what writes and what reads it; ``random``.
+        modules: Graph name -> module.
+        source: For recorded observations.
+        samples: How many of them.
+
+    Raises:
+        SourceError: when the policy gives actions without gradients.
+    """
+    if rank == "random":
+        random = np.random.default_rng(SEED)
+        for group in groups:
+            group.importance = random.random(group.size)
+        return
+    weights = {graph: dict(module.named_parameters()) for graph, module in modules.items()}
+    if rank == "magnitude":
+        for group in groups:
+            group.importance = _magnitude(group, weights[group.graph])
+        return
+    values = {(graph, name): value.requires_grad_() for graph, named in weights.items()
+              for name, value in named.items() if value.is_floating_point()}  # fmt: skip
+    try:
+        for slopes in slopes_of(_actions(modules, source, samples), values):
+            for group in groups:
+                moved = np.zeros(group.size)
+                for member in _readers(group):
+                    if (key := (group.graph, member.weight)) in slopes:
+                        moved += _by_unit(values[key].detach() * slopes[key], member).numpy()
+                group.importance = group.importance + moved**2
+    finally:
+        for value in values.values():
+            value.requires_grad_(False)
+
+
+class Work:
+    """Counts multiply-accumulates of one inference.
+
+    Args:
+        walks: Graph name -> walk.
+        runs: Graph name -> how often it runs.
+        groups: Whose units may go.
+    """
+
+    def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[Group]) -> None:
+        numbers = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
+        self._sizes = [group.size for group in groups]
+        self._terms: list[tuple[int, list[int]]] = []
+        for graph, walk in walks.items():
+            for product in walk.products:
+                leaves = [leaf for axis in product for leaf in walk.factors.leaves(axis)]
+                loses = [numbers[graph, leaf] for leaf in leaves if (graph, leaf) in numbers]
+                fixed = [walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in numbers]
+                self._terms.append((runs[graph] * math.prod(fixed), loses))
+
+    def without(self, number: int, size: int) -> int:
+        """Return what is saved when one group has so many units, and all others are whole."""
+        return sum(
+            fixed * math.prod(self._sizes[other] for other in loses)
+            - fixed * math.prod(size if other == number else self._sizes[other] for other in loses)
+            for fixed, loses in self._terms
+        )
+
+    def macs(self, sizes: Sequence[int]) -> int:
+        """Return the work with so many units of each group."""
+        return sum(fixed * math.prod(sizes[number] for number in loses) for fixed, loses in self._terms)
+
+
+def _is_slowest(walk: Walk, members: Sequence[Member]) -> bool:
+    """Leave out what lies within another unit, such as the elements of a head."""
+    for member in members:
+        axis = walk.weights[member.weight][member.axis]
+        slower = walk.factors.leaves(axis)[: member.place]
+        if any(not walk.factors.is_frozen(other) for other in slower):
+            return False
+    return True
+
+
+def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
+    """Return the product of the L2 norms of what writes and what reads each unit."""
+    product = np.ones(group.size)
+    for axis in (0, 1):
+        squares = [
+            _by_unit(weights[member.weight].detach() ** 2, member).numpy()
+            for member in group.members
+            if member.axis == axis and member.weight in weights and weights[member.weight].dim() > 1
+        ]
+        product = product * np.sqrt(np.sum(squares, axis=0)) if squares else product
+    return product
+
+
+def _readers(group: Group) -> list[Member]:
+    """Return the weights that read the units; those that write them where nothing reads them."""
+    return [member for member in group.members if member.axis == 1] or group.members
+
+
+def _by_unit(values: Tensor, member: Member) -> Tensor:
+    """Return sums of a weight's values for each unit of a member: (units,)."""
+    shape = values.shape
+    parts = values.reshape(*shape[: member.axis], *member.sizes, *shape[member.axis + 1 :])
+    unit = member.axis + member.place
+    return parts.double().sum(dim=[axis for axis in range(parts.dim()) if axis != unit])
+
+
+def _actions(modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> Iterator[Any]:
+    """Yield the raw action of each recorded observation."""
+    program = BatchedProgram(source.manifest.program, modules)
+    noise = drawn(program.noise, 1, np.random.default_rng(SEED))
+    for inputs in recorded_inputs(source, samples):
+        yield program.run(inputs, noise)[source.manifest.spec.action.name]

@@ -1,0 +1,196 @@
+"""Pruning to a latency: blocks, heads, neurons and channels go by what they take on this machine, not by their work."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import DataError, RecipeError
+from vlatool.module.edits import Edit, edits_from
+from vlatool.module.stage import Changed, ModuleStage
+from vlatool.prune._clock import Clock
+from vlatool.prune._prices import Stack, edits_of, is_gone, measured_prices, role_of
+from vlatool.prune._selection import Selection
+from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
+from vlatool.prune.depth import PROTECTED, _Ranking, stacks
+from vlatool.stage.base import Context
+
+if TYPE_CHECKING:
+    from torch import nn
+
+AIM, CLOSE = 0.98, 0.04
+"""The share of the asked latency that is aimed at, and how far below it a result may stay."""
+ROUNDS = 6
+"""Of choosing and measuring, at most."""
+
+
+class LatencyPruning(ModuleStage):
+    """Remove what matters least for the milliseconds that it takes here, until an inference takes as long as asked.
+
+    Milliseconds are measured on this machine in float32: without half of the units of each kind of layer, and without
+    one block of each stack, all in one run. What is removed is then measured as a whole, and chosen again, until the
+    latency lies within 4 % below the target. ``gate`` ranks blocks and units alike, by how much the action moves when
+    one is scaled. Quantization comes afterwards, and makes it faster still.
+    """
+
+    target_ms: float = Field(gt=0, le=1e6, description="milliseconds that an inference may take here, in float32")
+    engine: str = Field("", description="engine of the runtime; the default one when empty")
+    threads: int = Field(1, ge=1, le=1024, description="intra-op threads")
+    rank: Rank = Field("gate", description="how units are ranked")
+    blocks: bool = Field(True, description="whether whole blocks may go, those of the trunk")
+    samples: int = Field(32, ge=1, description="recorded observations to rank on")
+    multiple: int = Field(16, ge=1, description="neurons and channels that stay are a multiple of this")
+    least: float = Field(0.125, gt=0, le=1, description="share of each group that stays in any case")
+    include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
+    exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
+    chosen: str = Field("", description="what an earlier run chose, as its manifest has it: nothing is measured then")
+
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+        """Choose the blocks and units that stay.
+
+        Raises:
+            RecipeError: when it is fast enough already, or cannot be made so fast.
+            SourceError: when torch.export cannot trace a module.
+            DataError: when the latency is not met: it changes from run to run.
+        """
+        if self.chosen:
+            return Changed(edits_from(self.chosen, "--chosen"))
+        context.tell("tracing the policy", None)
+        walks = walks_of(modules, source)
+        groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
+        context.tell(f"ranking the units of {len(groups)} groups", None)
+        rank_units(groups, self.rank, modules, source, self.samples)
+        blocks = self._stacks(modules, source)
+        work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
+        with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
+            clock = Clock(source, Path(scratch), self.engine, self.threads, self.made_by(), context)
+            edits = self._met(groups, blocks, work, clock, context)
+        return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits])})
+
+    def _stacks(self, modules: Mapping[str, nn.Module], source: Bundle) -> list[Stack]:
+        """Return the stacks that may lose blocks."""
+        if not self.blocks or self.rank != "gate":
+            return []
+        selection = Selection((), self.exclude, PROTECTED)
+        sizes = {(graph, name): len(stack) for graph, module in modules.items() for name, stack in stacks(module)
+                 if selection.has((name,))}  # fmt: skip
+        scores = _Ranking(modules, source, self.samples).gate(
+            [(graph, name, block) for (graph, name), size in sizes.items() for block in range(size)], set()
+        )
+        return [
+            Stack(graph, name, [scores[graph, name, block] for block in range(size)])
+            for (graph, name), size in sizes.items()
+        ]
+
+    def _met(
+        self, groups: Sequence[Group], blocks: Sequence[Stack], work: Work, clock: Clock, context: Context
+    ) -> tuple[Edit, ...]:
+        """Return edits that meet the target, choosing again as long as what was chosen does not."""
+        context.tell(f"measuring what {len({role_of(group) for group in groups})} kinds of layers take", None)
+        whole, prices = measured_prices(groups, blocks, work, clock)
+        if whole <= self.target_ms:
+            raise RecipeError(f"It takes {whole:.3g} ms here already; asked for {self.target_ms:g} ms.", "ask for less")
+        choice = _Choice(groups, blocks, work, prices, self.least)
+        goal, tried = AIM * self.target_ms, list[float]()
+        for number in range(ROUNDS):
+            edits = choice.until(whole, goal)
+            _, (ms,) = clock.times([edits])
+            tried.append(ms)
+            context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
+            if (1 - CLOSE) * self.target_ms <= ms <= self.target_ms:
+                return edits
+            goal *= AIM * self.target_ms / ms
+        raise DataError(
+            f"The latency of {self.target_ms:g} ms was not met within {CLOSE:.0%}; measured: "
+            f"{', '.join(f'{ms:.3g}' for ms in tried)} ms.",
+            "let nothing else run meanwhile; let units go one by one: --multiple 1",
+        )
+
+
+@dataclass(frozen=True, order=True)
+class _Offer:
+    """What may go next: how much it matters for each millisecond that it saves, and what it is."""
+
+    price: float
+    ms: float
+    part: int
+    loses: tuple[int, ...]
+
+
+class _Choice:
+    """Chooses what goes by prices that were measured.
+
+    Args:
+        groups: Units that may go.
+        stacks: Blocks that may go.
+        work: Of the groups.
+        prices: Role of a group -> milliseconds for a multiply-accumulate.
+        least: Share of each group that stays.
+    """
+
+    def __init__(
+        self, groups: Sequence[Group], stacks: Sequence[Stack], work: Work, prices: Mapping[str, float], least: float
+    ) -> None:
+        self._groups, self._stacks, self._work, self._least = groups, stacks, work, least
+        self._prices = [prices[role_of(group)] for group in groups]
+        self._saved = [0.0] * len(groups)
+
+    def until(self, whole: float, goal: float) -> tuple[Edit, ...]:
+        """Take away what matters least for the milliseconds that it saves, from all of it, until so many are left.
+
+        Raises:
+            RecipeError: when no more may go before.
+        """
+        self._saved = [0.0] * len(self._groups)
+        for group in self._groups:
+            group.keep = list(range(group.size))
+        for stack in self._stacks:
+            stack.keep = list(range(len(stack.importance)))
+        left = whole
+        while left > goal:
+            offers = [*self._units(), *self._blocks()]
+            fit = [offer for offer in offers if left - offer.ms >= (1 - CLOSE) * goal]
+            if not offers:
+                raise RecipeError(
+                    f"No less than about {left:.3g} of {whole:.3g} ms can be reached here; asked for {goal / AIM:.3g}.",
+                    "ask for more, or let less stay (--least); quantization makes it faster, too",
+                )
+            offer = min(fit) if fit else min(offers, key=lambda offer: offer.ms)
+            self._take(offer)
+            left -= offer.ms
+        return edits_of(self._groups, self._stacks)
+
+    def _units(self) -> Iterator[_Offer]:
+        """Yield the next units of each group that is not in a block that is gone."""
+        for number, group in enumerate(self._groups):
+            if is_gone(group, self._stacks):
+                continue
+            cost, loses = group.cheapest(self._least)
+            ms = self._prices[number] * self._work.without(number, group.stays - len(loses)) - self._saved[number]
+            if loses and ms > 0:
+                yield _Offer(cost / ms, ms, number, tuple(loses))
+
+    def _blocks(self) -> Iterator[_Offer]:
+        """Yield the next block of each stack; the last one stays."""
+        for place, stack in enumerate(self._stacks):
+            if len(stack.keep) < 2:
+                continue
+            block = stack.least
+            inside = (number for number, group in enumerate(self._groups) if stack.block_of(group) == block)
+            ms = stack.ms - sum(self._saved[number] for number in inside)
+            if ms > 0:
+                yield _Offer(stack.importance[block] / ms, ms, len(self._groups) + place, (block,))
+
+    def _take(self, offer: _Offer) -> None:
+        if offer.part < len(self._groups):
+            self._groups[offer.part].without(offer.loses)
+            self._saved[offer.part] += offer.ms
+        else:
+            self._stacks[offer.part - len(self._groups)].keep.remove(*offer.loses)
