@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +14,16 @@ from pydantic import ValidationError
 from vlatool.benchmark.latency import Latency, processors
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, ProfileError, UsageError
+from vlatool.export.onnx import ExportOnnx
 from vlatool.files.messages import from_json, to_json
 from vlatool.graph.workload import workload
+from vlatool.graph.zeros import zero_share
 from vlatool.measurement.cold_start import ColdStart, cold_start, run
 from vlatool.measurement.interleaved import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.measurement.jobs import ColdStartJob, LatencyJob
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import run_transform
 
 
 def names(row):
@@ -350,3 +354,20 @@ def test_the_memory_of_eager_torch_is_not_said_to_be_limited(float_bundle, sourc
 def test_numbers_that_no_machine_has_are_refused(options):
     with pytest.raises(ValidationError, match="less than or equal"):
         Latency(**options)
+
+
+def test_zeros_are_said_to_gain_nothing_as_measured(source_bundle: Bundle, float_bundle: Bundle, tmp_path: Path):
+    sparse = run_transform(
+        build_stage("prune.magnitude", {"ratio": 0.8}), source_bundle, tmp_path / "sparse", Context()
+    )
+    exported = run_transform(ExportOnnx(), sparse, tmp_path / "exported", Context())
+    assert zero_share(float_bundle) == 0
+    assert 0.5 < zero_share(exported) < 0.8, "what is protected is dense"
+    report = benchmarked(float_bundle, against=(exported.path,))
+    reasons = [finding.reason for finding in report.findings if "zero" in finding.reason]
+    assert len(reasons) == 1
+    speedup = report.rows[1].value("speedup")
+    assert f"are zero, and it is {speedup:.3g}x as fast as " in reasons[0]
+    assert "ONNX Runtime " in reasons[0]
+    back = benchmarked(exported, against=(float_bundle.path,))
+    assert not [finding for finding in back.findings if "zero" in finding.reason]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,6 +16,7 @@ from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, U
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
 from vlatool.graph.workload import WORK, whole_work, workload
+from vlatool.graph.zeros import zero_share
 from vlatool.machine.host import fingerprint
 from vlatool.measurement import agent
 from vlatool.measurement.interleaved import MOST
@@ -24,6 +25,7 @@ from vlatool.measurement.measured import Measured
 from vlatool.measurement.rows import measurements, raw, sustained, tables
 from vlatool.measurement.validity import findings, validity
 from vlatool.report import Finding, Measurement, Report, Row
+from vlatool.runtime.engine import engine_class
 from vlatool.stage.base import Context, Measure
 
 if TYPE_CHECKING:
@@ -34,6 +36,10 @@ LOG_LINES = 40
 CALLS, FEWEST_TICKS = 200, 20
 LONGEST_S = 86_400
 HERE = "this host"
+SPARSE = 0.2
+"""Share of zeros, above those of the first policy, from which a policy counts as sparse."""
+GAINED = 1.05
+"""Speed-up that its interval must lie above before a policy is said to gain by its zeros."""
 
 
 class Latency(Measure):
@@ -176,7 +182,11 @@ class Latency(Measure):
             role = "baseline" if policy is reference and others else "subject"
             placed = tuple(replace(number, where=where) for number in numbers)
             rows.append(Row(policy.name, role, "", placed, raw(run, policy, not others), details))
-        seen = (*findings(run, job, bool(self.sustained)), *self._limited(run.host, where))
+        seen = (
+            *findings(run, job, bool(self.sustained)),
+            *self._limited(run.host, where),
+            *_sparse(bundles, rows, run),
+        )
         valid = validity(seen)
         return Report(
             "benchmark",
@@ -248,6 +258,25 @@ def _ms(row: Row) -> str:
     """Return the median latency with three digits, or with all before the point."""
     value = row.value("latency_p50")
     return f"{value:.3g} ms" if value < 1000 else f"{value:,.0f} ms"
+
+
+def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Measured) -> Iterator[Finding]:
+    """Say of each policy with more zeros than the first one whether the engine gains by them, as was measured."""
+    dense = zero_share(bundles[0]) if len(bundles) > 1 else 1.0
+    for bundle, row, policy in list(zip(bundles, rows, run.policies, strict=True))[1:]:
+        share = zero_share(bundle) if dense < 1 else 0.0
+        if share < dense + SPARSE:
+            continue
+        speedup = next(number for number in row.measurements if number.name == "speedup")
+        gained = speedup.low is not None and speedup.low > GAINED
+        titles = ", ".join(dict.fromkeys(str(engine_class(graph.engine).title) for graph in policy.engines))
+        verdict = "gains by them" if gained else "multiplies them like other numbers: nothing is faster"
+        yield Finding(
+            "note",
+            f"{share:.0%} of the weights of {row.name} are zero, and it is {speedup.value:.3g}x as fast as "
+            f"{rows[0].name} in this run: {titles} {verdict}",
+            "" if gained else "for speed, remove whole units: vlatool prune structured",
+        )
 
 
 def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:
