@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 import typer
 from _acts import POLICY_YAML, policy
+from _flow import write_flow
 from safetensors.torch import load_file, save_file
 
 from vlatool.cli import app, main
@@ -42,6 +43,8 @@ LINES = {
     "prune neurons": "{policy} -o {out}",
     "prune structured": "{policy} -o {out} --samples 2 --multiple 1",
     "prune depth": "{deep} -o {out} --samples 2",
+    "prune latency": "{deep} -o {out} --target-ms 1 --chosen {chosen}",
+    "prune steps": "{flow} -o {out} --to 2",
     "distill policy": "{pruned} -o {out} --trust {policy} --steps 2 --batch 2 --episodes 1 --student-episodes 0",
     "distill weights": "{policy} --file {tuned} -o {out}",
     "quantize bfloat16": "{policy} -o {out}",
@@ -134,6 +137,8 @@ def places(policy_template, tmp_path_factory) -> SimpleNamespace:
     assert not left.value.code
     made = {
         "deep": deeper(noisy, here / "deep"),
+        "flow": write_flow(here / "flow"),
+        "chosen": '[{"graph":"main","module":"blocks","axis":"blocks","keep":[0]}]',
         "bundle": here / "bundle",
         "pruned": here / "pruned",
         "tuned": here / "pruned/module/main.safetensors",

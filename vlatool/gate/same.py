@@ -15,6 +15,7 @@ from vlatool.gate.config import Gate
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode")
 """What a robot relies on; files of statistics and tokenizers may differ."""
 RATE = ("control_hz", "chunk", "execute")
+FEWER_STEPS = "prune.steps"
 
 
 def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
@@ -65,14 +66,19 @@ def _rates(mine: Manifest, theirs: Manifest) -> str:
 def _program(mine: Manifest, theirs: Manifest) -> str:
     """Return what the candidate keeps between inferences, draws, or repeats otherwise than the baseline.
 
-    How a program is cut into graphs is each bundle's own business.
+    How a program is cut into graphs is each bundle's own business; that it has fewer steps is, where it was made so.
     """
-    parts: list[tuple[str, Any, Any]] = [
-        (word, _of_all(mine, word), _of_all(theirs, word)) for word in ("keep", "noise", "schedule")
-    ]
-    one, two = (max(step.repeat for step in manifest.program) for manifest in (mine, theirs))
-    parts.append(("repeat", one, two))
+    words = ("keep", "noise") if _has_fewer_steps(mine) else ("keep", "noise", "schedule")
+    parts: list[tuple[str, Any, Any]] = [(word, _of_all(mine, word), _of_all(theirs, word)) for word in words]
+    if not _has_fewer_steps(mine):
+        one, two = (max(step.repeat for step in manifest.program) for manifest in (mine, theirs))
+        parts.append(("repeat", one, two))
     return "; ".join(text for word, one, two in parts if (text := _told(f"the program's {word}", one, two)))
+
+
+def _has_fewer_steps(manifest: Manifest) -> bool:
+    """Return whether a stage reduced the steps of the program: success tells what that is worth."""
+    return any(entry.get("stage") == FEWER_STEPS for entry in manifest.build)
 
 
 def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle, hash_file
+from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError
 from vlatool.module.description import read_description, read_location
 from vlatool.module.factory import OWN_NAME, call_factory, factory_file, split_factory
@@ -30,6 +31,7 @@ class Origin:
         weights: Glob of the shards that vlatool loads; empty when the factory does.
         code: File beside the factory -> its SHA-256 when the source bundle was made.
         environment: ``make`` and ``tasks`` of the environment that the policy's description names.
+        program: How the description lets its graphs run.
     """
 
     folder: Path
@@ -38,6 +40,7 @@ class Origin:
     weights: str = ""
     code: Mapping[str, str] = field(default_factory=dict)
     environment: Mapping[str, Any] = field(default_factory=dict)
+    program: tuple[ProgramStep, ...] = ()
 
     def check(self, endings: tuple[str, ...] = ()) -> None:
         """Raise when a file is not what it was: every one, or those with these endings.
@@ -112,7 +115,9 @@ def origin_of(bundle: Bundle) -> Origin:
             raise SourceError(
                 f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", AGAIN
             )
-    return Origin(folder, factory, described.arguments, described.weights, _code(bundle), described.environment)
+    return Origin(
+        folder, factory, described.arguments, described.weights, _code(bundle), described.environment, described.program
+    )
 
 
 def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
+from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, require
 from vlatool.module.description import read_location
@@ -35,12 +36,14 @@ class Changed:
     Args:
         edits: What is kept of the structure; the caller cuts the modules.
         training: How they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
+        program: How the graphs run from now on; as before when None.
         options: What the stage found out on this machine, under names of options of its own, so that it is made again
             in the same way wherever that is done.
     """
 
     edits: tuple[Edit, ...] = ()
     training: Mapping[str, Any] | None = None
+    program: tuple[ProgramStep, ...] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -92,7 +95,7 @@ class ModuleStage(Transform):
         made_by = self.made_by()
         made_by["options"] = {**made_by["options"], **done.options}
         edits = joined_edits(read_edits(bundle), done.edits)
-        changed = write_changed(bundle, out, edits, modules, made_by, done.training)
+        changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program)
         context.tell("running the changed policy", None)
         torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
@@ -105,6 +108,7 @@ def write_changed(
     modules: Mapping[str, nn.Module],
     made_by: dict[str, Any],
     training: Mapping[str, Any] | None = None,
+    program: tuple[ProgramStep, ...] | None = None,
 ) -> Bundle:
     """Write a source bundle with other modules.
 
@@ -115,6 +119,7 @@ def write_changed(
         modules: Graph name -> module after the edits.
         made_by: Stage, options and versions.
         training: How they were trained, if they were.
+        program: How they run; as in the source when None.
     """
     write_module(out, edits, modules)
     if training is not None:
@@ -122,4 +127,5 @@ def write_changed(
     carry_over(source, out)
     shutil.copyfile(source.path / LOCATION, out / LOCATION)
     build = (*history(source), {**made_by, "input": source.hash})
-    return seal(out, replace(source.manifest, parent=source.hash, made_by=made_by, build=build))
+    program = source.manifest.program if program is None else program
+    return seal(out, replace(source.manifest, program=program, parent=source.hash, made_by=made_by, build=build))

@@ -168,7 +168,8 @@ class Session:
         if number:
             return write_changed(source, place, read_edits(source), self._lesson.modules, source.manifest.made_by)
         modules = teacher.program.modules
-        return write_changed(teacher.bundle, place, teacher.edits, modules, source.manifest.made_by)
+        program = teacher.program.steps
+        return write_changed(teacher.bundle, place, teacher.edits, modules, source.manifest.made_by, program=program)
 
     def _draw(self, random: np.random.Generator) -> Tensor:
         """Return the loss of a batch."""

@@ -11,6 +11,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError
 from vlatool.module.batched import BatchedProgram
 from vlatool.module.edits import Edit, read_edits
+from vlatool.module.origin import origin_of
 from vlatool.module.torch_policy import load_modules, unedited_modules
 
 if TYPE_CHECKING:
@@ -58,7 +59,8 @@ class Teacher:
         own = load_modules(bundle) if path is not None else unedited_modules(bundle)
         _check_apart(own, modules)
         _check_fits(bundle, student)
-        return cls(bundle, edits, BatchedProgram(bundle.manifest.program, own))
+        program = bundle.manifest.program if path is not None else origin_of(bundle).program
+        return cls(bundle, edits, BatchedProgram(program, own))
 
 
 def _check_apart(teacher: Mapping[str, nn.Module], student: Mapping[str, nn.Module]) -> None:

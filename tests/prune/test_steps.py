@@ -1,0 +1,108 @@
+"""Fewer denoising steps: the program integrates the same span in larger steps, and distillation makes up for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from _flow import write_flow
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.program import ProgramStep
+from vlatool.errors import RecipeError
+from vlatool.export.onnx import ExportOnnx
+from vlatool.gate.config import Gate
+from vlatool.gate.same import check
+from vlatool.module.torch_policy import torch_policy
+from vlatool.prune.steps import Steps, fewer
+from vlatool.rebuild.rebuild import rebuild
+from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import run_transform
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that integrates a flow in four steps; read only."""
+    return write_flow(tmp_path_factory.mktemp("flow") / "flow")
+
+
+@pytest.fixture(scope="module")
+def source(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    return run_transform(TorchModule(policy=folder), None, tmp_path_factory.mktemp("source") / "out", Context())
+
+
+@pytest.fixture(scope="module")
+def one(source: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    return run_transform(Steps(to=1), source, tmp_path_factory.mktemp("one") / "out", Context())
+
+
+def error(bundle: Bundle, whole: Bundle) -> float:
+    """The mean relative error of the actions for new states, from the same noise."""
+    ours, theirs = torch_policy(bundle, 0), torch_policy(whole, 0)
+    states = np.random.default_rng(1).standard_normal((32, 3)).astype(np.float32)
+    errors = []
+    for state in states:
+        ours.reset()
+        theirs.reset()
+        errors.append(relative_error(ours.infer({"state": state}).chunk, theirs.infer({"state": state}).chunk))
+    return float(np.mean(errors))
+
+
+def test_the_program_has_larger_steps_and_runs(one: Bundle, source: Bundle, folder: Path, tmp_path: Path):
+    prefix, head = one.manifest.program
+    assert (head.repeat, head.schedule) == (1, {"t": [1.0], "dt": [-1.0]})
+    assert prefix == source.manifest.program[0]
+    exported = run_transform(ExportOnnx(), one, tmp_path / "out", Context())
+    state = {"state": np.ones(3, np.float32)}
+    ours, wanted = load(exported.path, seed=0), torch_policy(one, 0)
+    assert relative_error(ours.infer(state).chunk, wanted.infer(state).chunk) < 1e-5
+    assert rebuild(exported, Context(), source=str(folder), cache=tmp_path / "cache").identical
+    whole = run_transform(ExportOnnx(), source, tmp_path / "whole", Context())
+    check(exported, whole, Gate(accuracy=None))
+
+
+def test_what_many_steps_reached_is_learnt(one: Bundle, source: Bundle, tmp_path: Path):
+    options = {"steps": 300, "batch": 32, "learning_rate": 0.01, "average": 0.9, "loss": "l2"}
+    made = run_transform(build_stage("distill.policy", options), one, tmp_path / "out", Context())
+    assert made.manifest.program == one.manifest.program
+    assert error(made, source) < 0.5 * error(one, source)
+
+
+@pytest.mark.parametrize(("schedule", "count", "wanted"), [
+    ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.25] * 4}, 2, {"t": [1.0, 0.5], "dt": [-0.5, -0.5]}),
+    ({"dt": [0.25] * 4, "t": [0.0, 0.25, 0.5, 0.75]}, 1, {"dt": [1.0], "t": [0.0]}),
+    ({"t": [0, 250, 500, 750], "dt": [250] * 4}, 2, {"t": [0, 500], "dt": [500, 500]}),
+    ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.25] * 4}, 3,
+     {"t": [1.0, 1 - 1 / 3, 1 - 2 / 3], "dt": [-1 / 3] * 3}),
+])  # fmt: skip
+def test_times_and_sizes_span_the_same(schedule, count: int, wanted):
+    step = ProgramStep("head", {"t": "t", "dt": "dt"}, {"x": "x"}, 4, {}, schedule)
+    made = fewer(step, count)
+    assert made.repeat == count
+    assert list(made.schedule) == list(wanted)
+    for name, numbers in wanted.items():
+        assert made.schedule[name] == pytest.approx(numbers)
+        assert {type(number) for number in made.schedule[name]} == {type(number) for number in numbers}
+
+
+@pytest.mark.parametrize(("schedule", "to", "says"), [
+    ({"t": [1.0, 0.75, 0.5, 0.25]}, 2, r"does not say how large its steps are: .* \(t: -0\.25\)"),
+    ({"t": [1.0, 0.9, 0.5, 0.25], "dt": [-0.25] * 4}, 2, "The schedule of 't' is neither one number nor evenly spaced"),
+    ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.1] * 4}, 2, "does not say how large its steps are"),
+    ({"dt": [-0.25] * 4}, 2, r"does not say how large its steps are: .* \(no times\)"),
+    ({"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.25] * 4}, 4, "repeats 'head' 4 times; --to is 4"),
+    ({"t": [0, 1, 2, 3], "dt": [1] * 4}, 3, "whole numbers"),
+])  # fmt: skip
+def test_what_cannot_have_fewer_steps_is_refused(schedule, to: int, says: str):
+    step = ProgramStep("head", {name: name for name in schedule}, {"x": "x"}, 4, {}, schedule)
+    with pytest.raises(RecipeError, match=says):
+        fewer(step, to)
+
+
+def test_a_policy_without_repeats_is_refused(source_bundle: Bundle, tmp_path: Path):
+    with pytest.raises(RecipeError, match="repeats no graph"):
+        run_transform(Steps(to=1), source_bundle, tmp_path / "out", Context())
