@@ -49,6 +49,7 @@ LINES = {
     "distill weights": "{policy} --file {tuned} -o {out}",
     "quantize bfloat16": "{policy} -o {out}",
     "quantize float8": "{policy} -o {out}",
+    "quantize qat": "{policy} -o {out} --steps 2 --batch 2 --episodes 0 --student-episodes 0 --threads 1",
     "quantize": "{policy} -o {out}",
     "benchmark latency": "{policy} --iterations 20 --duration 0",
     "benchmark overhead": "{policy} --iterations 100",

@@ -27,7 +27,15 @@ from vlatool.stage.run import run_transform
 from vlatool.training.loop import Trainer
 from vlatool.training.teacher import Teacher
 
-SHORT = {"steps": 12, "batch": 4, "episodes": 4, "student_episodes": 2, "every": 5, "learning_rate": 0.003}
+SHORT = {
+    "steps": 12,
+    "batch": 4,
+    "episodes": 4,
+    "student_episodes": 2,
+    "every": 5,
+    "learning_rate": 0.003,
+    "threads": 1,
+}
 
 
 @pytest.fixture(autouse=True)

@@ -66,7 +66,7 @@ def test_the_program_has_larger_steps_and_runs(one: Bundle, source: Bundle, fold
 
 
 def test_what_many_steps_reached_is_learnt(one: Bundle, source: Bundle, tmp_path: Path):
-    options = {"steps": 300, "batch": 32, "learning_rate": 0.01, "average": 0.9, "loss": "l2"}
+    options = {"steps": 300, "batch": 32, "learning_rate": 0.01, "average": 0.9, "loss": "l2", "threads": 1}
     made = run_transform(build_stage("distill.policy", options), one, tmp_path / "out", Context())
     assert made.manifest.program == one.manifest.program
     assert error(made, source) < 0.5 * error(one, source)

@@ -7,7 +7,7 @@ import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -23,7 +23,7 @@ from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.optimize.choice import foretold
 from vlatool.report import Report
-from vlatool.stage.base import Context, Measure, Stage, Transform
+from vlatool.stage.base import Context, Measure, Stage, Transform, build_stage
 from vlatool.stage.run import cache_directory, cached_transform, measured_with, run_transform
 
 if TYPE_CHECKING:
@@ -90,6 +90,9 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
                 stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
+        for name, options in stage.then():
+            bundle = cached_transform(stage, bundle, cache_directory(), context)
+            stage = cast(Transform, build_stage(name, options))
         result = run_transform(stage, bundle, out, context, force=force)
         on_board = board_summary(result, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""

@@ -58,12 +58,16 @@ class BatchedProgram:
         """
         torch = require("torch", "build")
         size = len(next(iter(inputs.values())))
-        if size > 1 and self._batches is None:
-            self._batches = self._takes_batches(inputs, noise)
+        self.look(inputs, noise)
         if size == 1 or self._batches:
             return self._run(inputs, noise)
         rows = [self._run(_rows(inputs, row, row + 1), _rows(noise, row, row + 1)) for row in range(size)]
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+
+    def look(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> None:
+        """Find out with a first batch whether the modules take batches; where runs are changed, look before that."""
+        if len(next(iter(inputs.values()))) > 1 and self._batches is None:
+            self._batches = self._takes_batches(inputs, noise)
 
     def _takes_batches(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> bool:
         """Say whether two rows together give what each gives alone."""

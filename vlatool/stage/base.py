@@ -163,6 +163,10 @@ class Transform(Stage):
         """
         return ""
 
+    def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+        """Return the stages that the command line runs after this one, each with its options; a recipe names them."""
+        return ()
+
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return what else a person wants to know about the new bundle, a sentence for each line."""
         return ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -40,6 +40,9 @@ class TrainingStage(ModuleStage):
     have done wherever they came to (DAgger: Ross et al., arXiv 1011.0686).
     """
 
+    changed_first: ClassVar[bool] = True
+    """Whether a policy that is as its factory makes it has nothing to learn."""
+
     teacher: Path | None = Field(
         None, description="source bundle of the teacher; the policy before any edit when empty"
     )
@@ -73,7 +76,7 @@ class TrainingStage(ModuleStage):
                 f"{EVALUATION_SEEDS}, and would see episodes of the training.",
                 "take a smaller --first-seed, or fewer episodes",
             )
-        if source is not None and self.teacher is None and not is_changed(source):
+        if self.changed_first and source is not None and self.teacher is None and not is_changed(source):
             raise RecipeError(
                 f"{source.manifest.name} is as its factory makes it: without --teacher it would be its own teacher.",
                 "prune it first (vlatool prune structured), or name a --teacher",

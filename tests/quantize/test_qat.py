@@ -1,0 +1,122 @@
+"""Quantization-aware training: the grids are those of the methods that follow; what rounding costs is learnt away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.export.onnx import ExportOnnx
+from vlatool.module.to_onnx import quiet_exporter
+from vlatool.module.torch_policy import torch_policy
+from vlatool.quantize._blocks import METHODS, Format, Scratch, dequantize, planes_of_rows, quantize_planes
+from vlatool.quantize.qat import Qat
+from vlatool.rebuild.rebuild import rebuild
+from vlatool.runtime import load
+from vlatool.runtime.policy import relative_error
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import run_transform
+from vlatool.training.fake_quantization import fake_quantization, in_blocks, per_channel, per_tensor
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+
+
+def test_products_are_rounded_and_gradients_pass_through():
+    torch.manual_seed(0)
+    net = nn.Sequential(nn.Conv2d(3, 8, 3), nn.Flatten(), nn.Linear(8 * 4, 5))
+    values = torch.randn(2, 3, 4, 4)
+    with torch.no_grad():
+        hidden = nn.functional.conv2d(per_tensor(values), per_channel(net[0].weight), net[0].bias).flatten(1)
+        wanted = nn.functional.linear(per_tensor(hidden), per_channel(net[2].weight), net[2].bias)
+        fours = nn.functional.linear(net[1](net[0](values)), in_blocks(net[2].weight), net[2].bias)
+    with fake_quantization("int8"):
+        rounded = net(values)
+    with fake_quantization("int4"):
+        assert torch.equal(net(values), fours)
+    assert torch.equal(rounded, wanted)
+    assert not torch.equal(net(values), wanted), "outside, nothing is rounded"
+    rounded.sum().backward()
+    assert all(value.grad is not None and bool(value.grad.abs().sum() > 0) for value in net.parameters())
+
+
+def test_a_traced_module_is_rounded_alike():
+    net = nn.Sequential(nn.Linear(8, 16), nn.GELU(), nn.Linear(16, 4)).eval()
+    values = torch.randn(3, 8)
+    with quiet_exporter():
+        traced = torch.export.unflatten(torch.export.export(net, (values,)))
+    with fake_quantization("int8"):
+        assert torch.allclose(traced(values), net(values))
+
+
+def test_int8_weights_lie_on_the_grid_of_static_int8():
+    weight = torch.randn(6, 40) * torch.logspace(-3, 1, 6)[:, None]
+    weight[2] = 0
+    codes = per_channel(weight) / (weight.abs().amax(1, keepdim=True).clamp_min(1e-12) / 127)
+    assert torch.allclose(codes, codes.round(), atol=1e-3)
+    assert float(codes.abs().max()) <= 127.001
+
+
+def test_int4_blocks_lie_on_the_grid_of_weight_only():
+    weight = torch.randn(6, 64) * torch.logspace(-2, 1, 6)[:, None]
+    weight[1, :32] = weight[1, :32].abs()
+    planes = planes_of_rows(weight.reshape(-1, 32).T.numpy().copy(), Scratch())
+    stored = quantize_planes(planes, Format(), METHODS["rtn"], Scratch())
+    meant = dequantize(stored.codes, stored.scale, stored.zero, Format()).reshape(6, 64)
+    assert np.allclose(in_blocks(weight).numpy(), meant, rtol=1e-5, atol=1e-6)
+    assert in_blocks(torch.randn(3, 40)).shape == (3, 40)
+
+
+def test_uint8_values_hold_zero():
+    values = per_tensor(torch.tensor([0.0, 0.5, 3.0, 10.0]))
+    assert float(values[0]) == 0
+    assert values.unique().numel() == 4
+    assert torch.equal(per_tensor(torch.zeros(4)), torch.zeros(4))
+    assert float(per_tensor(torch.tensor([-1.0, 2.0]))[0]) == pytest.approx(-1, abs=3 / 255)
+
+
+def error(policy: object, wanted: object, bundle: Bundle) -> float:
+    observations = recorded_observations(bundle, 16)
+    return float(np.mean([relative_error(policy.infer(each).chunk, wanted.infer(each).chunk) for each in observations]))
+
+
+@pytest.mark.parametrize("weights", ["int8", "int4"])
+def test_what_rounding_costs_is_learnt_away(policy_dir: Path, tmp_path: Path, weights: str):
+    stored = load_file(policy_dir / "weights.safetensors")
+    for name, factor in (("mlp.1.weight", 60.0), ("mlp.1.bias", 60.0)):  # one neuron takes the whole range
+        stored[f"blocks.0.{name}"][0] *= factor
+    stored["blocks.0.mlp.3.weight"][:, 0] /= 60.0
+    save_file(stored, policy_dir / "weights.safetensors")
+    source_bundle = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
+    whole = torch_policy(source_bundle, 0)
+    options = {"weights": weights, "steps": 80, "batch": 32, "average": 0.9, "episodes": 0, "student_episodes": 0,
+               "learning_rate": 0.01, "loss": "l2", "threads": 1}  # fmt: skip
+    tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
+    errors = []
+    for name, start in (("plain", source_bundle), ("trained", tuned)):
+        for number, (stage, given) in enumerate(Qat(weights=weights).then()):
+            start = run_transform(build_stage(stage, given), start, tmp_path / f"{name}{number}", Context())
+        errors.append(error(load(start.path), whole, source_bundle))
+    assert errors[1] < 0.8 * errors[0]
+    assert [entry["stage"] for entry in start.manifest.build][-3:-1] == ["quantize.qat", "export.onnx"]
+    assert rebuild(start, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
+
+
+def test_the_policy_need_not_be_changed_before(source_bundle: Bundle):
+    Qat().check(source_bundle, None)
+
+
+def test_an_export_of_the_tuned_policy_is_in_float32(source_bundle: Bundle, tmp_path: Path):
+    options = {"steps": 2, "batch": 4, "episodes": 0, "student_episodes": 0, "threads": 1}
+    tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
+    exported = run_transform(ExportOnnx(), tuned, tmp_path / "exported", Context())
+    assert exported.manifest.graphs["main"].precision == {"float32": 1.0}

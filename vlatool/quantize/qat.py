@@ -1,0 +1,44 @@
+"""Quantization-aware training: weights learn to be rounded, then they are."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from vlatool.runtime.engine import layouts
+from vlatool.training.fake_quantization import BLOCK, fake_quantization
+from vlatool.training.imitation import ImitationStage
+
+if TYPE_CHECKING:
+    LayoutName = str
+else:
+    LayoutName = Literal[tuple(layouts())]
+
+
+class Qat(ImitationStage):
+    """Train a policy while its products are rounded, so that quantization afterwards costs less accuracy.
+
+    The teacher is the policy in float32 before any edit, or ``--teacher``: no labels are needed. What is trained are
+    the weights; they are rounded to the same grid as by ``quantize static-int8`` (int8, with activations) or
+    ``quantize weight-only`` (int4, in blocks of 32), which follow, and write the same form of bundle. Try these alone
+    first: they take seconds, and most policies lose nothing. In a recipe, name the method that follows.
+    """
+
+    changed_first: ClassVar[bool] = False
+
+    weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
+    learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
+    layout: LayoutName = Field("ort", description="of the bundle, as quantize static-int8 takes it; ort for int4")
+
+    def computed(self) -> contextlib.AbstractContextManager[Any]:
+        """Products are rounded."""
+        rounded: contextlib.AbstractContextManager[Any] = fake_quantization(self.weights)
+        return rounded
+
+    def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+        """Export, and quantize to the grid that the weights were trained for."""
+        if self.weights == "int4":
+            return ("export.onnx", {}), ("quantize.weight_only", {"bits": 4, "block": BLOCK, "search": False})
+        return ("export.onnx", {}), ("quantize.static_int8", {"layout": self.layout})

@@ -1,0 +1,67 @@
+"""Training that brings a student's action close to its teacher's."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field
+
+from vlatool import registry
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError, nearest
+from vlatool.module.batched import BatchedProgram
+from vlatool.training.rounds import LABEL, NOISE, tensors
+from vlatool.training.session import Lesson
+from vlatool.training.stage import TrainingStage
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from vlatool.hardware.profile import Profile
+    from vlatool.training.teacher import Teacher
+
+
+class ImitationStage(TrainingStage):
+    """Trains a student to do what its teacher does, from the same observation and the same noise."""
+
+    loss: str = Field("auto", description="kl (discrete actions), l1, l2 or huber; kl or l1 when auto")
+    temperature: float = Field(2.0, gt=0, le=100, description="of kl")
+    delta: float = Field(0.1, gt=0, le=1000, description="of huber")
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The loss is known, and fits the action."""
+        known = registry.names("losses")
+        if self.loss != "auto" and self.loss not in known:
+            raise RecipeError(f"Unknown loss '{self.loss}'; {nearest(self.loss, ['auto', *known])}.")
+        super().check(source, profile)
+        if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
+            raise RecipeError("The loss kl compares discrete actions; the policy's are continuous.", "try --loss l1")
+
+    def computed(self) -> contextlib.AbstractContextManager[Any]:
+        """Return a context in which the student computes."""
+        return contextlib.nullcontext()
+
+    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+        """The student does with each observation what the teacher did."""
+        action = source.manifest.spec.action
+        name = self.loss if self.loss != "auto" else "kl" if action.kind == "discrete" else "l1"
+        student, distance = BatchedProgram(source.manifest.program, modules), self._distance(name)
+
+        def loss(rows: Mapping[str, Any]) -> Tensor:
+            inputs, noise = tensors(rows), tensors(rows, NOISE)
+            student.look(inputs, noise)
+            with self.computed():
+                values = student.run(inputs, noise)
+            far: Tensor = distance(values[action.name].float(), tensors(rows, LABEL)[action.name])
+            return far
+
+        return Lesson(name, modules, loss)
+
+    def _distance(self, name: str) -> Any:
+        """Return the loss with the options that it takes."""
+        kind = registry.load("losses", name)
+        takes = inspect.signature(kind).parameters
+        return kind(**{option: getattr(self, option) for option in ("temperature", "delta") if option in takes})
