@@ -1,11 +1,12 @@
 """Prune a policy whose weights are in shards, and print the most memory that each command had.
 
-    python tests/soak/large_depth.py --folder F --make       # the sample smolvla-like, 450 M, 1.8 GB of shards
+    python tests/soak/large_depth.py --folder F --make smolvla   # the sample smolvla-like, 450 M, 1.8 GB of shards
     python tests/soak/large_depth.py -- vlatool prune depth F -o pruned ...
     python tests/soak/large_depth.py --torch pruned --bundle pruned32   # actions of a bundle beside those of torch
 
 The memory is the most that a process had resident (VmHWM), summed over the command and all that it started.
-``tests/soak/stream_benchmark.py --make`` writes a policy of 6.7 billion parameters.
+``--folder F --make llama`` writes a policy of 6.7 billion parameters, 13.5 GB of bfloat16 shards. The blocks that
+``--rank even`` lets go are zeros that take no place on the disk, so that it takes 7 GB: nothing reads them.
 """
 
 from __future__ import annotations
@@ -21,10 +22,19 @@ from pathlib import Path
 
 import numpy as np
 
-OBSERVATIONS = 4
+
+def make_llama(folder: Path) -> None:
+    """Write a Llama-shaped policy, half of whose blocks are holes."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from _llama import write_llama
+
+    from vlatool.prune.depth import spread
+
+    count = write_llama(folder, holes=tuple(sorted(set(range(32)) - set(spread(32, 16)))))
+    print(f"{count / 1e9:.3f} G parameters")
 
 
-def make(folder: Path) -> None:
+def make_smolvla(folder: Path) -> None:
     """Write the sample with its weights in two shards, named after its graphs."""
     import yaml
     from safetensors.torch import save_file
@@ -87,7 +97,7 @@ def measured(command: list[str]) -> int:
     return code
 
 
-def compare(source: Path, made: Path) -> float:
+def compare(source: Path, made: Path, count: int) -> float:
     """Return the largest relative difference of a bundle's actions from torch's, weights read one after the other."""
     from vlatool.bundle.bundle import Bundle
     from vlatool.data import observations_for
@@ -100,7 +110,7 @@ def compare(source: Path, made: Path) -> float:
 
     bundle = Bundle.open(source)
     trust.name(read_location(source), None, "")
-    stored, observations = stored_modules(bundle), observations_for(bundle, OBSERVATIONS)
+    stored, observations = stored_modules(bundle), observations_for(bundle, count)
     noises = [noise for step in bundle.manifest.program for noise in step.noise.items()]
     random = np.random.default_rng(0)
     drawn = [
@@ -117,17 +127,18 @@ def compare(source: Path, made: Path) -> float:
 def main() -> int:
     """Make the sample, measure a command, or compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, help="where the sample is")
-    parser.add_argument("--make", action="store_true", help="write it")
+    parser.add_argument("--folder", type=Path, help="where the policy is")
+    parser.add_argument("--make", choices=["smolvla", "llama"], help="write it")
     parser.add_argument("--torch", type=Path, help="a pruned bundle")
     parser.add_argument("--bundle", type=Path, help="what was exported of it")
+    parser.add_argument("--observations", type=int, default=4, help="on which they are compared")
     parser.add_argument("command", nargs="*", help="what is measured, after --")
     given = parser.parse_args()
     if given.make:
-        make(given.folder)
+        (make_llama if given.make == "llama" else make_smolvla)(given.folder)
         return 0
     if given.torch:
-        print(f"relative L2 difference from torch: {compare(given.torch, given.bundle):.3g}")
+        print(f"relative L2 difference from torch: {compare(given.torch, given.bundle, given.observations):.3g}")
         return 0
     return measured(given.command)
 
