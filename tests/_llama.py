@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -74,6 +75,7 @@ def write_llama(
     seed: int = 0,
     dtype: str = "bfloat16",
     shard_bytes: int = SHARD_BYTES,
+    holes: tuple[int, ...] = (),
 ) -> int:
     """Write policy.yaml and the shards with their index; weights are drawn and written a part at a time.
 
@@ -83,6 +85,7 @@ def write_llama(
         seed: Of the weights: matrices N(0, 1 / fan in), norms 1.
         dtype: Of the stored weights.
         shard_bytes: Size from which a new shard begins.
+        holes: Layers whose weights are zeros that take no place on the disk.
 
     Returns:
         The number of parameters.
@@ -103,7 +106,7 @@ def write_llama(
     placed = {}
     for number, shard in enumerate(shards):
         file = f"model-{number + 1:05}-of-{len(shards):05}.safetensors"
-        _write_shard(out / file, shard, seed, dtype)
+        _write_shard(out / file, shard, seed, dtype, tuple(f"decoder.layers.{number}." for number in holes))
         placed.update(dict.fromkeys(shard, file))
     index = {"metadata": {}, "weight_map": placed}
     (out / "model.safetensors.index.json").write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
@@ -132,7 +135,9 @@ def _describe(out: Path, arguments: dict[str, Any]) -> None:
     shutil.copyfile(__file__, out / "policy.py")
 
 
-def _write_shard(file: Path, tensors: dict[str, tuple[int, ...]], seed: int, dtype: str) -> None:
+def _write_shard(
+    file: Path, tensors: dict[str, tuple[int, ...]], seed: int, dtype: str, holes: tuple[str, ...] = ()
+) -> None:
     names = {"bfloat16": "BF16", "float16": "F16", "float32": "F32"}
     width = torch.empty(0, dtype=getattr(torch, dtype)).element_size()
     header: dict[str, Any] = {}
@@ -146,6 +151,9 @@ def _write_shard(file: Path, tensors: dict[str, tuple[int, ...]], seed: int, dty
     with file.open("wb") as stream:
         stream.write(len(text).to_bytes(8, "little") + text)
         for name, shape in tensors.items():
+            if holes and name.startswith(holes):
+                stream.truncate(stream.seek(math.prod(shape) * width, os.SEEK_CUR))
+                continue
             for part in _drawn(name, shape, seed, dtype):
                 stream.write(part.view(torch.uint8).numpy().data)
 

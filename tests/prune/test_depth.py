@@ -13,7 +13,7 @@ from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
 from vlatool.prune._selection import Selection
-from vlatool.prune.depth import PROTECTED, Depth, stacks
+from vlatool.prune.depth import PROTECTED, Depth, spread, stacks
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform
 
@@ -112,6 +112,69 @@ def test_stacks_are_blocks_of_one_kind():
 def test_wrong_options_are_told(source_bundle: Bundle, options: dict[str, object], says: str):
     with pytest.raises(RecipeError, match=says):
         build_stage("prune.depth", {"samples": 1, **options}).change({"main": Net()}, source_bundle, Context())
+
+
+def kept(modules: dict[str, nn.Module], source: Bundle, **options: object) -> list[tuple[str, str, tuple[int, ...]]]:
+    stage = build_stage("prune.depth", options)
+    stage.check(source, None)
+    return [(edit.graph, edit.module, edit.keep) for edit in stage.change(modules, source, Context()).edits]
+
+
+@pytest.mark.parametrize(("keep", "stay"), [((3, 0), (0, 3)), ("1,2", (1, 2)), (" 0, 1 ,3", (0, 1, 3)), ([2], (2,))])
+def test_blocks_that_are_named_stay(source_bundle: Bundle, keep: object, stay: tuple[int, ...]):
+    assert kept({"main": Net()}, source_bundle, keep=keep) == [("main", "trunk", stay)]
+
+
+@pytest.mark.parametrize(("size", "count", "numbers"), [
+    (4, 1, [0]), (4, 2, [0, 3]), (5, 3, [0, 2, 4]), (16, 8, [0, 2, 4, 6, 9, 11, 13, 15]), (3, 3, [0, 1, 2]),
+])  # fmt: skip
+def test_even_keeps_both_ends(size: int, count: int, numbers: list[int]):
+    assert spread(size, count) == numbers
+
+
+def test_even_takes_no_run(source_bundle: Bundle):
+    modules = {"main": Net().to("meta")}
+    assert kept(modules, source_bundle, rank="even") == [("main", "trunk", (0, 3))]
+    assert kept(modules, source_bundle, rank="even", blocks=3) == [("main", "trunk", (0, 2, 3))]
+
+
+def test_lists_of_several_kinds_are_taken_when_they_are_named(source_bundle: Bundle):
+    net = Net()
+    net.turns = nn.ModuleList(nn.Linear(2, 2) if number % 2 else nn.Identity() for number in range(6))
+    modules = {"main": net}
+    assert kept(modules, source_bundle, rank="even") == [("main", "trunk", (0, 3))]
+    assert kept(modules, source_bundle, rank="even", include=("turns",)) == [("main", "turns", (0, 3, 5))]
+    with pytest.raises(RecipeError, match="No stack of blocks matches 'turns'"):
+        kept(modules, source_bundle, include=("turns",))
+
+
+def test_a_stack_that_graphs_share_is_cut_once(source_bundle: Bundle):
+    one, other = Net(), Net()
+    other.trunk = one.trunk
+    assert kept({"one": one, "other": other}, source_bundle, keep="0,1") == [("one", "trunk", (0, 1))]
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"keep": ""}, "keep = .*at least 1 item"),
+    ({"keep": []}, "keep = .*at least 1 item"),
+    ({"keep": "a"}, "keep.0 = 'a': .*integer"),
+    ({"keep": "0,1.5"}, "keep.1 = '1.5': .*integer"),
+    ({"keep": [True]}, "not a truth value"),
+    ({"keep": 3}, "keep = 3: .*tuple"),
+    ({"keep": "0,0"}, "names a block twice: 0,0"),
+    ({"keep": "0,4"}, r"names block 4; trunk \(4\) has the blocks 0 to 3"),
+    ({"keep": "-1"}, "names block -1"),
+    ({"keep": "3,2,1,0"}, "names all blocks"),
+    ({"keep": "0", "blocks": 2}, "--blocks would say so again"),
+    ({"keep": "0", "ratio": 0.25, "rank": "even"}, "--ratio and --rank would"),
+    ({"keep": "0", "include": ("*",)}, r"these differ: trunk \(4\), more \(3\)"),
+    ({"rank": "even", "ratio": 0.1}, "--ratio 0.1 removes no block"),
+])  # fmt: skip
+def test_wrong_blocks_to_keep_are_told(source_bundle: Bundle, options: dict[str, object], says: str):
+    net = Net()
+    net.more = nn.ModuleList(nn.Linear(3, 3) for _ in range(3))
+    with pytest.raises(RecipeError, match=says):
+        kept({"main": net}, source_bundle, **{"include": ("trunk",), **options})
 
 
 def test_without_a_stack_widths_are_proposed(source_bundle: Bundle, float_bundle: Bundle, tmp_path: Path):

@@ -112,7 +112,8 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
         annotation = list.__class_getitem__(typing.get_args(annotation)[0])
         default = list(default or ())
     elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        annotation = typing.Optional[next(arm for arm in typing.get_args(annotation) if arm is not type(None))]  # noqa: UP045
+        arm: Any = next(arm for arm in typing.get_args(annotation) if arm is not type(None))
+        annotation = typing.Optional[str if arm == tuple[int, ...] else arm]  # noqa: UP045 (numbers: as 0,2,4)
     flag = f"--{name.replace('_', '-')}"
     flags = (f"{flag}/--no-{flag[2:]}",) if annotation is bool else (flag,)
     required = default is PydanticUndefined

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,7 +13,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, require, require_present
+from vlatool.module.edits import read_edits
 from vlatool.module.origin import factory_of
+from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
 from vlatool.module.to_onnx import EXTERNAL_DATA_BYTES, exported_by_torch, name_by_module, strip_notes, weight_bytes
 from vlatool.module.torch_policy import TorchSession, load_modules
 from vlatool.runtime.contract import Outputs, check_chunk
@@ -52,31 +55,50 @@ class ExportOnnx(Transform):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Export, run, compare, and write the bundle."""
         bundle = source_of(source, self.name())
-        spec = bundle.manifest.spec
-        check_chunk(spec)
-        modules = load_modules(bundle)
-        sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
+        check_chunk(bundle.manifest.spec)
         observations = observations_for(bundle, self.samples)
-        encode = ObservationEncoder(spec, bundle.path / "assets")
-        context.tell("running the torch policy", None)
-        torch_program = Program(bundle.manifest.program, sessions, seed=0)
-        outputs = Outputs(spec.outputs)
-
-        def action(values: dict[str, Any]) -> Any:
-            return outputs(values, "The torch module")[spec.action.name]
-
-        expected = [torch_program.run(encode(observation), finish=action) for observation in observations]
-        graphs = {}
-        for number, (name, session) in enumerate(sessions.items()):
-            context.tell(f"exporting {name}", number / len(sessions))
-            graphs[name] = self._export(name, session, out)
+        expected, graphs = self._exported(bundle, observations, out, context)
         carry_over(bundle, out)
         context.tell("checking in ONNX Runtime", None)
         exported = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
         self._compare(exported, observations, expected)
         return exported
 
-    def _export(self, name: str, session: TorchSession, out: Path) -> Graph:
+    def _exported(
+        self, bundle: Bundle, observations: list[dict[str, Any]], out: Path, context: Context
+    ) -> tuple[list[Any], dict[str, Graph]]:
+        """Return what torch gives for the observations, and the graphs; no module is in memory afterwards.
+
+        A pruned policy whose weights stay in shards may be too large to be there as a whole: it runs with one weight at
+        a time, and the weights of one graph are read to export it, which go into a file of their own.
+        """
+        stored = stored_modules(bundle) if read_edits(bundle) and takes_shards(bundle) else None
+        modules = stored.modules if stored else load_modules(bundle)
+        sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
+        context.tell("running the torch policy", None)
+        with weights_read(stored) if stored else contextlib.nullcontext():
+            expected = self._actions(bundle, sessions, observations)
+        graphs = {}
+        for number, (name, session) in enumerate(sessions.items()):
+            context.tell(f"exporting {name}", number / len(sessions))
+            with graph_filled(stored, name) if stored else contextlib.nullcontext():
+                graphs[name] = self._export(name, session, out, beside=stored is not None)
+        return expected, graphs
+
+    def _actions(
+        self, bundle: Bundle, sessions: dict[str, TorchSession], observations: list[dict[str, Any]]
+    ) -> list[Any]:
+        """Return the raw action of each observation."""
+        spec = bundle.manifest.spec
+        encode, outputs = ObservationEncoder(spec, bundle.path / "assets"), Outputs(spec.outputs)
+        program = Program(bundle.manifest.program, sessions, seed=0)
+
+        def action(values: dict[str, Any]) -> Any:
+            return outputs(values, "The torch module")[spec.action.name]
+
+        return [program.run(encode(observation), finish=action) for observation in observations]
+
+    def _export(self, name: str, session: TorchSession, out: Path, beside: bool) -> Graph:
         torch = require("torch", "build")
         for module in ("onnxscript", "onnx"):
             require(module, "build")
@@ -86,7 +108,7 @@ class ExportOnnx(Transform):
         (out / "graphs").mkdir(exist_ok=True)
         name_by_module(exported.model)
         strip_notes(exported.model)
-        exported.save(str(out / file), external_data=weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
+        exported.save(str(out / file), external_data=beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
         return Graph(file, {"float32": 1.0}, self.opset)
 
     def _compare(self, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any]) -> None:

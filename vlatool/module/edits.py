@@ -1,7 +1,8 @@
 """What a bundle changes in the modules that a factory makes: which channels are kept, and the weights.
 
 ``module/edits.json`` is an ordered list of structural edits, ``module/GRAPH.safetensors`` the weights of a graph's
-module after them. A module is always made in this order: the factory, the edits, the weights.
+module after them. A module is always made in this order: the factory, the edits, the weights. Without the second file
+the weights are those of the policy's shards (``vlatool.module.stored``): blocks that are kept have them already.
 """
 
 from __future__ import annotations
@@ -40,6 +41,11 @@ _CHANGED: weakref.WeakSet[Any] = weakref.WeakSet()
 def is_changed(bundle: Bundle) -> bool:
     """Return whether a bundle has modules other than those that its factory makes."""
     return any(name.startswith(f"{FOLDER}/") for name in bundle.manifest.files)
+
+
+def holds_weights(bundle: Bundle) -> bool:
+    """Return whether a bundle holds weights of its modules, other than those of its policy."""
+    return any(name.startswith(f"{FOLDER}/") and name.endswith(".safetensors") for name in bundle.manifest.files)
 
 
 def read_edits(bundle: Bundle) -> tuple[Edit, ...]:
@@ -237,7 +243,7 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
 
 
 def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module]) -> None:
-    """Write the edits and the weights of the modules to a new bundle."""
+    """Write the edits and the weights of the modules to a new bundle; no modules where the weights stay in shards."""
     safetensors = require("safetensors.torch", "build")
     (out / FOLDER).mkdir()
     (out / EDITS).write_text(json.dumps([asdict(edit) for edit in edits]) + "\n", encoding="utf-8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,13 +29,53 @@ Visit = Callable[[ProgramStep, Any, list[Any], dict[str, Any]], contextlib.Abstr
 """Step, its module, its inputs as fake tensors, real buffers by name -> what the module runs within, if anything."""
 
 
+@dataclass(frozen=True)
+class Weightless:
+    """A policy's modules with every parameter on torch's meta device, changed by the edits of its bundle.
+
+    Args:
+        modules: Graph name -> module.
+        made: Graph name -> each parameter and buffer with the name that it had in what the factory made, one that is
+            shared with each of its names; empty where a module must be traced.
+    """
+
+    modules: dict[str, Any]
+    made: dict[str, list[tuple[str, Any]]]
+
+
 def faked_modules(bundle: Bundle) -> dict[str, Any]:
-    """Call the factory of a source bundle, every parameter on torch's meta device: graph name -> module.
+    """Call the factory of a source bundle, every parameter on torch's meta device: graph name -> float32 module.
 
     Raises:
         SourceError: when code has changed, the factory fails, or a graph has no module.
     """
-    return _modules(require("torch", "build"), bundle)
+    return as_float32(weightless(bundle).modules)
+
+
+def as_float32(modules: Mapping[str, Any]) -> dict[str, Any]:
+    """Return modules in float32, in which graphs are exported; changed in place."""
+    return {name: module.float() for name, module in modules.items()}
+
+
+def weightless(bundle: Bundle) -> Weightless:
+    """Call the factory of a source bundle so that no parameter takes memory, and change its structure as it says.
+
+    Raises:
+        SourceError: when code has changed, the factory fails, or a graph has no module.
+    """
+    torch = require("torch", "build")
+    origin = origin_of(bundle)
+    origin.check((".py",))
+    traced = loses_units(read_edits(bundle))  # a trace runs the module, with all that it computes
+    with contextlib.nullcontext() if traced else _parameters_on_meta(torch):
+        product = origin.build()
+    modules = modules_of(product, (step.graph for step in bundle.manifest.program))
+    kept = {} if traced else modules
+    made = {graph: list(module.state_dict(keep_vars=True).items()) for graph, module in kept.items()}
+    modules = edited(modules, bundle, weights=False)
+    for module in modules.values() if traced else ():
+        _to_meta(torch, module)
+    return Weightless(modules, made)
 
 
 def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
@@ -61,19 +102,6 @@ def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
             values[target] = values[source]
 
 
-def _modules(torch: Any, bundle: Bundle) -> dict[str, Any]:
-    origin = origin_of(bundle)
-    origin.check((".py",))
-    traced = loses_units(read_edits(bundle))  # a trace runs the module, with all that it computes
-    with contextlib.nullcontext() if traced else _parameters_on_meta(torch):
-        product = origin.build()
-    modules = modules_of(product, (step.graph for step in bundle.manifest.program))
-    modules = edited(modules, bundle, weights=False)
-    for module in modules.values() if traced else ():
-        _to_meta(torch, module)
-    return {name: module.float() for name, module in modules.items()}
-
-
 def _to_meta(torch: Any, module: Any) -> None:
     for part in module.modules():
         for name, value in part._parameters.items():
@@ -89,7 +117,7 @@ def _parameters_on_meta(torch: Any) -> Iterator[None]:
 
     def register(module: Any, name: str, parameter: Any) -> None:
         if parameter is not None and not parameter.is_meta:
-            parameter = torch.nn.Parameter(parameter.detach().to("meta"), requires_grad=False)
+            parameter = torch.nn.Parameter(parameter.detach().to("meta"), parameter.requires_grad)
         original(module, name, parameter)
 
     kind.register_parameter = register

@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
-from vlatool.errors import BundleError, require
+from vlatool.errors import BundleError, SourceError, VlatoolError, require
+from vlatool.files.printable import message_of
 from vlatool.module.description import read_location
-from vlatool.module.edits import FOLDER, Edit, apply, joined_edits, read_edits, write_module
+from vlatool.module.edits import FOLDER, Edit, apply, holds_weights, joined_edits, read_edits, write_module
+from vlatool.module.failures import remedy_for
+from vlatool.module.faked import as_float32, run_faked
 from vlatool.module.origin import factory_of
-from vlatool.module.torch_policy import load_modules, torch_policy
+from vlatool.module.stored import stored_modules, takes_shards, weights_read
+from vlatool.module.torch_policy import load_modules, policy_of, torch_policy
 from vlatool.stage.base import Context, Transform, source_of
 from vlatool.stage.finish import SEED, carry_over, history
 
@@ -27,6 +31,8 @@ if TYPE_CHECKING:
 
 
 TRAINING = f"{FOLDER}/training.json"
+RUN_BELOW = 1 << 32
+"""Bytes of weights in shards up to which the changed policy is run on them; above, shapes alone go through it."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,8 @@ class ModuleStage(Transform):
 
     packages: ClassVar[tuple[str, ...]] = ("torch", "safetensors", "numpy")
     takes_modules: ClassVar[bool] = True
+    keeps_weights: ClassVar[bool] = False
+    """Whether it takes whole blocks away alone, so that weights in a policy's shards can stay there."""
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The bundle has modules, and no graphs yet."""
@@ -75,20 +83,28 @@ class ModuleStage(Transform):
         """
         raise NotImplementedError(self.name())
 
+    def in_parts(self) -> bool:
+        """Return whether ``change`` needs no more than one weight at a time, and no gradient."""
+        return False
+
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return how large the modules are, and how to go on."""
         size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
-        folder = read_location(bundle.path)
-        return (
-            f"weights {size / 1e6:.2f} MB, {len(read_edits(bundle))} structural edits; not exported yet:",
-            f"vlatool export {bundle.path} -o BUNDLE --trust {folder}",
-        )
+        folder, edits = read_location(bundle.path), len(read_edits(bundle))
+        export = f"vlatool export {bundle.path} -o BUNDLE --trust {folder}"
+        if not holds_weights(bundle):
+            streams = f"vlatool quantize weight-only {bundle.path} -o BUNDLE --trust {folder}"
+            stay = f"weights stay in the shards in {folder}, {edits} structural edits; not exported yet:"
+            return (stay, export, f"{streams}    # one weight in memory at a time")
+        return (f"weights {size / 1e6:.2f} MB, {edits} structural edits; not exported yet:", export)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Change the modules, write them, and run the policy once."""
         require("torch", "build")
         bundle = source_of(source, self.name())
         self.check(bundle, None)
+        if self.keeps_weights and takes_shards(bundle):
+            return self._run_on_shards(bundle, out, context)
         modules = load_modules(bundle)
         done = self.change(modules, bundle, context)
         modules = apply(modules, done.edits, bundle)
@@ -99,6 +115,39 @@ class ModuleStage(Transform):
         context.tell("running the changed policy", None)
         torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
+
+    def _run_on_shards(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
+        """Write the edits alone; no more than one weight is in memory, unless the choice needs all."""
+        if self.in_parts():
+            stored = stored_modules(bundle)
+            with weights_read(stored):
+                done = self.change(stored.modules, bundle, context)
+        else:
+            done = self.change(load_modules(bundle), bundle, context)
+        changed = write_changed(bundle, out, joined_edits(read_edits(bundle), done.edits), {}, self.made_by())
+        context.tell("running the changed policy", None)
+        _run_once(changed)
+        return changed
+
+
+def _run_once(bundle: Bundle) -> None:
+    """Run a policy whose weights are in shards: with their values where that is quick, with shapes alone else.
+
+    Raises:
+        SourceError: when it fails.
+    """
+    stored = stored_modules(bundle)
+    if stored.nbytes < RUN_BELOW:
+        with weights_read(stored):
+            policy_of(bundle, stored.modules, SEED).infer(observations_for(bundle, 1)[0])
+        return
+    try:
+        run_faked(bundle, as_float32(stored.modules), lambda *_: None)
+    except VlatoolError:
+        raise
+    except Exception as error:  # the seam: the user's module may raise anything
+        reason = (message_of(error).splitlines() or [""])[0]
+        raise SourceError(f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error)) from error
 
 
 def write_changed(
@@ -116,7 +165,7 @@ def write_changed(
         source: What it is made from.
         out: An empty directory.
         edits: All edits since the factory.
-        modules: Graph name -> module after the edits.
+        modules: Graph name -> module after the edits; none where the weights are those of the policy's shards.
         made_by: Stage, options and versions.
         training: How they were trained, if they were.
         program: How they run; as in the source when None.

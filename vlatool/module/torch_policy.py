@@ -12,9 +12,10 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import require
 from vlatool.module.batched import run_module
-from vlatool.module.edits import edited, load_tensors, read_tensors
+from vlatool.module.edits import edited, load_tensors, read_edits, read_tensors
 from vlatool.module.modules import modules_of
 from vlatool.module.origin import origin_of
+from vlatool.module.stored import filled, stored_modules, takes_shards
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.weights.shards import read_header, shard_files
@@ -31,6 +32,10 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     Raises:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
+    if read_edits(source) and takes_shards(source):
+        require("torch", "build")
+        origin_of(source).check()
+        return filled(stored_modules(source))
     return edited(unedited_modules(source), source)
 
 
@@ -70,7 +75,11 @@ def torch_policy(source: Bundle, seed: int | None = None) -> Policy:
         source: Of a torch policy.
         seed: Of the program's noise, from which every ``reset`` starts again; fresh entropy when None.
     """
-    modules = load_modules(source)
+    return policy_of(source, load_modules(source), seed)
+
+
+def policy_of(source: Bundle, modules: Mapping[str, nn.Module], seed: int | None = None) -> Policy:
+    """Open modules behind the interface of the runtime's policy, as ``torch_policy`` does."""
     sessions = {step.graph: TorchSession(modules[step.graph], step) for step in source.manifest.program}
     return Policy(source, Program(source.manifest.program, sessions, seed), "torch eager")
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require
@@ -23,6 +23,8 @@ from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
     from torch import nn
+
+    from vlatool.hardware.profile import Profile
 
 PROTECTED = ("vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action")
 """Parts of module names whose blocks stay unless --include names them: what sees and what acts is less redundant than
@@ -40,34 +42,78 @@ class Depth(ModuleStage):
 
     ``error`` removes one block after the other, each time the one whose absence changes the actions on recorded
     observations least. ``gate`` takes one backward pass: how much the action moves when the block's contribution to the
-    residual stream is scaled. ``cosine`` takes one forward pass: how little a block turns what passes through it. Train
-    the result afterwards (``vlatool distill policy`` takes it as it is).
+    residual stream is scaled. ``cosine`` takes one forward pass: how little a block turns what passes through it.
+    ``even`` runs nothing: what stays is spread evenly, the first and the last block with it. Train the result
+    afterwards (``vlatool distill policy`` takes it as it is).
+
+    Where policy.yaml names the shards of the weights, these stay where they are; ``even``, ``cosine`` and ``--keep``
+    then hold one weight in memory at a time.
     """
+
+    keeps_weights: ClassVar[bool] = True
 
     ratio: float = Field(0.5, gt=0, lt=1, description="share of the blocks of each stack that goes, at most")
     blocks: int | None = Field(None, ge=1, description="blocks of each stack that stay, in the place of --ratio")
-    rank: Literal["error", "gate", "cosine"] = Field("error", description="how blocks are ranked")
+    keep: tuple[int, ...] | None = Field(
+        None, min_length=1, description="numbers of the blocks that stay, such as 0,2,4, in the place of a ranking"
+    )
+    rank: Literal["error", "gate", "cosine", "even"] = Field("error", description="how blocks are ranked")
     samples: int = Field(32, ge=1, description="recorded observations to rank on")
     include: tuple[str, ...] = Field((), description="globs of stacks to prune; the trunk's when empty")
     exclude: tuple[str, ...] = Field((), description="globs of stacks to leave as they are")
+
+    @field_validator("keep", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        return [part for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """What stays is said once."""
+        super().check(source, profile)
+        others = [f"--{name}" for name in ("ratio", "blocks", "rank") if name in self.options()]
+        if self.keep and others:
+            raise RecipeError(f"--keep says which blocks stay; {' and '.join(others)} would say so again.", "name one")
+        if self.keep and len(set(self.keep)) < len(self.keep):
+            raise RecipeError(f"--keep names a block twice: {','.join(map(str, self.keep))}.")
+
+    def in_parts(self) -> bool:
+        """A backward pass needs all weights; one after the other would be read very often for ``error``."""
+        return bool(self.keep) or self.rank in ("even", "cosine")
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Choose the blocks that stay.
 
         Raises:
-            RecipeError: when there is no stack of blocks to prune, or a pattern matches none.
+            RecipeError: when there is no stack of blocks to prune, a pattern matches none, or ``keep`` does not fit.
         """
-        sizes = self._chosen({(graph, name): len(stack) for graph, module in modules.items()
-                              for name, stack in stacks(module)}, source)  # fmt: skip
+        sizes = self._chosen(self._sizes(modules), source)
+        left = _listed_blocks(sizes, self.keep) if self.keep else self._left(sizes, modules, source, context)
+        return Changed(tuple(Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()))
+
+    def _sizes(self, modules: Mapping[str, nn.Module]) -> dict[Stack, int]:
+        """Return how many blocks each stack has; one that several graphs share is the first one's."""
+        mixed = bool(self.include) and (bool(self.keep) or self.rank == "even")
+        found: dict[int, tuple[Stack, int]] = {}
+        for graph, module in modules.items():
+            for name, stack in stacks(module, mixed=mixed):
+                found.setdefault(id(stack), ((graph, name), len(stack)))
+        return dict(found.values())
+
+    def _left(
+        self, sizes: Mapping[Stack, int], modules: Mapping[str, nn.Module], source: Bundle, context: Context
+    ) -> dict[Stack, list[int]]:
+        """Return what stays of each stack that loses blocks."""
         goes = {stack: count for stack, size in sizes.items() if (count := self._goes(size)) > 0}
         if not goes:
             asked = f"--ratio {self.ratio:g}" if self.blocks is None else f"--blocks {self.blocks}"
             raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
+        if self.rank == "even":
+            return {stack: spread(sizes[stack], sizes[stack] - count) for stack, count in goes.items()}
         ranking = _Ranking(modules, source, self.samples)
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):
             left[graph, name].remove(block)
-        return Changed(tuple(Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()))
+        return left
 
     def _goes(self, size: int) -> int:
         """Return how many blocks of a stack go; one always stays."""
@@ -114,16 +160,50 @@ def _listed(sizes: Mapping[Stack, int]) -> str:
     return ", ".join(f"{name or 'the module itself'} ({size})" for (_, name), size in sizes.items())
 
 
-def stacks(module: nn.Module) -> Iterator[tuple[str, Any]]:
-    """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes."""
+def _listed_blocks(sizes: Mapping[Stack, int], keep: Sequence[int]) -> dict[Stack, list[int]]:
+    """Return that each stack keeps these blocks.
+
+    Raises:
+        RecipeError: when the stacks differ in length, a block is not there, or all stay.
+    """
+    if len(set(sizes.values())) > 1:
+        raise RecipeError(
+            f"--keep numbers the blocks of stacks of one length; these differ: {_listed(sizes)}.",
+            "name the stacks of one length with --include, and prune the others in another step",
+        )
+    size = next(iter(sizes.values()))
+    if outside := [number for number in keep if not 0 <= number < size]:
+        raise RecipeError(f"--keep names block {outside[0]}; {_listed(sizes)} has the blocks 0 to {size - 1}.")
+    if len(keep) == size:
+        raise RecipeError(f"--keep names all blocks of {_listed(sizes)}.", "leave out those that are to go")
+    return {stack: sorted(keep) for stack in sizes}
+
+
+def spread(size: int, count: int) -> list[int]:
+    """Return ``count`` of ``size`` numbers, spread evenly, the first and (of several) the last with them."""
+    steps = max(1, count - 1)
+    return [(2 * number * (size - 1) + steps) // (2 * steps) for number in range(count)]
+
+
+def stacks(module: nn.Module, *, mixed: bool = False) -> Iterator[tuple[str, Any]]:
+    """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes.
+
+    Args:
+        module: In which they are looked for.
+        mixed: Also yield lists of modules of several kinds, such as layers that alternate.
+    """
     nn = require("torch", "build").nn
     for name, part in module.named_modules():
         if not isinstance(part, nn.ModuleList | nn.Sequential) or len(part) < 2:
             continue
         kinds = {type(block) for block in part}
-        shapes = {tuple((key, tuple(value.shape)) for key, value in block.state_dict().items()) for block in part}
+        shapes = {
+            tuple((key, tuple(value.shape)) for key, value in block.state_dict(keep_vars=True).items())
+            for block in part
+        }
         shared = len({id(block) for block in part}) < len(part)
-        if len(kinds) == 1 and len(shapes) == 1 and shapes != {()} and not shared:
+        alike = len(kinds) == 1 and len(shapes) == 1
+        if (alike or (mixed and isinstance(part, nn.ModuleList))) and shapes != {()} and not shared:
             yield name, part
 
 

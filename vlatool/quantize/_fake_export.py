@@ -11,11 +11,11 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import GraphError, SourceError, nearest, require
-from vlatool.module.faked import faked_modules, run_faked
-from vlatool.module.origin import origin_of
+from vlatool.errors import GraphError, SourceError, require
+from vlatool.module.faked import as_float32, run_faked
+from vlatool.module.stored import StoredModules, policy_weights, stored_modules
 from vlatool.module.to_onnx import exported_by_torch, name_by_module, quiet_exporter, strip_notes
-from vlatool.weights.shards import StoredTensor, read_shards, stored_array
+from vlatool.weights.shards import FLOATS, StoredTensor, stored_array
 
 FOLDED = 1 << 16
 """Elements up to which constants are computed ahead."""
@@ -36,12 +36,6 @@ class Skeleton:
     opset: int
 
 
-def policy_weights(bundle: Bundle) -> tuple[Path, str]:
-    """Return the folder of a policy's code and the glob of its weights; empty when the factory loads them itself."""
-    origin = origin_of(bundle)
-    return origin.folder, origin.weights
-
-
 def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
     """Export every graph of a source bundle without reading a weight: graph name -> skeleton.
 
@@ -52,16 +46,11 @@ def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
         SourceError: when code has changed, the factory fails, or shards and modules do not fit together.
         GraphError: when torch cannot export a module.
     """
-    torch = require("torch", "build")
-    for package in ("onnx", "onnxscript"):
+    for package in ("torch", "onnx", "onnxscript"):
         require(package, "build")
-    folder, pattern = policy_weights(bundle)
-    shards = read_shards(folder, pattern)
-    modules = faked_modules(bundle)
-    places = {
-        name: _locate(torch, name, module, shards, len(modules) > 1, folder / "policy.yaml")
-        for name, module in modules.items()
-    }
+    stored = stored_modules(bundle)
+    _check_dtypes(stored)
+    modules, file = as_float32(stored.modules), policy_weights(bundle)[0] / "policy.yaml"
     exported: dict[str, tuple[Any, dict[str, Any]]] = {}
 
     def visit(step: ProgramStep, module: Any, feeds: list[Any], real: dict[str, Any]) -> None:
@@ -69,50 +58,18 @@ def export_skeletons(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
             exported[step.graph] = (exported_by_torch(module, feeds, step, opset, optimize=False).model, real)
 
     run_faked(bundle, modules, visit)
-    return {
-        name: _skeleton(model, places[name], real, opset, folder / "policy.yaml")
-        for name, (model, real) in exported.items()
-    }
+    return {name: _skeleton(model, stored.places[name], real, opset, file) for name, (model, real) in exported.items()}
 
 
-def _locate(
-    torch: Any, graph: str, module: Any, shards: dict[str, StoredTensor], several: bool, file: Path
-) -> dict[str, StoredTensor]:
-    """Return where the bytes of every parameter and saved buffer are: name -> tensor.
-
-    Names are those of ``state_dict()``; with several graphs ``GRAPH.name`` comes first. Tied weights are stored once.
-
-    Raises:
-        SourceError: naming the first tensor that is missing or has another shape or dtype.
-    """
-    state = module.state_dict(keep_vars=True)
-    places: dict[str, StoredTensor] = {}
-    stored_as: dict[int, StoredTensor] = {}
-    for name, value in state.items():
-        tensor = (shards.get(f"{graph}.{name}") if several else None) or shards.get(name)
-        if tensor is not None:
-            places[name] = stored_as[id(value)] = tensor
-    for name, value in state.items():
-        tensor = places[name] = places.get(name) or stored_as.get(id(value)) or _missing(graph, name, shards, file)
-        if tuple(value.shape) != tensor.shape:
-            raise SourceError(
-                f"'{tensor.name}' in {tensor.file.name} has the shape {list(tensor.shape)}; the module built by the "
-                f"factory wants {list(value.shape)}.",
-                "check the factory's arguments in policy.yaml",
-            )
-        if value.is_floating_point() and tensor.dtype not in ("F32", "F16", "BF16"):
-            raise SourceError(
-                f"'{tensor.name}' in {tensor.file.name} is {tensor.dtype}; weights may be F32, F16 or BF16.",
-                "convert the shards (weights that are quantized already cannot be quantized again)",
-            )
-    return places
-
-
-def _missing(graph: str, name: str, shards: dict[str, StoredTensor], file: Path) -> StoredTensor:
-    raise SourceError(
-        f"No shard holds '{name}', which the module '{graph}' needs; {nearest(name, shards)}.",
-        f"names are those of state_dict(); check the weights and the arguments in {file}",
-    )
+def _check_dtypes(stored: StoredModules) -> None:
+    for graph, module in stored.modules.items():
+        for name, value in module.state_dict(keep_vars=True).items():
+            tensor = stored.places[graph][name]
+            if value.is_floating_point() and tensor.dtype not in FLOATS:
+                raise SourceError(
+                    f"'{tensor.name}' in {tensor.file.name} is {tensor.dtype}; weights may be F32, F16 or BF16.",
+                    "convert the shards (weights that are quantized already cannot be quantized again)",
+                )
 
 
 def _skeleton(model: Any, weights: dict[str, StoredTensor], real: dict[str, Any], opset: int, file: Path) -> Skeleton:

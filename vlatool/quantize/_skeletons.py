@@ -8,9 +8,9 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, SourceError, VlatoolError, require
 from vlatool.graph.nodes import name_each
-from vlatool.module.edits import is_changed
+from vlatool.module.stored import policy_weights, takes_shards
 from vlatool.quantize._compute import as_float32
-from vlatool.quantize._fake_export import Skeleton, export_skeletons, policy_weights
+from vlatool.quantize._fake_export import Skeleton, export_skeletons
 from vlatool.quantize._rewrite import INLINE
 from vlatool.weights.shards import FLOATS, NUMPY_NAMES, StoredTensor, fingerprint, reading, shard_files, stored_array
 
@@ -36,12 +36,6 @@ def skeletons_of(bundle: Bundle, opset: int) -> dict[str, Skeleton]:
     for skeleton in skeletons.values():
         _read_small(skeleton)
     return skeletons
-
-
-def takes_shards(bundle: Bundle) -> bool:
-    """Whether a source bundle's policy describes where its weights are, so that it needs no float32 export."""
-    torch = not bundle.manifest.graphs and "factory" in bundle.manifest.source and not is_changed(bundle)
-    return torch and bool(policy_weights(bundle)[1])
 
 
 def weights_fingerprint(bundle: Bundle) -> str:

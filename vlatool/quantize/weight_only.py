@@ -17,9 +17,10 @@ from vlatool.files.work import forget, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
+from vlatool.module.stored import takes_shards
 from vlatool.quantize._compute import records_of
 from vlatool.quantize._records import Record
-from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, takes_shards, weights_fingerprint
+from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, weights_fingerprint
 from vlatool.quantize._stream import Written, work_root, write_records
 from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan, make_plan

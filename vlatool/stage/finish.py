@@ -246,9 +246,11 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     """
     samples = _samples(draft.manifest, observations, GOLDEN_COUNT)
     name = draft.manifest.spec.action.name
+    expected = _outputs(
+        reference_policy(draft), samples
+    )  # closed before the engine opens: one set of weights at a time
     policy = Policy.open(draft, threads=1, seed=SEED)
     own = _outputs(policy, samples)
-    expected = _outputs(reference_policy(draft), samples)
     arrays: dict[str, list[Any]] = {}
     for (observation, noise), action in zip(samples, expected, strict=True):
         parts = (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", {name: action.chunk}))
