@@ -18,10 +18,13 @@ def net() -> nn.Module:
     return nn.Sequential(nn.Linear(3, 8), nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 1)).eval()
 
 
-def draw_for(module: nn.Module):
-    def draw(random: np.random.Generator) -> torch.Tensor:
+def draw_for(module: nn.Module, times: float = 1.0):
+    def loss(rows: torch.Tensor) -> torch.Tensor:
+        return ((module(rows)[:, 0] - rows.sum(1)) ** 2).mean() * times
+
+    def draw(random: np.random.Generator):
         rows = torch.from_numpy(random.standard_normal((32, 3)).astype(np.float32))
-        return ((module(rows)[:, 0] - rows.sum(1)) ** 2).mean()
+        yield 1.0, lambda: loss(rows)
 
     return draw
 
@@ -98,7 +101,7 @@ def test_a_loss_that_is_not_finite_is_refused_and_the_checkpoint_stays(tmp_path:
     trainer.save()
     before = (tmp_path / CHECKPOINT).read_bytes()
     with pytest.raises(DataError, match="The loss is nan in step 4 of 10"):
-        trainer.train(10, lambda _random: draw_for(module)(_random) * float("nan"), silent)
+        trainer.train(10, draw_for(module, float("nan")), silent)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
 
 
@@ -106,7 +109,7 @@ def test_weights_without_a_gradient_stay(tmp_path: Path):
     module = nn.ModuleDict({"used": nn.Linear(3, 1), "unused": nn.Linear(3, 1)})
     before = module["unused"].weight.detach().clone()
     trainer = Trainer({"main": module}, Settings(5), tmp_path)
-    trainer.train(5, lambda random: module["used"](torch.ones(1, 3)).sum(), silent)
+    trainer.train(5, lambda _random: [(1.0, lambda: module["used"](torch.ones(1, 3)).sum())], silent)
     trainer.save()
     trainer = Trainer({"main": module}, Settings(5), tmp_path)
     assert torch.equal(module["unused"].weight, before)
