@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from vlatool.errors import OutputError, require
@@ -44,13 +45,13 @@ def check_events(folder: str) -> None:
     Raises:
         MissingExtra, OutputError: see ``Events``.
     """
-    from pathlib import Path
-
     place = Path(folder)
+    if place.exists() and not place.is_dir():
+        raise OutputError(f"{place} is a file; events are written into a directory.", "name another one: --events DIR")
     require("torch.utils.tensorboard", "tensorboard")
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"{place} cannot be written: {error.strerror}.", "name another directory: --events"
+            f"{place} cannot be made: {error.strerror}.", "name another directory: --events DIR"
         ) from error

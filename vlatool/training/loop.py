@@ -19,6 +19,7 @@ import numpy as np
 from vlatool.errors import DataError, require
 from vlatool.files.edited import whole_file
 from vlatool.module.batched import no_gradient
+from vlatool.module.edits import save_tensors
 from vlatool.training.best import Best
 from vlatool.training.group import Group
 
@@ -204,7 +205,7 @@ class Trainer:
         about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text()}
         about["seconds"] = f"{self.seconds:.3f}"
         with whole_file(self._file) as draft:
-            require("safetensors.torch", "build").save_file(tensors, str(draft), about)
+            save_tensors(draft, tensors, about)
 
     def _resume(self) -> None:
         """Go on from the checkpoint, if there is one."""

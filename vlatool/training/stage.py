@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import REPORTS, Bundle
-from vlatool.errors import RecipeError, require
+from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.work import forget, work_directory
 from vlatool.machine import host
 from vlatool.module.edits import is_changed
@@ -131,6 +131,13 @@ class TrainingStage(ModuleStage):
         try:
             with work_directory(self._place(source)) as place:
                 return self._trained(modules, source, place, context)
+        except OSError as error:  # of what is kept until the bundle is written, not of the bundle
+            where = error.filename or self._place(source)
+            raise OutputError(
+                f"The training cannot be kept: {where}: {error.strerror or error}.",
+                "make room there, or name another cache (VLATOOL_CACHE); the same command goes on from its last "
+                "checkpoint",
+            ) from error
         finally:
             torch.set_num_threads(before)
 
