@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from vlatool.errors import DataError
-from vlatool.training.loop import CHECKPOINT, Settings, Trainer
+from vlatool.training.loop import CHECKPOINT, Settings, Trainer, seconds_of
 
 
 def net() -> nn.Module:
@@ -113,3 +113,28 @@ def test_weights_without_a_gradient_stay(tmp_path: Path):
     trainer.save()
     trainer = Trainer({"main": module}, Settings(5), tmp_path)
     assert torch.equal(module["unused"].weight, before)
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:100], lambda data: data[: len(data) // 2], lambda data: b""])
+def test_a_damaged_checkpoint_is_told(tmp_path: Path, damage):
+    module = net()
+    trainer = Trainer({"main": module}, Settings(5), tmp_path)
+    trainer.train(2, draw_for(module), silent)
+    trainer.save()
+    (tmp_path / CHECKPOINT).write_bytes(damage((tmp_path / CHECKPOINT).read_bytes()))
+    with pytest.raises(DataError, match=r"checkpoint.safetensors is damaged"):
+        Trainer({"main": net()}, Settings(5), tmp_path)
+
+
+def test_a_checkpoint_of_other_weights_is_told(tmp_path: Path):
+    Trainer({"main": net()}, Settings(5), tmp_path).save()
+    with pytest.raises(DataError, match=r"checkpoint.safetensors is damaged"):
+        Trainer({"main": nn.Linear(2, 2)}, Settings(5), tmp_path)
+
+
+def test_the_time_of_earlier_runs_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    clock = iter([10.0, 17.0, 100.0, 103.0])
+    monkeypatch.setattr("vlatool.training.loop.time.monotonic", lambda: next(clock))
+    Trainer({"main": net()}, Settings(5), tmp_path).save()
+    assert seconds_of(tmp_path) == 7.0
+    assert Trainer({"main": net()}, Settings(5), tmp_path).seconds == 10.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,22 +16,22 @@ from vlatool.training.loop import Part
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from vlatool.training.session import Lesson
-
 
 class Batches:
     """Draws the rows of a step: the same batch, however many processes share it and in however many parts.
 
     Args:
-        lesson: Computes the loss.
+        loss: Rows, name -> (B, ...) -> the mean of their losses.
         frames: All rows.
         size: Rows of a batch.
         accumulate: Parts that a process computes one after the other.
         group: Which process this is.
     """
 
-    def __init__(self, lesson: Lesson, frames: Frames, size: int, accumulate: int, group: Group) -> None:
-        self._lesson, self._frames, self._size = lesson, frames, size
+    def __init__(
+        self, loss: Callable[[Mapping[str, Any]], Tensor], frames: Frames, size: int, accumulate: int, group: Group
+    ) -> None:
+        self._of_rows, self._frames, self._size = loss, frames, size
         self._parts = group.size * accumulate
         self._own = slice(group.rank * accumulate, (group.rank + 1) * accumulate)
 
@@ -42,4 +42,4 @@ class Batches:
             yield len(part) / self._size, partial(self._loss, part)
 
     def _loss(self, rows: NDArray[Any]) -> Tensor:
-        return self._lesson.loss(self._frames.batch(rows))
+        return self._of_rows(self._frames.batch(rows))

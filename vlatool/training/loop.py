@@ -18,6 +18,7 @@ import numpy as np
 
 from vlatool.errors import DataError, require
 from vlatool.files.edited import whole_file
+from vlatool.files.printable import message_of
 from vlatool.module.batched import no_gradient
 from vlatool.module.edits import save_tensors
 from vlatool.training.best import Best
@@ -208,26 +209,39 @@ class Trainer:
             save_tensors(draft, tensors, about)
 
     def _resume(self) -> None:
-        """Go on from the checkpoint, if there is one."""
+        """Go on from the checkpoint, if there is one.
+
+        Raises:
+            DataError: when it is damaged.
+        """
         if not self._file.is_file():
             return
-        torch = require("torch", "build")
-        with require("safetensors", "build").safe_open(str(self._file), "pt") as opened, torch.no_grad():
-            about, names = opened.metadata(), set(opened.keys())
-            self.step, self.losses = int(about["step"]), json.loads(about["losses"])
-            self._start -= float(about["seconds"])
-            best = {name: opened.get_tensor(f"best.{name}") for name in self._weights if f"best.{name}" in names}
-            self.best = Best.of(about["best"], best)
-            for name, value in self._weights.items():
-                value.copy_(opened.get_tensor(f"weight.{name}"))
-                self._average[name].copy_(opened.get_tensor(f"average.{name}"))
-                state: dict[str, Any] = {
-                    key: opened.get_tensor(f"{key}.{name}")
-                    for key in ("step", "exp_avg", "exp_avg_sq")
-                    if f"{key}.{name}" in names
-                }
-                if state:
-                    self._optimizer.state[value] = state
+        safetensors, torch = require("safetensors", "build"), require("torch", "build")
+        try:
+            with safetensors.safe_open(str(self._file), "pt") as opened, torch.no_grad():
+                self._take(opened)
+        except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+            raise DataError(
+                f"The checkpoint {self._file} is damaged: {message_of(error)}.",
+                f"remove {self._file.parent}: the training then begins anew",
+            ) from error
+
+    def _take(self, opened: Any) -> None:
+        about, names = opened.metadata(), set(opened.keys())
+        self.step, self.losses = int(about["step"]), json.loads(about["losses"])
+        self._start -= float(about["seconds"])
+        best = {name: opened.get_tensor(f"best.{name}") for name in self._weights if f"best.{name}" in names}
+        self.best = Best.of(about["best"], best)
+        for name, value in self._weights.items():
+            value.copy_(opened.get_tensor(f"weight.{name}"))
+            self._average[name].copy_(opened.get_tensor(f"average.{name}"))
+            state: dict[str, Any] = {
+                key: opened.get_tensor(f"{key}.{name}")
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{key}.{name}" in names
+            }
+            if state:
+                self._optimizer.state[value] = state
 
 
 def seconds_of(folder: Path) -> float:

@@ -47,7 +47,7 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
     group, frames = Group(job["rank"], job["size"]), Frames(place)
     _, lesson = stage.prepared(load_modules(source), source)
     trainer = Trainer(lesson.modules, stage.settings(), place, group)
-    batches = Batches(lesson, frames, stage.batch, stage.accumulate, group)
+    batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
     _peer[:] = [Peer(place / MEETING, group, frames, trainer, batches, contextlib.ExitStack())]
 
 

@@ -121,7 +121,7 @@ class Session:
         self._frames = Frames(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
         self._trainer = Trainer(lesson.modules, settings, place, self._crew.group)
-        self._batches = Batches(lesson, self._frames, plan.batch, plan.accumulate, self._crew.group)
+        self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
         self._success = ""
