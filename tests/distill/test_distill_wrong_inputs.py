@@ -195,6 +195,7 @@ ROWS = [
     Row("an output that exists", "exists", 3, Workshop.taken),
     Row("events into a file", "is a file; events are written into a directory", 3,
         lambda at: at.line("--events", at.file())),
+    Row("events into the output", "is in the output", 2, lambda at: at.line("--events", at.out / "events")),
     Row("events without tensorboard", r"pip install 'vlatool\[tensorboard\]'", 4, Workshop.no_tensorboard),
     Row("a cache that is a file", "Not a directory", 3, Workshop.cache_is_a_file),
     Row("a full disk at the checkpoint", "No space left on device", 3,
@@ -254,6 +255,9 @@ ROWS = [
         "        if torch.is_grad_enabled():\n            raise SystemExit(0)\n" + FORWARD)),
     Row("a loss that is not finite", "The loss is nan in step 1 of 3", 3, lambda at: at.code(
         "        lost = float('nan') if torch.is_grad_enabled() else 0\n" + FORWARD.replace("\n", " + lost\n"))),
+    Row("a loss that is not finite, in two processes", "The loss is nan in step 1 of 3", 3, lambda at: [*at.code(
+        "        lost = float('nan') if torch.is_grad_enabled() else 0\n" + FORWARD.replace("\n", " + lost\n")),
+        "--processes", 2]),
     Row("a learning rate that is too high", "try a lower --learning-rate", 3, lambda at: [*at.code(EXPLODING),
         "--learning-rate", 1, "--steps", 40]),
     # ---- recordings

@@ -85,9 +85,9 @@ class Crew:
         return bool(self._errors)
 
     def _cause(self, error: BaseException) -> BaseException:
-        """Return the error that came first, not one of those that followed from it."""
+        """Return the error that came first, not one of those that followed from it; of a kill, how to go on."""
         first = next((each for each in self._errors if LOST not in str(each)), error)
-        if not isinstance(first, VlatoolError):
+        if not isinstance(first, VlatoolError) or "(SIG" not in first.message:
             return first
         return type(first)(first.message, "; ".join(filter(None, (first.fix, AGAIN))))
 
