@@ -8,6 +8,7 @@ import pytest
 from _trainings import Killed, digest, distilled, killed_after, raise_killed, training_of
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.report import read_report
 from vlatool.training.session import Session
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -21,6 +22,17 @@ def test_a_training_that_gets_better_goes_to_its_end(pruned_once: Bundle, tmp_pa
     assert judged["scores"] == sorted(judged["scores"], reverse=True)
     assert judged["best_step"] == len(training_of(made)["losses"]) == 12
     assert training_of(made)["rounds"][0]["observations"] == 20, "of 24 recorded, an episode of four is held out"
+
+
+def test_the_report_beside_the_bundle_has_the_curve_and_the_time(pruned_once: Bundle, tmp_path: Path):
+    one, other = (distilled(pruned_once, tmp_path / name, steps=3) for name in ("one", "other"))
+    (row,) = read_report(one.path / "reports").rows
+    assert row.raw["training: distill.policy"] == training_of(one)["losses"]
+    assert row.value("training_time.distill.policy") > 0
+    assert (one.path / "reports/report.html").is_file()
+    assert (one.path / "reports/report.json").read_bytes() != (other.path / "reports/report.json").read_bytes()
+    assert one.hash == other.hash, "times are no part of it"
+    assert Bundle.open(one.path)
 
 
 def test_it_stops_and_keeps_the_best_however_often_it_is_killed(

@@ -46,14 +46,13 @@ def rounds(work: Work, kills: int, seed: int, tell: Callable[[str], None] = prin
     """Make the reference; kill so many times, over as many rounds as that takes; return every violation."""
     seconds = work.make_reference()
     tell(f"one run takes {seconds:.1f} s")
-    moments, violations, left = random.Random(seed), list[str](), kills
-    while left:
+    moments, violations = random.Random(seed), list[str]()
+    while work.counts["killed"] < kills:
         work.clear()
-        while left and not work.out.exists():
-            left -= 1
+        while work.counts["killed"] < kills and not work.out.exists():
             moment = moments.uniform(0, seconds * LATEST)
             found = kill(work, moment)
-            tell(f"kill {kills - left} at {moment:.2f} s: {found or checkpoint(work)}")
+            tell(f"kill {work.counts['killed']} at {moment:.2f} s: {found or checkpoint(work)}")
             violations += found
         violations += end(work)
         work.counts["rounds"] += 1

@@ -11,6 +11,7 @@ from vlatool.machine.host import fingerprint
 from vlatool.module.stage import TRAINING
 from vlatool.render import write_reports
 from vlatool.report import TRAINED, TRAINING_TIME, Measurement, Report, Row
+from vlatool.training.forecast import duration
 
 Record = dict[str, Any]
 
@@ -29,16 +30,16 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     training = json.loads(made.file(TRAINING).read_bytes())
     stage = str(made.manifest.made_by["stage"])
     losses, steps = training["losses"], len(training["losses"])
-    took = Measurement(
-        f"{TRAINING_TIME}{stage}", seconds, "s", samples=steps, note="on the wall clock, with all episodes"
-    )
+    took = Measurement(f"{TRAINING_TIME}{stage}", seconds, "s")
     row = Row(
         made.manifest.name,
         measurements=(took,),
         raw={f"{TRAINED}{stage}": losses},
         details={f"{TRAINED}{stage}": [_round(round_) for round_ in training["rounds"]]},
     )
-    result = f"{stage}: {training['loss']} {losses[0]:.4g} -> {losses[-1]:.4g} in {steps} steps and {seconds:.0f} s."
+    few = max(1, steps // 20)
+    first, last = sum(losses[:few]) / few, sum(losses[-few:]) / few
+    result = f"{training['loss']} {first:.4g} -> {last:.4g} in {steps} steps and {duration(seconds)}."
     report = Report(
         "training", f"{made.manifest.name}: {stage}", summary=(result,), rows=(row,), command=command,
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"), environment=fingerprint(),

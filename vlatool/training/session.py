@@ -128,6 +128,8 @@ class Session:
 
     def run(self) -> dict[str, Any]:
         """Play, label and train until all steps are done; return what there is to know of it."""
+        if self._trainer.step:
+            self._context.tell(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
             self._held_out.prepare(self._source, RECORDED, self._write_held_out)
         next_round(self._frames, 0, self._first)

@@ -11,8 +11,8 @@ from vlatool.render.charts.svg import Axis, Canvas, axis_for
 from vlatool.render.charts.timeline import draw_bands
 
 HEIGHT, LEFT, RIGHT, TOP = 170, 54.0, 14.0, 26.0
-LAST = 20
-"""Steps whose mean is the loss at the end."""
+ENDS = 20
+"""The loss at the start and at the end are means of this part of the steps each."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Curve:
     @property
     def ends(self) -> tuple[float, float]:
         """The mean loss of the first and of the last steps."""
-        few = min(LAST, max(1, len(self.losses) // 2))
+        few = max(1, len(self.losses) // ENDS)
         return sum(self.losses[:few]) / few, sum(self.losses[-few:]) / few
 
 

@@ -35,7 +35,7 @@ class Training:
             Chart(partial(loss_curve, curve, str(place)), CAPTION) for place, curve in enumerate(curves.values())
         ]
         blocks += [table for name in names if (table := records_table(report, name))]
-        yield Section("Training", tuple(blocks), 95, "measured", brief=False)
+        yield Section("Training", tuple(blocks), 85, "measured", brief=False)
 
 
 def _curves(report: Report, name: str) -> Iterator[Curve]:
