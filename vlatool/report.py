@@ -15,6 +15,10 @@ SCHEMA = 1
 REPORT = "report.json"
 ON_BOARD = "is_profile"
 """Key of the environment: the profile that the machine is the board of."""
+TRAINED = "training: "
+"""What the names of losses (``raw``) and rounds (``details``) of a training begin with; its stage follows."""
+TRAINING_TIME = "training_time."
+"""The same of measurements of how long it took, in seconds."""
 ORIGINS = ("measured", "predicted")
 VERDICTS = ("pass", "fail", "inconclusive", "info")
 ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")
@@ -72,7 +76,8 @@ class Row:
         measurements: By no particular order; names are unique within a row and origin.
         raw: Series name -> raw samples in the order in which they were taken: ``latency_ms``, and ``at_s`` (the start
             of each call, seconds since the start of the run); ``telemetry.NAME`` and ``telemetry.NAME.at_s`` (a reading
-            of the machine and its times); ``throttled_at_s`` (moments at which throttling was seen).
+            of the machine and its times); ``throttled_at_s`` (moments at which throttling was seen);
+            ``training: STAGE`` (the loss of each step).
         details: Tables that belong to the row: title -> list of {column: cell}.
     """
 
@@ -125,7 +130,8 @@ class Report:
     """What a command measured, predicted and decided.
 
     Args:
-        kind: ``benchmark``, ``evaluate``, ``optimize``, ``compare``, ``hwselect`` or ``gate``.
+        kind: ``benchmark``, ``evaluate``, ``optimize``, ``compare``, ``hwselect``, ``gate`` or
+            ``training``.
         title: One line.
         verdict: ``pass``, ``fail``, ``inconclusive`` or ``info``.
         summary: Sentences for a person; the first is the result.

@@ -39,6 +39,13 @@ def test_candidates_are_pruned_trained_exported_and_quantized(policy_dir: Path, 
     assert all(number(rows[name], "latency_p50") > 0 for name in rows)
     assert number(rows["smaller"], "relative_error") > 0
     assert Bundle.open(tmp_path / "out").manifest.graphs
+    trained = "training: distill.policy"
+    assert len(rows["smaller"]["raw"][trained]) == 30
+    assert rows["smaller"]["details"][trained][0]["who acted"] == "recordings"
+    assert number(rows["smaller"], "training_time.distill.policy") > 0
+    assert [name for name, row in rows.items() if trained in row["raw"]] == ["smaller"]
+    page = (tmp_path / "out/reports/report.html").read_text()
+    assert page.count("Loss of smaller: distill.policy") == 2, "for a screen and a phone"
 
 
 def number(row: dict[str, Any], name: str) -> float:

@@ -12,8 +12,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
+from vlatool.prune._ranking import stacks
 from vlatool.prune._selection import Selection
-from vlatool.prune.depth import PROTECTED, Depth, spread, stacks
+from vlatool.prune.depth import PROTECTED, Depth, spread
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from vlatool.errors import DataError
-from vlatool.training.loop import CHECKPOINT, Settings, Trainer
+from vlatool.training.loop import CHECKPOINT, Settings, Trainer, seconds_of
 
 
 def net() -> nn.Module:
@@ -18,10 +18,13 @@ def net() -> nn.Module:
     return nn.Sequential(nn.Linear(3, 8), nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 1)).eval()
 
 
-def draw_for(module: nn.Module):
-    def draw(random: np.random.Generator) -> torch.Tensor:
+def draw_for(module: nn.Module, times: float = 1.0):
+    def loss(rows: torch.Tensor) -> torch.Tensor:
+        return ((module(rows)[:, 0] - rows.sum(1)) ** 2).mean() * times
+
+    def draw(random: np.random.Generator):
         rows = torch.from_numpy(random.standard_normal((32, 3)).astype(np.float32))
-        return ((module(rows)[:, 0] - rows.sum(1)) ** 2).mean()
+        yield 1.0, lambda: loss(rows)
 
     return draw
 
@@ -98,7 +101,7 @@ def test_a_loss_that_is_not_finite_is_refused_and_the_checkpoint_stays(tmp_path:
     trainer.save()
     before = (tmp_path / CHECKPOINT).read_bytes()
     with pytest.raises(DataError, match="The loss is nan in step 4 of 10"):
-        trainer.train(10, lambda _random: draw_for(module)(_random) * float("nan"), silent)
+        trainer.train(10, draw_for(module, float("nan")), silent)
     assert (tmp_path / CHECKPOINT).read_bytes() == before
 
 
@@ -106,7 +109,32 @@ def test_weights_without_a_gradient_stay(tmp_path: Path):
     module = nn.ModuleDict({"used": nn.Linear(3, 1), "unused": nn.Linear(3, 1)})
     before = module["unused"].weight.detach().clone()
     trainer = Trainer({"main": module}, Settings(5), tmp_path)
-    trainer.train(5, lambda random: module["used"](torch.ones(1, 3)).sum(), silent)
+    trainer.train(5, lambda _random: [(1.0, lambda: module["used"](torch.ones(1, 3)).sum())], silent)
     trainer.save()
     trainer = Trainer({"main": module}, Settings(5), tmp_path)
     assert torch.equal(module["unused"].weight, before)
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:100], lambda data: data[: len(data) // 2], lambda data: b""])
+def test_a_damaged_checkpoint_is_told(tmp_path: Path, damage):
+    module = net()
+    trainer = Trainer({"main": module}, Settings(5), tmp_path)
+    trainer.train(2, draw_for(module), silent)
+    trainer.save()
+    (tmp_path / CHECKPOINT).write_bytes(damage((tmp_path / CHECKPOINT).read_bytes()))
+    with pytest.raises(DataError, match=r"checkpoint.safetensors is damaged"):
+        Trainer({"main": net()}, Settings(5), tmp_path)
+
+
+def test_a_checkpoint_of_other_weights_is_told(tmp_path: Path):
+    Trainer({"main": net()}, Settings(5), tmp_path).save()
+    with pytest.raises(DataError, match=r"checkpoint.safetensors is damaged"):
+        Trainer({"main": nn.Linear(2, 2)}, Settings(5), tmp_path)
+
+
+def test_the_time_of_earlier_runs_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    clock = iter([10.0, 17.0, 100.0, 103.0])
+    monkeypatch.setattr("vlatool.training.loop.time.monotonic", lambda: next(clock))
+    Trainer({"main": net()}, Settings(5), tmp_path).save()
+    assert seconds_of(tmp_path) == 7.0
+    assert Trainer({"main": net()}, Settings(5), tmp_path).seconds == 10.0

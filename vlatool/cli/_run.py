@@ -48,6 +48,7 @@ SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
 NEW_BUNDLE = typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)
 REPORTS = typer.Option("-o", "--output", help="directory for report.html, report.md and report.json")
 WORKERS = typer.Option("--workers", min=1, help="processes for closed-loop episodes; all cores if unset")
+EVENTS = typer.Option("--events", help="directory for events that TensorBoard reads: loss, learning rate, success")
 TARGET = typer.Option("--target", help="run there, through ssh: user@host, or a Host of your ssh config")
 REMOTE_PYTHON = typer.Option("--remote-python", help="Python of the target, such as ~/venv/bin/python")
 COMMON_FLAGS = (_flag("force", Force, False), _flag("as_json", AsJson, False))
@@ -56,6 +57,7 @@ TRANSFORM_FLAGS = (
     _board_flag("make it the way this board runs it, and show what to expect there (see: vlatool profiles list)"),
     *COMMON_FLAGS,
 )
+TRAINING_FLAGS = (_flag("events", Annotated[Path | None, EVENTS], None),)
 MEASURE_FLAGS = (
     _flag("out", Annotated[Path | None, REPORTS], None),
     _board_flag(
@@ -71,13 +73,23 @@ REMOTE_FLAGS = (
 )
 
 
-def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bool, profile: str | None = None) -> None:
+def transform(
+    stage: Transform,
+    source: str,
+    out: Path,
+    force: bool,
+    as_json: bool,
+    profile: str | None = None,
+    events: Path | None = None,
+) -> None:
     """Make a bundle from a bundle, or from a policy that is exported first."""
     from vlatool.hardware.profile import load_profile
     from vlatool.sources import is_bundle, source_stage, sourced
 
     bundle: Bundle | None
     refuse_existing(out, force, source, file_or_none(profile), *named_files(stage), kind=BUNDLE)
+    if events is not None and out.absolute() in (events.absolute(), *events.absolute().parents):
+        raise UsageError(f"--events {events} is in the output {out}, which appears whole or not at all.")
     board = load_profile(profile) if profile else None
     stage = stage.on(board) if board else stage
     with progress() as context:
@@ -90,6 +102,7 @@ def transform(stage: Transform, source: str, out: Path, force: bool, as_json: bo
                 stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
+        context = replace(context, events=str(events.absolute()) if events else "")
         for name, options in stage.then():
             bundle = cached_transform(stage, bundle, cache_directory(), context)
             stage = cast(Transform, build_stage(name, options))

@@ -18,7 +18,7 @@ from vlatool import registry
 from vlatool.cli import _complete, _run
 from vlatool.cli._default import DefaultGroup
 from vlatool.errors import PluginError, UsageError, nearest
-from vlatool.stage.base import Measure, Stage, validated
+from vlatool.stage.base import Measure, Stage, Transform, validated
 
 DEFAULTS = {
     "export": "onnx",
@@ -93,6 +93,8 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
 
     if issubclass(stage, Measure) and stage.remotely:
         common = (*common, *_run.REMOTE_FLAGS)
+    if issubclass(stage, Transform) and stage.trains:
+        common = (*common, *_run.TRAINING_FLAGS)
     typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
     parameters = [typed, _run.SOURCE_FLAG, *own.values(), *common]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

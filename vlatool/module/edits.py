@@ -8,6 +8,7 @@ the weights are those of the policy's shards (``vlatool.module.stored``): blocks
 from __future__ import annotations
 
 import json
+import os
 import re
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
@@ -242,13 +243,33 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
     module.load_state_dict(tensors)
 
 
+def save_tensors(path: Path, tensors: Mapping[str, Any], about: Mapping[str, str] | None = None) -> None:
+    """Write a safetensors file.
+
+    Args:
+        path: A new file.
+        tensors: Name -> tensor.
+        about: Texts that go with them.
+
+    Raises:
+        OSError: when it cannot be written; what there is of it stays.
+    """
+    safetensors = require("safetensors", "build")
+    try:
+        require("safetensors.torch", "build").save_file(dict(tensors), str(path), dict(about) if about else None)
+    except safetensors.SafetensorError as error:
+        number = re.search(r"\(os error (\d+)\)", str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from error
+
+
 def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module]) -> None:
     """Write the edits and the weights of the modules to a new bundle; no modules where the weights stay in shards."""
-    safetensors = require("safetensors.torch", "build")
     (out / FOLDER).mkdir()
     (out / EDITS).write_text(json.dumps([asdict(edit) for edit in edits]) + "\n", encoding="utf-8")
     for graph, module in modules.items():
         tensors = {name: value.detach().contiguous().clone() for name, value in module.state_dict().items()}
         path = out / FOLDER / f"{graph}.safetensors"
-        safetensors.save_file(tensors, str(path))
+        save_tensors(path, tensors)
         path.chmod((out / EDITS).stat().st_mode & 0o777)  # safetensors lets nobody else read it

@@ -32,6 +32,7 @@ from vlatool.optimize.recipe import Recipe
 from vlatool.optimize.search import Search
 from vlatool.optimize.summary import report_of
 from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, placed
+from vlatool.optimize.trained import trainings, with_trainings
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -112,11 +113,12 @@ def optimize_here(request: Mapping[str, Any], tell: Tell) -> None:
 def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     """Run a plan in this process, and write everything into an empty directory."""
     source = cached_transform(plan.source, None, plan.cache, context)
-    baseline = _chain(plan.export, source, plan, context)
+    baseline = _chain(plan.export, source, plan, context)[-1]
     _check_metric(plan, baseline, context)
     plan, tried = _searched(plan, baseline, context)
-    bundles, failures = _candidates(plan, source, baseline, context)
+    bundles, failures, trained = _candidates(plan, source, baseline, context)
     rows, notes = _measured(plan, source, {BASELINE: baseline, **bundles}, context)
+    rows = {name: with_trainings(row, trained.get(name, ())) for name, row in rows.items()}
     judged, trust = judged_rows(plan, rows, {name: engine_of(bundle) for name, bundle in bundles.items()})
     tables = {**tried, **_explained(judged, bundles, baseline, context)}
     judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
@@ -127,14 +129,15 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     return report
 
 
-def _chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: Context) -> Bundle:
-    bundle = source
+def _chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: Context) -> list[Bundle]:
+    """Run stages one after the other; return the source and what each made."""
+    made = [source]
     for stage in stages:
         context.tell(stage.name(), None)
-        stage.check(bundle, plan.profile)
-        bundle = cached_transform(stage, bundle, plan.cache, context)
-    refuse_findings(bundle, plan.recipe.limits.accept)
-    return bundle
+        stage.check(made[-1], plan.profile)
+        made.append(cached_transform(stage, made[-1], plan.cache, context))
+    refuse_findings(made[-1], plan.recipe.limits.accept)
+    return made
 
 
 def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
@@ -163,24 +166,27 @@ def _searched(plan: Plan, baseline: Bundle, context: Context) -> tuple[Plan, Tab
     return replace(plan, recipe=recipe, candidates=stages), search.tables()
 
 
-def _candidates(plan: Plan, source: Bundle, baseline: Bundle, context: Context) -> tuple[dict[str, Bundle], list[Row]]:
-    """Make every candidate; one that cannot be made becomes a row that says why.
+def _candidates(
+    plan: Plan, source: Bundle, baseline: Bundle, context: Context
+) -> tuple[dict[str, Bundle], list[Row], dict[str, tuple[Row, ...]]]:
+    """Make every candidate; one that cannot be made becomes a row that says why. Return also how they were trained.
 
     What changes the policy's modules starts at the source, and is exported after that.
     """
-    bundles, failures = {}, []
+    bundles, failures, trained = {}, [], {}
     for name, stages in plan.candidates.items():
         try:
             changed = stages[: sum(stage.takes_modules for stage in stages)]
-            start = _chain((*changed, *plan.export), source, plan, context) if changed else baseline
-            bundles[name] = _chain(stages[len(changed) :], start, plan, context)
+            started = _chain((*changed, *plan.export), source, plan, context) if changed else [baseline]
+            bundles[name] = _chain(stages[len(changed) :], started[-1], plan, context)[-1]
+            trained[name] = trainings(started)
         except VlatoolError as error:
             if error.exit_code not in (3, 4):
                 raise
             failures.append(Row(name, "failed", error.message))
     if not bundles:
         raise RecipeError("No candidate could be made: " + "; ".join(f"{row.name}: {row.reason}" for row in failures))
-    return bundles, failures
+    return bundles, failures, trained
 
 
 def _measured(

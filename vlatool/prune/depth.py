@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, SourceError, require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.errors import RecipeError
 from vlatool.module.edits import BLOCKS, Edit
-from vlatool.module.feeds import recorded_inputs
 from vlatool.module.stage import Changed, ModuleStage
+from vlatool.prune._ranking import Place, Ranking, Stack, stacks
 from vlatool.prune._selection import Selection
-from vlatool.prune._slopes import slopes_of
-from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -30,11 +25,6 @@ PROTECTED = ("vision", "visual", "image", "vit", "encoder", "projector", "connec
 """Parts of module names whose blocks stay unless --include names them: what sees and what acts is less redundant than
 the trunk between: with two of its action blocks left, pi0.5 succeeds in 26 %, with as few others in 91 % (DTR, arXiv
 2606.27755)."""
-SEED = 0
-Stack = tuple[str, str]
-"""Blocks one behind the other: their graph and the name of the list."""
-Place = tuple[str, str, int]
-"""A block: its graph, the name of the stack, and its number there."""
 
 
 class Depth(ModuleStage):
@@ -109,7 +99,7 @@ class Depth(ModuleStage):
             raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
         if self.rank == "even":
             return {stack: spread(sizes[stack], sizes[stack] - count) for stack, count in goes.items()}
-        ranking = _Ranking(modules, source, self.samples)
+        ranking = Ranking(modules, source, self.samples)
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):
             left[graph, name].remove(block)
@@ -120,7 +110,7 @@ class Depth(ModuleStage):
         return size - self.blocks if self.blocks is not None else min(size - 1, math.floor(size * self.ratio + 1e-9))
 
     def _going(
-        self, ranking: _Ranking, left: Mapping[Stack, list[int]], goes: Mapping[Stack, int], context: Context
+        self, ranking: Ranking, left: Mapping[Stack, list[int]], goes: Mapping[Stack, int], context: Context
     ) -> Iterator[tuple[Stack, int]]:
         """Yield which block goes next; the caller takes it from what is left."""
         rank = {"error": ranking.errors, "cosine": ranking.cosine, "gate": ranking.gate}[self.rank]
@@ -183,133 +173,3 @@ def spread(size: int, count: int) -> list[int]:
     """Return ``count`` of ``size`` numbers, spread evenly, the first and (of several) the last with them."""
     steps = max(1, count - 1)
     return [(2 * number * (size - 1) + steps) // (2 * steps) for number in range(count)]
-
-
-def stacks(module: nn.Module, *, mixed: bool = False) -> Iterator[tuple[str, Any]]:
-    """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes.
-
-    Args:
-        module: In which they are looked for.
-        mixed: Also yield lists of modules of several kinds, such as layers that alternate.
-    """
-    nn = require("torch", "build").nn
-    for name, part in module.named_modules():
-        if not isinstance(part, nn.ModuleList | nn.Sequential) or len(part) < 2:
-            continue
-        kinds = {type(block) for block in part}
-        shapes = {
-            tuple((key, tuple(value.shape)) for key, value in block.state_dict(keep_vars=True).items())
-            for block in part
-        }
-        shared = len({id(block) for block in part}) < len(part)
-        alike = len(kinds) == 1 and len(shapes) == 1
-        if (alike or (mixed and isinstance(part, nn.ModuleList))) and shapes != {()} and not shared:
-            yield name, part
-
-
-class _Ranking:
-    """What the action loses without some blocks, on recorded observations.
-
-    Args:
-        modules: Graph name -> module.
-        source: For the program and the encoding of observations.
-        samples: Observations at most.
-    """
-
-    def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
-        self._program = BatchedProgram(source.manifest.program, modules)
-        self._action = source.manifest.spec.action.name
-        self._inputs = recorded_inputs(source, samples)
-        self._noise = drawn(self._program.noise, 1, np.random.default_rng(SEED))
-        self._blocks = {
-            (graph, name, number): block
-            for graph, module in modules.items()
-            for name, stack in stacks(module)
-            for number, block in enumerate(stack)
-        }
-
-    def actions(self) -> Iterator[Any]:
-        """Yield the raw action of each observation as a tensor."""
-        for inputs in self._inputs:
-            yield self._program.run(inputs, self._noise)[self._action]
-
-    def errors(self, candidates: Sequence[Place], removed: Collection[Place]) -> dict[Place, float]:
-        """Return the mean relative error of the actions without each candidate, in addition to what is removed."""
-        with require("torch", "build").no_grad():
-            wanted = [action.numpy() for action in self.actions()]
-            found = {}
-            for place in candidates:
-                with self._hooked({*removed, place}, lambda _: _passes_on):
-                    pairs = zip(self.actions(), wanted, strict=True)
-                    found[place] = float(np.mean([relative_error(action.numpy(), whole) for action, whole in pairs]))
-        return found
-
-    def cosine(self, candidates: Sequence[Place], _removed: Collection[Place]) -> dict[Place, float]:
-        """Return 1 - cosine similarity between what each block is given and what it gives, as a mean."""
-        torch = require("torch", "build")
-        turned: dict[Place, list[float]] = {place: [] for place in candidates}
-
-        def looking(place: Place) -> Any:
-            def look(_module: Any, given: Any, named: Any, gives: Any) -> None:
-                similar = torch.nn.functional.cosine_similarity(_stream(given, named), _first(gives), dim=-1)
-                turned[place].append(1 - float(similar.mean()))
-
-            return look
-
-        with torch.no_grad(), self._hooked(candidates, looking):
-            for _ in self.actions():
-                pass
-        return {place: float(np.mean(shares)) if shares else 0.0 for place, shares in turned.items()}
-
-    def gate(self, candidates: Sequence[Place], _removed: Collection[Place]) -> dict[Place, float]:
-        """Return the expected square of what the action moves by when a block's contribution is scaled.
-
-        With a gate g of 1 on the contribution, ``x + g (block(x) - x)``, it is the mean of ``(d(v . action)/dg)^2``
-        over random directions v: the diagonal of the Fisher information for an action with Gaussian noise.
-        """
-        torch = require("torch", "build")
-        gates = {place: torch.ones((), requires_grad=True) for place in candidates}
-
-        def gated(place: Place) -> Any:
-            def scale(_module: Any, given: Any, named: Any, gives: Any) -> Any:
-                stream = _stream(given, named)
-                mixed = stream + gates[place] * (_first(gives) - stream)
-                return (mixed, *gives[1:]) if isinstance(gives, tuple) else mixed
-
-            return scale
-
-        total = dict.fromkeys(candidates, 0.0)
-        with self._hooked(candidates, gated):
-            for slopes in slopes_of(self.actions(), gates):
-                for place, slope in slopes.items():
-                    total[place] += float(slope) ** 2
-        return total
-
-    @contextlib.contextmanager
-    def _hooked(self, places: Collection[Place], hook: Callable[[Place], Any]) -> Iterator[None]:
-        handles = [self._blocks[place].register_forward_hook(hook(place), with_kwargs=True) for place in places]
-        try:
-            yield
-        finally:
-            for handle in handles:
-                handle.remove()
-
-
-def _first(gives: Any) -> Any:
-    return gives[0] if isinstance(gives, tuple | list) else gives
-
-
-def _stream(given: Any, named: Any) -> Any:
-    """Return what passes through a block: its first argument."""
-    return given[0] if given else next(iter(named.values()))
-
-
-def _passes_on(_module: Any, given: Any, named: Any, gives: Any) -> Any:
-    """Take the place of a block that is removed: what it is given, beside what else it gives."""
-    stream = _stream(given, named)
-    if _first(gives).shape != stream.shape:
-        raise SourceError(
-            f"A block gives {list(_first(gives).shape)} for {list(stream.shape)}: without it, shapes would not fit.",
-            "leave its stack out: --exclude NAME",
-        )
-    return (stream, *gives[1:]) if isinstance(gives, tuple) else stream

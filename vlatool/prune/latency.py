@@ -17,9 +17,10 @@ from vlatool.module.edits import Edit, edits_from
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._clock import Clock
 from vlatool.prune._prices import Stack, edits_of, is_gone, measured_prices, role_of
+from vlatool.prune._ranking import Ranking, stacks
 from vlatool.prune._selection import Selection
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
-from vlatool.prune.depth import PROTECTED, _Ranking, stacks
+from vlatool.prune.depth import PROTECTED
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 AIM, CLOSE = 0.98, 0.04
 """The share of the asked latency that is aimed at, and how far below it a result may stay."""
-ROUNDS = 6
+ROUNDS = 8
 """Of choosing and measuring, at most."""
 
 
@@ -81,7 +82,7 @@ class LatencyPruning(ModuleStage):
         selection = Selection((), self.exclude, PROTECTED)
         sizes = {(graph, name): len(stack) for graph, module in modules.items() for name, stack in stacks(module)
                  if selection.has((name,))}  # fmt: skip
-        scores = _Ranking(modules, source, self.samples).gate(
+        scores = Ranking(modules, source, self.samples).gate(
             [(graph, name, block) for (graph, name), size in sizes.items() for block in range(size)], set()
         )
         return [
@@ -102,9 +103,11 @@ class LatencyPruning(ModuleStage):
         for number in range(ROUNDS):
             edits = choice.until(whole, goal)
             _, (ms,) = clock.times([edits])
+            if self._is_met(ms):  # once may be luck
+                ms = (ms + clock.times([edits])[1][0]) / 2
             tried.append(ms)
             context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
-            if (1 - CLOSE) * self.target_ms <= ms <= self.target_ms:
+            if self._is_met(ms):
                 return edits
             goal *= AIM * self.target_ms / ms
         raise DataError(
@@ -112,6 +115,9 @@ class LatencyPruning(ModuleStage):
             f"{', '.join(f'{ms:.3g}' for ms in tried)} ms.",
             "let nothing else run meanwhile; let units go one by one: --multiple 1",
         )
+
+    def _is_met(self, ms: float) -> bool:
+        return (1 - CLOSE) * self.target_ms <= ms <= self.target_ms
 
 
 @dataclass(frozen=True, order=True)

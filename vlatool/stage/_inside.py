@@ -33,6 +33,7 @@ def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any
     return {
         "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
+        "events": context.events,
     }  # fmt: skip
 
 
@@ -42,7 +43,7 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
     if not isinstance(stage, Transform):
         raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
-    bundle = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"]))
+    bundle = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"], events=job["events"]))
     return {"hash": bundle.hash}
 
 

@@ -51,12 +51,14 @@ class Context:
         command: The command line, for reports.
         elsewhere: Measures on another machine: a job, the bundles that it names, and ``tell`` -> what was found there.
             Here when None.
+        events: Folder into which a training writes events that TensorBoard reads; none when empty.
     """
 
     tell: Tell = field(default=_silent)
     workers: int = 1
     command: str = ""
     elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
+    events: str = ""
 
 
 class SampleSet:
@@ -149,6 +151,8 @@ class Transform(Stage):
 
     takes_modules: ClassVar[bool] = False
     """Whether it starts from a source bundle without graphs, since it works on the policy's torch modules."""
+    trains: ClassVar[bool] = False
+    """Whether it changes weights step by step, and tells of each (``Context.events``)."""
     streams: ClassVar[bool] = False
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 

@@ -31,7 +31,10 @@ NAMES = {
     STREAMS: re.compile(r"[\w.-]+"),
     WORKLOADS: re.compile(r"[0-9a-f]{32}\.json"),
 }
-STREAM_FILES = re.compile(r"lock|data|journal|checkpoint\.safetensors|round-\d{3}\.json|(round|draft)-\d{3}/.+")
+STREAM_FILES = re.compile(
+    r"lock|data|journal|checkpoint\.safetensors|\.checkpoint\.safetensors\.\d+\.part|meeting|round-\d{3}\.json"
+    r"|(held-out/)?(round|draft)-\d{3}/.+"
+)
 """What unfinished work is made of: a file that is written part by part, or training."""
 DRAFT = re.compile(r"\.(?P<final>.+)\.tmp-\d+-[0-9a-f]{8}")
 PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")

@@ -33,6 +33,11 @@ class Frames:
     def __len__(self) -> int:
         return sum(len(next(iter(arrays.values()))) for arrays in self._rounds)
 
+    @property
+    def count(self) -> int:
+        """How many rounds are used."""
+        return len(self._rounds)
+
     def has(self, number: int) -> bool:
         """Say whether a round was written whole, by an earlier run too."""
         return self._place(number).is_dir()

@@ -1,7 +1,7 @@
 """The training loop: AdamW, warm-up and cosine, averaged weights, and a run that is killed goes on as if it were not.
 
 What a step does depends on the seed, its number and the weights alone: a run that continues from a checkpoint ends with
-the same weights, bit for bit, on the same processor with the same number of threads.
+the same weights, bit for bit, on the same processor with the same number of threads and processes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,11 @@ import numpy as np
 
 from vlatool.errors import DataError, require
 from vlatool.files.edited import whole_file
+from vlatool.files.printable import message_of
 from vlatool.module.batched import no_gradient
+from vlatool.module.edits import save_tensors
+from vlatool.training.best import Best
+from vlatool.training.group import Group
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -30,8 +34,10 @@ WARMUP = 0.05
 """Share of the steps in which the learning rate rises."""
 BFLOAT16 = ("amx_bf16", "avx512_bf16", "bf16")
 """Features of processors that multiply bfloat16 natively: twice as fast as float32 here."""
-Draw = Callable[[np.random.Generator], "Tensor"]
-"""Random numbers of a step -> its loss."""
+Part = tuple[float, Callable[[], "Tensor"]]
+"""Share of a batch, and what computes the mean loss of its rows; gradients of parts are added."""
+Draw = Callable[[np.random.Generator], Iterable[Part]]
+"""Random numbers of a step -> the parts of its batch that this process takes."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +86,14 @@ class Trainer:
         modules: Graph name -> module.
         settings: How long and how fast.
         folder: For checkpoints.
+        group: The processes that train together; the first one writes checkpoints.
     """
 
-    def __init__(self, modules: Mapping[str, nn.Module], settings: Settings, folder: Path) -> None:
+    def __init__(
+        self, modules: Mapping[str, nn.Module], settings: Settings, folder: Path, group: Group | None = None
+    ) -> None:
         torch = require("torch", "build")
-        self._settings = settings
+        self._settings, self._group = settings, group or Group()
         self._file = folder / CHECKPOINT
         self._weights = {
             f"{graph}.{name}": value.requires_grad_()
@@ -97,9 +106,16 @@ class Trainer:
         groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": plain, "weight_decay": 0.0}]
         self._optimizer = torch.optim.AdamW([group for group in groups if group["params"]], lr=settings.learning_rate)
         self._average = {name: value.detach().clone() for name, value in self._weights.items()}
+        self.best = Best()
         self.step = 0
         self.losses: list[float] = []
+        self._start = time.monotonic()
         self._resume()
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time since the training began, of all runs up to their last checkpoints."""
+        return time.monotonic() - self._start
 
     def train(self, until: int, draw: Draw, tell: Callable[[int, float], None]) -> None:
         """Take steps until so many are done.
@@ -113,32 +129,45 @@ class Trainer:
             DataError: when the loss is not finite.
             SourceError: when it does not depend on the weights.
         """
-        torch = require("torch", "build")
         saved = time.monotonic()
         while self.step < until:
-            with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.bfloat16):
-                loss = draw(np.random.default_rng((self._settings.seed, self.step)))
-            if not loss.requires_grad:
-                raise no_gradient("let make() return the module that was trained, as it was trained")
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                raise DataError(
-                    f"The loss is {value} in step {self.step + 1} of {self._settings.steps}.",
-                    "try a lower --learning-rate, and look for values that are not finite in the recordings",
-                )
-            for group in self._optimizer.param_groups:
-                group["lr"] = self._settings.rate(self.step)
-            self._optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(list(self._weights.values()), CLIP)
-            self._optimizer.step()
-            self._follow()
-            self.step += 1
-            self.losses.append(value)
+            self._take_step(draw)
             tell(self.step, float(np.mean(self.losses[-20:])))
-            if time.monotonic() - saved > self._settings.checkpoint_s:
+            if self._group.rank == 0 and time.monotonic() - saved > self._settings.checkpoint_s:
                 self.save()
                 saved = time.monotonic()
+
+    def _take_step(self, draw: Draw) -> None:
+        self._optimizer.zero_grad()
+        loss = self._group.summed(self._own_loss(draw), list(self._weights.values()))
+        if not math.isfinite(loss):
+            raise DataError(
+                f"The loss is {loss} in step {self.step + 1} of {self._settings.steps}.",
+                "try a lower --learning-rate, and look for values that are not finite in the recordings",
+            )
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._settings.rate(self.step)
+        require("torch", "build").nn.utils.clip_grad_norm_(list(self._weights.values()), CLIP)
+        self._optimizer.step()
+        self._follow()
+        self.step += 1
+        self.losses.append(loss)
+
+    def _own_loss(self, draw: Draw) -> float:
+        """Add the gradients of this process's parts of the batch; return their share of its loss."""
+        torch, total = require("torch", "build"), 0.0
+        for share, compute in draw(np.random.default_rng((self._settings.seed, self.step))):
+            with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.bfloat16):
+                loss = compute()
+            if not loss.requires_grad:
+                raise no_gradient("let make() return the module that was trained, as it was trained")
+            (loss * share).backward()  # type: ignore[no-untyped-call]
+            total += share * float(loss.detach())
+        return total
+
+    def judge(self, score: float) -> None:
+        """Remember how well the averaged weights do, and the weights where none did better."""
+        self.best.look(score, self.step, self._average)
 
     def _follow(self) -> None:
         """Let the average follow the weights, closely in the first steps."""
@@ -156,7 +185,8 @@ class Trainer:
                 self._average[name].copy_(kept)
 
     def finish(self) -> None:
-        """Put the average in the place of the weights, and ask for no gradients any more."""
+        """Put the average in the place of the weights, the best one where that is known; ask for no gradients more."""
+        self._average.update(self.best.weights)
         self.swap()
         for value in self._weights.values():
             value.requires_grad_(False)
@@ -172,25 +202,49 @@ class Trainer:
         for name, value in self._weights.items():
             for key, held in self._optimizer.state[value].items():
                 tensors[f"{key}.{name}"] = held.contiguous()
-        about = {"step": str(self.step), "losses": json.dumps(self.losses)}
+        tensors |= {f"best.{name}": value for name, value in self.best.weights.items()}
+        about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text()}
+        about["seconds"] = f"{self.seconds:.3f}"
         with whole_file(self._file) as draft:
-            require("safetensors.torch", "build").save_file(tensors, str(draft), about)
+            save_tensors(draft, tensors, about)
 
     def _resume(self) -> None:
-        """Go on from the checkpoint, if there is one."""
+        """Go on from the checkpoint, if there is one.
+
+        Raises:
+            DataError: when it is damaged.
+        """
         if not self._file.is_file():
             return
-        torch = require("torch", "build")
-        with require("safetensors", "build").safe_open(str(self._file), "pt") as opened, torch.no_grad():
-            about, names = opened.metadata(), set(opened.keys())
-            self.step, self.losses = int(about["step"]), json.loads(about["losses"])
-            for name, value in self._weights.items():
-                value.copy_(opened.get_tensor(f"weight.{name}"))
-                self._average[name].copy_(opened.get_tensor(f"average.{name}"))
-                state: dict[str, Any] = {
-                    key: opened.get_tensor(f"{key}.{name}")
-                    for key in ("step", "exp_avg", "exp_avg_sq")
-                    if f"{key}.{name}" in names
-                }
-                if state:
-                    self._optimizer.state[value] = state
+        safetensors, torch = require("safetensors", "build"), require("torch", "build")
+        try:
+            with safetensors.safe_open(str(self._file), "pt") as opened, torch.no_grad():
+                self._take(opened)
+        except (safetensors.SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+            raise DataError(
+                f"The checkpoint {self._file} is damaged: {message_of(error)}.",
+                f"remove {self._file.parent}: the training then begins anew",
+            ) from error
+
+    def _take(self, opened: Any) -> None:
+        about, names = opened.metadata(), set(opened.keys())
+        self.step, self.losses = int(about["step"]), json.loads(about["losses"])
+        self._start -= float(about["seconds"])
+        best = {name: opened.get_tensor(f"best.{name}") for name in self._weights if f"best.{name}" in names}
+        self.best = Best.of(about["best"], best)
+        for name, value in self._weights.items():
+            value.copy_(opened.get_tensor(f"weight.{name}"))
+            self._average[name].copy_(opened.get_tensor(f"average.{name}"))
+            state: dict[str, Any] = {
+                key: opened.get_tensor(f"{key}.{name}")
+                for key in ("step", "exp_avg", "exp_avg_sq")
+                if f"{key}.{name}" in names
+            }
+            if state:
+                self._optimizer.state[value] = state
+
+
+def seconds_of(folder: Path) -> float:
+    """Return the wall-clock time that a training took, as its last checkpoint says."""
+    with require("safetensors", "build").safe_open(str(folder / CHECKPOINT), "pt") as opened:
+        return float(opened.metadata()["seconds"])

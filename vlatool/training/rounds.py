@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -33,7 +33,15 @@ def scene_of(source: Bundle) -> tuple[EpisodesJob, tuple[str, ...]] | None:
     return (EpisodesJob(str(make), str(origin.folder), "", ()), tuple(tasks)) if make and tasks else None
 
 
-def write_recorded(encode: Callable[[Any], Mapping[str, Array]], observations: Sequence[Any], target: Path) -> None:
+class Counted(Protocol):
+    """Observations, each read when it is its turn."""
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[Any]: ...
+
+
+def write_recorded(encode: Callable[[Any], Mapping[str, Array]], observations: Counted, target: Path) -> None:
     """Write encoded observations as a part of a round, one after the other: they need not fit into the memory."""
     target.mkdir(parents=True, exist_ok=True)
     kept: dict[str, Array] = {}

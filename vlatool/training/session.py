@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.episodes.play import jobs_for, run_jobs
@@ -20,9 +18,14 @@ from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
+from vlatool.training.batches import Batches
+from vlatool.training.crew import Crew
+from vlatool.training.events import Events
+from vlatool.training.forecast import Forecast
 from vlatool.training.frames import Frames, joined
+from vlatool.training.held_out import HeldOut
 from vlatool.training.loop import Settings, Trainer
-from vlatool.training.rounds import label, next_round, scene_of, write_recorded
+from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
 from vlatool.training.teacher import Teacher
 
 if TYPE_CHECKING:
@@ -45,6 +48,8 @@ class Plan:
         pauses: Numbers of the steps before which it does.
         noise: What disturbs the actions in them, see ``EpisodesJob``.
         first_seed: Of the first episode of each task; the others follow.
+        patience: Pauses in a row without an improvement after which training ends; 0 for never.
+        accumulate: Parts of a batch, computed one after the other.
     """
 
     batch: int
@@ -53,6 +58,8 @@ class Plan:
     pauses: Sequence[int]
     noise: float
     first_seed: int
+    patience: int = 0
+    accumulate: int = 1
 
     def asked(self, number: int) -> int:
         """Return how many episodes a round has."""
@@ -70,7 +77,8 @@ class Lesson:
     Args:
         name: Of the loss.
         modules: The student's, which are trained in place.
-        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> their loss.
+        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
+            computed in parts.
     """
 
     name: str
@@ -89,6 +97,7 @@ class Session:
         teacher: Who says what is right.
         place: The folder.
         context: For progress.
+        crew: Other processes that train, too.
     """
 
     def __init__(
@@ -100,36 +109,109 @@ class Session:
         teacher: Teacher,
         place: Path,
         context: Context,
+        crew: Crew | None = None,
     ) -> None:
         self._plan, self._settings, self._lesson = plan, settings, lesson
         self._source, self._teacher, self._place, self._context = source, teacher, place, context
+        self._crew = crew or Crew()
         self._spec = source.manifest.spec
         self._scene = scene_of(source) if plan.episodes or plan.student_episodes else None
+        self._plays = self._scene is not None and plan.student_episodes > 0
+        self._encode = ObservationEncoder(self._spec, source)
         self._frames = Frames(place)
-        self._trainer = Trainer(lesson.modules, settings, place)
+        self._held_out = HeldOut(place) if plan.patience and not self._plays else None
+        self._trainer = Trainer(lesson.modules, settings, place, self._crew.group)
+        self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
+        self._forecast = Forecast(settings.steps, self._trainer.step)
+        self._events = Events(context.events, self._trainer.step)
+        self._success = ""
 
     def run(self) -> dict[str, Any]:
         """Play, label and train until all steps are done; return what there is to know of it."""
+        if self._trainer.step:
+            self._context.tell(f"going on from step {self._trainer.step}", None)
+        if self._held_out is not None:
+            self._held_out.prepare(self._source, RECORDED, self._write_held_out)
         next_round(self._frames, 0, self._first)
-        ends = [*(self._plan.pauses if self._scene else ()), self._settings.steps]
-        for number, end in enumerate(ends):
-            if number:
-                next_round(self._frames, number, partial(self._students, number))
-            self._trainer.train(end, self._draw, self._tell)
-            self._trainer.save()
+        pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
+        for number, end in enumerate([*pauses, self._settings.steps]):
+            if number and self._paused(number):
+                break
+            self._train(end)
+        else:
+            if self._plan.patience:
+                self._paused(len(pauses) + 1)
         self._trainer.finish()
+        self._events.close()
+        return self._about()
+
+    def _train(self, end: int) -> None:
+        with self._crew.training(self._frames.count, end):
+            self._trainer.train(end, self._batches, self._tell)
+        self._trainer.save()
+
+    def _paused(self, number: int) -> bool:
+        """Let the student play, and say whether it has stopped getting better."""
+        if self._plays:
+            with self._forecast.pause():
+                next_round(self._frames, number, partial(self._students, number))
+            self._note(number)
+        patience, best = self._plan.patience, self._trainer.best
+        if not patience:
+            return False
+        if len(best.scores) < number:
+            self._trainer.judge(self._score(number))
+            self._trainer.save()
+        return best.unimproved(number) >= patience
+
+    def _score(self, number: int) -> float:
+        """Return how well the averaged weights do: the share of episodes that succeed, or less the held-out loss."""
+        if self._held_out is None:
+            about = self._round(number)
+            return float(about["successes"] / about["episodes"])
+        self._trainer.swap()
+        try:
+            loss = self._held_out.loss(self._lesson.loss, self._plan.batch, bfloat16=self._settings.bfloat16)
+        finally:
+            self._trainer.swap()
+        self._events.add(self._trainer.step, {"held-out loss": loss})
+        self._success = f"held-out loss {loss:.4g}"
+        return -loss
+
+    def _about(self) -> dict[str, Any]:
+        best, several = self._trainer.best, self._crew.group.size
+        judged = "success" if self._held_out is None else "held-out loss"
+        scores = best.scores if self._held_out is None else [-score for score in best.scores]
         return {
             "loss": self._lesson.name,
             "precision": "bfloat16" if self._settings.bfloat16 else "float32",
             "threads": require("torch", "build").get_num_threads(),
+            **({"processes": several} if several > 1 else {}),
             "losses": self._trainer.losses,
-            "rounds": [json.loads((self._place / ROUND.format(number)).read_text()) for number in range(len(ends))],
+            "rounds": [self._round(number) for number in range(self._frames.count)],
+            **({"judged": {"by": judged, "scores": scores, "best_step": best.step}} if scores else {}),
         }
+
+    def _round(self, number: int) -> dict[str, Any]:
+        about: dict[str, Any] = json.loads((self._place / ROUND.format(number)).read_text())
+        return about
+
+    def _note(self, number: int) -> None:
+        """Remember for the progress how well the student did."""
+        about = self._round(number)
+        share = about["successes"] / about["episodes"]
+        self._success = f"student {share:.1%} of {about['episodes']}"
+        self._events.add(about["step"], {"success": share})
+
+    def _write_held_out(self, observations: Counted, target: Path) -> None:
+        write_recorded(self._encode, observations, target)
+        self._label(target, 0, 1)
 
     def _first(self, target: Path) -> None:
         """Write the first round: recordings, and the teacher's episodes."""
-        encode = ObservationEncoder(self._spec, self._source)
-        write_recorded(encode, recorded_observations(self._source, RECORDED), target / "recorded")
+        recorded = recorded_observations(self._source, RECORDED)
+        chosen = self._held_out.others if self._held_out is not None else recorded
+        write_recorded(self._encode, chosen, target / "recorded")
         self._play(target, 0)
 
     def _students(self, number: int, target: Path) -> None:
@@ -156,10 +238,13 @@ class Session:
         about["observations"] = joined((target / "recorded", *sorted(folder.glob("*"))), target)
         for part in ("recorded", "episodes", "actor"):
             shutil.rmtree(target / part, ignore_errors=True)
+        (self._place / ROUND.format(number)).write_text(json.dumps(about))
+        self._label(target, number)
+
+    def _label(self, target: Path, *seed: int) -> None:
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
-        (self._place / ROUND.format(number)).write_text(json.dumps(about))
-        label(target, names, outputs, self._teacher.program, (self._settings.seed, number), self._context)
+        label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
 
     def _actor(self, place: Path, number: int) -> Bundle:
         """Write who plays as a bundle, which the processes that play open."""
@@ -171,9 +256,7 @@ class Session:
         program = teacher.program.steps
         return write_changed(teacher.bundle, place, teacher.edits, modules, source.manifest.made_by, program=program)
 
-    def _draw(self, random: np.random.Generator) -> Tensor:
-        """Return the loss of a batch."""
-        return self._lesson.loss(self._frames.batch(random.integers(len(self._frames), size=self._plan.batch)))
-
     def _tell(self, step: int, loss: float) -> None:
-        self._context.tell(f"step {step} of {self._settings.steps}, loss {loss:.4g}", step / self._settings.steps)
+        words = [f"step {step} of {self._settings.steps}", f"loss {loss:.4g}", self._success, self._forecast.left(step)]
+        self._context.tell(", ".join(filter(None, words)), step / self._settings.steps)
+        self._events.add(step, {"loss": self._trainer.losses[-1], "learning rate": self._settings.rate(step - 1)})

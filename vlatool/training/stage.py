@@ -5,20 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, require
+from vlatool.bundle.bundle import REPORTS, Bundle
+from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.work import forget, work_directory
 from vlatool.machine import host
 from vlatool.module.edits import is_changed
 from vlatool.module.stage import TRAINING, Changed, ModuleStage
 from vlatool.stage.base import Context, source_of
 from vlatool.stage.cache import STREAMS
-from vlatool.training.loop import Settings, has_bfloat16
+from vlatool.training.crew import crew_of
+from vlatool.training.events import check_events
+from vlatool.training.loop import Settings, has_bfloat16, seconds_of
+from vlatool.training.report import write_training_report
 from vlatool.training.session import Lesson, Plan, Session
 from vlatool.training.teacher import Teacher
 
@@ -42,7 +45,7 @@ class TrainingStage(ModuleStage):
 
     changed_first: ClassVar[bool] = True
     """Whether a policy that is as its factory makes it has nothing to learn."""
-
+    trains: ClassVar[bool] = True
     teacher: Path | None = Field(
         None, description="source bundle of the teacher; the policy before any edit when empty"
     )
@@ -60,7 +63,12 @@ class TrainingStage(ModuleStage):
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="of matrix products in training; bfloat16 where the processor has it"
     )
-    threads: int = Field(0, ge=0, description="of torch; all cores of this process when 0")
+    threads: int = Field(0, ge=0, description="of torch, over all processes; all cores of this process when 0")
+    processes: int = Field(1, ge=1, le=64, description="that share each batch, and the threads")
+    accumulate: int = Field(1, ge=1, description="parts of a batch that follow each other: less memory, the same loss")
+    patience: int = Field(
+        0, ge=0, description="stop when so many rounds in a row were no better (success, or held-out loss); 0 for never"
+    )
 
     def inputs(self) -> tuple[Path, ...]:
         """The teacher's manifest."""
@@ -69,7 +77,15 @@ class TrainingStage(ModuleStage):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """No episode of the training is one of the evaluation's, and the teacher is another policy."""
         super().check(source, profile)
-        last = self.first_seed + self.episodes + len(self.pauses()) * self.student_episodes
+        parts = self.processes * self.accumulate
+        if self.batch < parts:
+            raise RecipeError(
+                f"A batch of {self.batch} cannot be split into {parts} parts (processes {self.processes}, accumulate "
+                f"{self.accumulate}).",
+                "take a larger --batch, or fewer parts",
+            )
+        rounds = len(self.pauses()) + bool(self.patience)
+        last = self.first_seed + self.episodes + rounds * self.student_episodes
         if self.first_seed < EVALUATION_SEEDS < last:
             raise RecipeError(
                 f"The episodes to train on take the seeds {self.first_seed} to {last}; evaluations begin at "
@@ -83,8 +99,9 @@ class TrainingStage(ModuleStage):
             )
 
     def pauses(self) -> list[int]:
-        """Return before which steps the student plays."""
-        return list(range(self.every, round(self.steps * LAST_SHARE), self.every)) if self.student_episodes else []
+        """Return before which steps the student plays, or is judged on recorded observations."""
+        looks = self.student_episodes or self.patience
+        return list(range(self.every, round(self.steps * LAST_SHARE), self.every)) if looks else []
 
     def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
         """Return what the student does with a batch, and how far that is from what the teacher says of it."""
@@ -103,6 +120,8 @@ class TrainingStage(ModuleStage):
         return (
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
+            *_judged(training.get("judged")),
+            *([f"loss curve: {page}"] if (page := made.path / REPORTS / "report.html").is_file() else []),
             *super().lines(made),
         )
 
@@ -110,26 +129,64 @@ class TrainingStage(ModuleStage):
         """Train the modules in place."""
         torch = require("torch", "build")
         before = torch.get_num_threads()
-        torch.set_num_threads(self.threads or before)
+        torch.set_num_threads(max(1, (self.threads or before) // self.processes))
         try:
             with work_directory(self._place(source)) as place:
                 return self._trained(modules, source, place, context)
+        except OSError as error:  # of what is kept until the bundle is written, not of the bundle
+            where = error.filename or self._place(source)
+            raise OutputError(
+                f"The training cannot be kept: {where}: {error.strerror or error}.",
+                "make room there, or name another cache (VLATOOL_CACHE); the same command goes on from its last "
+                "checkpoint",
+            ) from error
         finally:
             torch.set_num_threads(before)
 
     def _trained(self, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context) -> Changed:
+        teacher, lesson = self.prepared(modules, source)
+        with crew_of(self._job(source), self.processes, place, self.runs(source)) as crew:
+            session = Session(self.plan(), self.settings(), lesson, source, teacher, place, context, crew)
+            return Changed(training=session.run())
+
+    def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
+        """Return the teacher of a student's modules, and what it teaches; every process of a training has its own."""
         teacher = Teacher.of(source, self.teacher, modules)
+        return teacher, self.lesson(modules, source, teacher)
+
+    def settings(self) -> Settings:
+        """Return how long and how fast is trained."""
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_bfloat16(host.isa()))
-        settings = Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, bfloat16)
-        plan = Plan(self.batch, self.episodes, self.student_episodes, self.pauses(), self.noise, self.first_seed)
-        lesson = self.lesson(modules, source, teacher)
-        return Changed(training=Session(plan, settings, lesson, source, teacher, place, context).run())
+        return Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, bfloat16)
+
+    def plan(self) -> Plan:
+        """Return what is played when."""
+        played = (self.batch, self.episodes, self.student_episodes, self.pauses(), self.noise, self.first_seed)
+        return Plan(*played, self.patience, self.accumulate)
+
+    def _job(self, source: Bundle) -> dict[str, Any]:
+        """Return what another process of the training needs to know."""
+        threads = require("torch", "build").get_num_threads()
+        options = self.model_dump(mode="json")
+        return {"stage": self.name(), "options": options, "source": str(source.path.absolute()), "threads": threads}
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Train; what a run that is killed goes on from is there until the result is written."""
+        if context.events:
+            check_events(context.events)
         made = super().run(source, out, context)
-        forget(self._place(source_of(source, self.name())))
+        place = self._place(source_of(source, self.name()))
+        write_training_report(made, seconds_of(place), context.command)
+        forget(place)
         return made
 
     def _place(self, source: Bundle) -> Path:
         return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+
+
+def _judged(judged: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """Say by what the weights were chosen, if they were."""
+    if judged is None:
+        return ()
+    scores = ", ".join(f"{score:.4g}" for score in judged["scores"])
+    return (f"the weights of step {judged['best_step']} did best, by {judged['by']}: {scores}",)

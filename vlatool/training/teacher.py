@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import ASSETS, Bundle
+from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import RecipeError, SourceError
 from vlatool.module.batched import BatchedProgram
 from vlatool.module.edits import Edit, read_edits
 from vlatool.module.origin import origin_of
 from vlatool.module.torch_policy import load_modules, unedited_modules
+from vlatool.runtime.statistics import load_normaliser
 
 if TYPE_CHECKING:
     from torch import nn
@@ -76,21 +78,64 @@ def _check_apart(teacher: Mapping[str, nn.Module], student: Mapping[str, nn.Modu
 
 
 def _check_fits(teacher: Bundle, student: Bundle) -> None:
-    """Refuse a teacher that sees or does something else."""
+    """Refuse a teacher that sees or does something else: both are given the same encoded observations and noise."""
     for ours, theirs, what in (
         (student.manifest.spec.inputs, teacher.manifest.spec.inputs, "is given"),
         (student.manifest.spec.outputs, teacher.manifest.spec.outputs, "gives"),
     ):
-        wanted = {tensor.name: (tensor.kind, tensor.shape, tensor.dtype, tensor.labels) for tensor in ours}
-        other = {tensor.name: (tensor.kind, tensor.shape, tensor.dtype, tensor.labels) for tensor in theirs}
+        wanted, other = ({tensor.name: tensor for tensor in tensors} for tensors in (ours, theirs))
         for name in sorted({*wanted, *other}):
-            if wanted.get(name) != other.get(name):
-                raise RecipeError(
-                    f"The teacher {what} '{name}' as {_shown(other.get(name))}, the student as "
-                    f"{_shown(wanted.get(name))}; they must agree.",
-                    "take a teacher with the same inputs and outputs",
-                )
+            _check_same(what, name, _form(other.get(name)), _form(wanted.get(name)))
+        for name, tensor in wanted.items():
+            _check_units(name, (other[name], teacher), (tensor, student))
+    drawn, given = (_noise(bundle) for bundle in (student, teacher))
+    for name in drawn:
+        _check_same("draws", name, given.get(name), drawn[name])
 
 
-def _shown(tensor: Any) -> str:
-    return "nothing" if tensor is None else f"{tensor[0]} {list(tensor[1])} {tensor[2]}"
+def _check_same(what: str, name: str, teacher: str | None, student: str | None) -> None:
+    if teacher != student:
+        raise RecipeError(
+            f"The teacher {what} '{name}' as {teacher or 'nothing'}, the student as {student or 'nothing'}; they must "
+            "agree.",
+            "take a teacher with the same inputs and outputs",
+        )
+
+
+def _form(tensor: TensorSpec | None) -> str | None:
+    if tensor is None:
+        return None
+    labels = f" of {', '.join(tensor.labels)}" if tensor.labels else ""
+    return f"{tensor.kind} {list(tensor.shape)} {tensor.dtype}{labels}"
+
+
+def _check_units(name: str, teacher: tuple[TensorSpec, Bundle], student: tuple[TensorSpec, Bundle]) -> None:
+    """Refuse what has the same form, and means something else."""
+    for what in (_unit, _statistics, _vocabulary):
+        if what(*teacher) != what(*student):
+            raise RecipeError(
+                f"The teacher and the student have another {(what.__doc__ or '').rstrip('.').lower()} for '{name}': "
+                "what one of them is given, or gives, means something else to the other.",
+                "take a teacher with the same units, statistics and tokenizer",
+            )
+
+
+def _unit(tensor: TensorSpec, _bundle: Bundle) -> Any:
+    """Unit or mode."""
+    return tensor.units(), tensor.mode
+
+
+def _statistics(tensor: TensorSpec, bundle: Bundle) -> Any:
+    """Normalisation."""
+    normaliser = load_normaliser(tensor, bundle)
+    return None if normaliser is None else (normaliser.offset.tolist(), normaliser.scale.tolist())
+
+
+def _vocabulary(tensor: TensorSpec, bundle: Bundle) -> Any:
+    """Vocabulary."""
+    return bundle.manifest.files[f"{ASSETS}/{tensor.tokenizer}"].sha256 if tensor.tokenizer else ""
+
+
+def _noise(bundle: Bundle) -> dict[str, str]:
+    """Return what a program draws: name -> shape and distribution."""
+    return {name: str(dict(wanted)) for step in bundle.manifest.program for name, wanted in step.noise.items()}

@@ -109,7 +109,7 @@ def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Ax
     canvas.up(scale, LEFT, right, {value: tick(value) for value in scale.ticks(4)})
     most = 180 if canvas.width > 500 else 90
     bins = max(20, min(most, len(variant.samples) // 12))
-    _bands(canvas, envelope(times, variant.samples, bins), across, scale, variant.css)
+    draw_bands(canvas, envelope(times, variant.samples, bins), across, scale, variant.css)
     if aim.limit is not None and scale.holds(aim.limit):
         canvas.line(LEFT, scale(aim.limit), right, scale(aim.limit), "limit")
     calls = f"n = {fixed(len(variant.samples), 0)}"
@@ -117,7 +117,8 @@ def panel(canvas: Canvas, variant: Sampled, aim: Latency, top: float, across: Ax
     canvas.heading(top + 14, right, variant.name, numbers, f"name ink halo {variant.css}")
 
 
-def _bands(canvas: Canvas, bands: Sequence[Band], across: Axis, scale: Axis, css: str) -> None:
+def draw_bands(canvas: Canvas, bands: Sequence[Band], across: Axis, scale: Axis, css: str) -> None:
+    """Draw the median of each stretch as a line, and its spread as bands."""
     centres = [across(band.at) for band in bands]
     for css_of, top, bottom in (("outer", "high", "low"), ("band", "upper", "lower")):
         edges = ([scale(getattr(band, end)) for band in bands] for end in (top, bottom))
@@ -132,6 +133,6 @@ def _gauge(canvas: Canvas, gauge: Gauge, top: float, across: Axis) -> None:
     scale = axis_for([low, high], top + GAUGE_PANEL - 8, top + 22, pad=0.08)
     unit = UNITS.get(gauge.unit, plain(gauge.unit))
     bands = envelope(gauge.times, gauge.values, min(len(gauge.values), 120 if canvas.width > 500 else 60))
-    _bands(canvas, bands, across, scale, "s-gauge")
+    draw_bands(canvas, bands, across, scale, "s-gauge")
     numbers = f"{significant(low)}–{significant(high)} {unit}".rstrip()
     canvas.heading(top + 14, canvas.width - RIGHT, gauge.name, numbers, "note halo")

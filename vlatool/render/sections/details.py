@@ -8,7 +8,7 @@ from vlatool.render._view import ABSENT, ranks_boards
 from vlatool.render.cells import records_table
 from vlatool.render.document import Section, Table
 from vlatool.render.sections.parts import PARTS
-from vlatool.report import Report
+from vlatool.report import TRAINED, Report
 
 
 class Details:
@@ -23,5 +23,5 @@ class Details:
 def tables(report: Report) -> list[Table]:
     """Return the tables, that of the telemetry first."""
     titles = dict.fromkeys(("telemetry", *(title for row in report.rows for title in row.details)))
-    shown = (title for title in titles if title not in (ABSENT, *PARTS))
+    shown = (title for title in titles if title not in (ABSENT, *PARTS) and not title.startswith(TRAINED))
     return [table for title in shown if (table := records_table(report, title))]

@@ -1,0 +1,64 @@
+"""How variants were trained: the loss of every step, who acted in which round, and what it took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+from vlatool.render._format import cell, plain, significant
+from vlatool.render.cells import number, records_table, texts
+from vlatool.render.charts.losses import Curve, loss_curve
+from vlatool.render.charts.samples import finite
+from vlatool.render.charts.svg import tinted
+from vlatool.render.document import MISSING, Block, Chart, Column, Line, Section, Table
+from vlatool.report import TRAINED, TRAINING_TIME, Report
+
+CAPTION = (
+    "Line: median of consecutive steps; bands: the middle 80 %, and smallest to largest. Vertical lines: rounds of "
+)
+CAPTION += "episodes that were added."
+COLUMNS = (("training", False), ("steps", True), ("loss at the start", True), ("at the end", True),
+           ("success in the last round", True), ("time", True))  # fmt: skip
+
+
+class Training:
+    """A table of all trainings, then the curve and the rounds of each."""
+
+    def build(self, report: Report) -> Iterator[Section]:
+        """Return one section, when any variant was trained."""
+        names = sorted({name for row in report.rows for name in row.raw if name.startswith(TRAINED)})
+        curves = {curve.name: curve for name in names for curve in _curves(report, name)}
+        if not curves:
+            return
+        blocks: list[Block] = [_table(report, names)]
+        blocks += [
+            Chart(partial(loss_curve, curve, str(place)), CAPTION) for place, curve in enumerate(curves.values())
+        ]
+        blocks += [table for name in names if (table := records_table(report, name))]
+        yield Section("Training", tuple(blocks), 85, "measured", brief=False)
+
+
+def _curves(report: Report, name: str) -> Iterator[Curve]:
+    """Yield the training of that name of every variant that had it."""
+    for row, css in tinted(report.rows):
+        losses = finite(row.raw.get(name) or [])
+        if len(losses) > 1:
+            rounds = [int(one.get("before step") or 0) for one in row.details.get(name, ())]
+            yield Curve(_title(row.name, name), losses, [step for step in rounds if step > 1], css)
+
+
+def _title(variant: str, name: str) -> str:
+    return f"{plain(variant)}: {plain(name.removeprefix(TRAINED))}"
+
+
+def _table(report: Report, names: list[str]) -> Table:
+    lines = []
+    for name in names:
+        for row, curve in ((row, curve) for row in report.rows for curve in _curves(report, name)
+                           if curve.name == _title(row.name, name)):  # fmt: skip
+            played = [one["success"] for one in row.details.get(name, ()) if one.get("success")]
+            first, last = map(significant, curve.ends)
+            words = texts((curve.name, str(len(curve.losses)), first, last, cell(played[-1]) if played else ""))
+            took = row.get(name.replace(TRAINED, TRAINING_TIME))
+            lines.append(Line((*words, number(took) if took else MISSING)))
+    return Table(tuple(Column(title, numeric) for title, numeric in COLUMNS), tuple(lines))

@@ -1,0 +1,124 @@
+"""The other processes of a training: started, told what to do, and ended by the first one."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent import futures
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from vlatool.errors import SourceError, VlatoolError
+from vlatool.training.group import LOST, Group, joined_group
+from vlatool.user_code.children import Apart
+
+HERE = "vlatool.training.peer"
+GRACE_S = 5.0
+"""Seconds in which a process that was lost says how, before the others are ended."""
+MEETING = "meeting"
+"""File through which the processes find each other, in the folder of the training."""
+PRELOAD = ("torch", HERE)
+AGAIN = "run the same command again: it goes on from the last checkpoint"
+
+
+class Crew:
+    """Other processes that take the same steps with other rows; none where the training is one process.
+
+    Args:
+        children: Processes with the ranks from 1 on.
+        threads: One for each, which waits for it.
+    """
+
+    def __init__(self, children: Sequence[Apart] = (), threads: ThreadPoolExecutor | None = None) -> None:
+        self.group = Group(0, len(children) + 1)
+        self._children, self._threads = children, threads
+        self._errors: list[BaseException] = []
+
+    @contextlib.contextmanager
+    def training(self, rounds: int, until: int) -> Iterator[None]:
+        """Let the others train, too, while the block does.
+
+        Args:
+            rounds: How many rounds of rows there are.
+            until: Number of the step to stop before.
+
+        Raises:
+            VlatoolError: what one of them met, or how it ended.
+        """
+        with self.calling("train", {"rounds": rounds, "until": until}):
+            yield
+
+    @contextlib.contextmanager
+    def calling(self, function: str, job: Mapping[str, Any]) -> Iterator[None]:
+        """Call a function of ``peer`` in all others while the block runs.
+
+        Raises:
+            VlatoolError: as ``training``.
+        """
+        calls = [self._submit(child, function, {**job, "rank": rank}) for rank, child in enumerate(self._children, 1)]
+        try:
+            yield
+        except SourceError as error:
+            if error.message != LOST:
+                raise
+            self._end(calls)
+            raise self._cause(error) from error
+        if self._end(calls, wait=True):
+            raise self._cause(self._errors[0])
+
+    def _submit(self, child: Apart, function: str, job: Mapping[str, Any]) -> Future[None]:
+        if self._threads is None:
+            raise RuntimeError("a crew of several has threads")
+        return self._threads.submit(self._call, child, function, job)
+
+    def _call(self, child: Apart, function: str, job: Mapping[str, Any]) -> None:
+        try:
+            child.call(f"{HERE}:{function}", job, lambda _what, _share: None)
+        except BaseException as error:  # told in the first process; the others wait for this one in vain
+            self._errors.append(error)
+            child.end()
+
+    def _end(self, calls: Sequence[Future[None]], *, wait: bool = False) -> bool:
+        """Wait for all calls, ending the processes first unless they shall come to an end; say whether any failed."""
+        if not wait:  # the one that was lost is about to say how it ended
+            futures.wait(calls, timeout=GRACE_S, return_when=futures.FIRST_COMPLETED)
+        for child in () if wait else self._children:
+            child.end()
+        for call in calls:
+            call.result()
+        return bool(self._errors)
+
+    def _cause(self, error: BaseException) -> BaseException:
+        """Return the error that came first, not one of those that followed from it; of a kill, how to go on."""
+        first = next((each for each in self._errors if LOST not in str(each)), error)
+        if not isinstance(first, VlatoolError) or "(SIG" not in first.message:
+            return first
+        return type(first)(first.message, "; ".join(filter(None, (first.fix, AGAIN))))
+
+
+@contextlib.contextmanager
+def crew_of(job: Mapping[str, Any], size: int, place: Path, about: str) -> Iterator[Crew]:
+    """Yield the crew of a training, each process with the student loaded, and this one among them.
+
+    Args:
+        job: What ``peer.join`` needs to know.
+        size: How many processes there are with this one.
+        place: Folder of the training.
+        about: Whose code they run.
+    """
+    if size == 1:
+        yield Crew()
+        return
+    meeting = place / MEETING
+    meeting.unlink(missing_ok=True)
+    with contextlib.ExitStack() as opened:
+        threads = opened.enter_context(ThreadPoolExecutor(size - 1))
+        names = (f"{about}, process {rank + 1} of {size}" for rank in range(1, size))
+        children = [opened.enter_context(Apart(name, PRELOAD)) for name in names]
+        crew = Crew(children, threads)
+        with crew.calling("load", {**job, "place": str(place), "size": size}):
+            pass
+        with crew.calling("join", {}):
+            opened.enter_context(joined_group(meeting, crew.group))
+        yield crew

@@ -1,0 +1,109 @@
+"""Processes that train one student together: each takes its share of every batch, and gradients are added up.
+
+Modules are not wrapped (``DistributedDataParallel`` hooks into ``forward``, and a program calls modules many times, row
+by row, or traces them again): every process has the same weights, adds its gradients to those of the others after
+``backward``, and takes the same step. Sums are the same bits in all processes, so the weights stay equal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vlatool.errors import SourceError, require
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+LOST = "Another process of the training is gone."
+INTERFACE = "GLOO_SOCKET_IFNAME"
+
+
+@dataclass(frozen=True)
+class Group:
+    """Which of the processes this one is.
+
+    Args:
+        rank: Its number; the first one, 0, plays, labels and writes.
+        size: How many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+
+    def summed(self, loss: float, weights: Sequence[Tensor]) -> float:
+        """Replace gradients by their sums over all processes; return the sum of the losses.
+
+        A weight that got no gradient anywhere has none afterwards.
+
+        Raises:
+            SourceError: when another process is gone.
+        """
+        if self.size == 1:
+            return loss
+        try:
+            return _summed(loss, weights)
+        except RuntimeError as error:
+            raise SourceError(LOST) from error
+
+
+def _summed(loss: float, weights: Sequence[Tensor]) -> float:
+    torch = require("torch", "build")
+    has = [float(value.grad is not None) for value in weights]
+    numbers = torch.tensor([loss, *has], dtype=torch.float64)
+    torch.distributed.all_reduce(numbers)
+    used = [value for value, count in zip(weights, numbers[1:].tolist(), strict=True) if count]
+    for value in used:
+        if value.grad is None:
+            value.grad = torch.zeros_like(value)
+    for dtype in dict.fromkeys(value.dtype for value in used):
+        _add_up([value.grad for value in used if value.dtype == dtype and value.grad is not None])
+    return float(numbers[0])
+
+
+def _add_up(gradients: Sequence[Tensor]) -> None:
+    """Replace gradients of one dtype by their sums, in one message."""
+    torch = require("torch", "build")
+    flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+    torch.distributed.all_reduce(flat)
+    for gradient, total in zip(gradients, flat.split([gradient.numel() for gradient in gradients]), strict=True):
+        gradient.copy_(total.view_as(gradient))
+
+
+@contextlib.contextmanager
+def joined_group(meeting: Path, group: Group) -> Iterator[None]:
+    """Be one of the processes of a group within the block; all of them must come.
+
+    Args:
+        meeting: A file through which they find each other; it must be new.
+        group: Which one this is.
+    """
+    if group.size == 1:
+        yield
+        return
+    distributed = require("torch.distributed", "build")
+    with _on_this_machine():
+        store = distributed.FileStore(str(meeting), group.size)
+        distributed.init_process_group("gloo", store=store, rank=group.rank, world_size=group.size)
+    try:
+        yield
+    finally:
+        distributed.destroy_process_group()
+
+
+@contextlib.contextmanager
+def _on_this_machine() -> Iterator[None]:
+    """Let gloo listen where no other machine reaches it."""
+    names = [name for _, name in socket.if_nameindex() if name.startswith("lo")]
+    before = os.environ.get(INTERFACE)
+    os.environ.update({INTERFACE: names[0]} if names else {})
+    try:
+        yield
+    finally:
+        os.environ.pop(INTERFACE, None)
+        os.environ.update({INTERFACE: before} if before is not None else {})

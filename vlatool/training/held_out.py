@@ -1,0 +1,98 @@
+"""Recorded observations that a training does not learn from: where nobody plays, their loss says when to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import Recording, calibration_recording
+from vlatool.errors import DataError, require
+from vlatool.training.frames import Frames
+from vlatool.training.rounds import Counted, next_round
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FOLDER = "held-out"
+SHARE = 0.1
+"""Of the episodes, or of the stretches where episodes are not recorded."""
+STRETCHES = 20
+"""Parts of a recording without episodes: neighbours look alike, and stay together."""
+
+
+class HeldOut:
+    """The recorded observations in two: one part to learn from, one to judge with.
+
+    Args:
+        place: Folder of the training.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self._frames = Frames(place / FOLDER)
+        self._others: Recording | None = None
+
+    @property
+    def others(self) -> Counted:
+        """Return the observations to learn from."""
+        if self._others is None:
+            raise RuntimeError("prepare() comes first")
+        return self._others
+
+    def prepare(self, source: Bundle, most: int, write: Callable[[Counted, Path], None]) -> None:
+        """Split the recording, and write what is held out unless an earlier run did.
+
+        Args:
+            source: The student's bundle.
+            most: Observations that are used of it.
+            write: Called with observations and the folder for them.
+
+        Raises:
+            DataError: when there are not two observations to split.
+        """
+        recording = calibration_recording(source)
+        if recording is None or len(recording) < 2:
+            raise DataError(
+                f"--patience needs something to judge with: episodes of the student's, or two recorded observations; "
+                f"there are {len(recording) if recording else 0}.",
+                "record some (calibration: FILE.npz in policy.yaml), name an environment there, or omit --patience",
+            )
+        used = np.zeros(len(recording), np.bool_)
+        used[recording.spread(most)] = True
+        recording = recording.only(used)
+        held = held_out(recording)
+        self._others = recording.only(~held)
+        next_round(self._frames, 0, partial(write, recording.only(held)))
+
+    def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
+        """Return the mean loss of what is held out.
+
+        Args:
+            loss: Of a batch.
+            rows: At a time.
+            bfloat16: Whether matrix products are computed so, as in training.
+        """
+        torch, total = require("torch", "build"), 0.0
+        parts = np.array_split(np.arange(len(self._frames)), -(-len(self._frames) // rows))
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            for part in parts:
+                total += float(loss(self._frames.batch(part))) * len(part)
+        return total / len(self._frames)
+
+
+def held_out(recording: Recording) -> NDArray[np.bool_]:
+    """Say of each observation whether it is held out: whole episodes where there are two or more, else stretches."""
+    size = len(recording)
+    groups = recording.episodes
+    if groups is None or len(np.unique(groups)) < 2:
+        groups = np.arange(size) * min(STRETCHES, size) // size
+    names, firsts = np.unique(groups, return_index=True)
+    ordered = names[np.argsort(firsts)]
+    count = max(1, round(len(ordered) * SHARE))
+    places = np.linspace(0, len(ordered) - 1, count + 2)[1:-1].round().astype(int) if len(ordered) > 2 else [1]
+    return np.isin(groups, ordered[places])

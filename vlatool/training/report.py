@@ -1,0 +1,56 @@
+"""How a training went, as a report beside the bundle: it holds times, and is no part of the bundle's identity."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime, timezone
+from typing import Any
+
+from vlatool.bundle.bundle import REPORTS, Bundle
+from vlatool.machine.host import fingerprint
+from vlatool.module.stage import TRAINING
+from vlatool.render import write_reports
+from vlatool.report import TRAINED, TRAINING_TIME, Measurement, Report, Row
+from vlatool.training.forecast import duration
+
+Record = dict[str, Any]
+
+
+def write_training_report(made: Bundle, seconds: float, command: str) -> None:
+    """Write ``reports/`` of a bundle that was trained.
+
+    Args:
+        made: With ``module/training.json``.
+        seconds: What the training took, on the wall clock.
+        command: The command line.
+
+    Raises:
+        OSError: when it cannot be written.
+    """
+    training = json.loads(made.file(TRAINING).read_bytes())
+    stage = str(made.manifest.made_by["stage"])
+    losses, steps = training["losses"], len(training["losses"])
+    took = Measurement(f"{TRAINING_TIME}{stage}", seconds, "s")
+    row = Row(
+        made.manifest.name,
+        measurements=(took,),
+        raw={f"{TRAINED}{stage}": losses},
+        details={f"{TRAINED}{stage}": [_round(round_) for round_ in training["rounds"]]},
+    )
+    few = max(1, steps // 20)
+    first, last = sum(losses[:few]) / few, sum(losses[-few:]) / few
+    result = f"{training['loss']} {first:.4g} -> {last:.4g} in {steps} steps and {duration(seconds)}."
+    report = Report(
+        "training", f"{made.manifest.name}: {stage}", summary=(result,), rows=(row,), command=command,
+        created=datetime.now(timezone.utc).isoformat(timespec="seconds"), environment=fingerprint(),
+    )  # fmt: skip
+    write_reports(report, made.path / REPORTS)
+
+
+def _round(about: Record) -> Record:
+    """Return what a person wants to know of a round."""
+    episodes = about.get("episodes")
+    success = f"{about['successes'] / episodes:.1%}" if episodes else None
+    who = about["actor"] if episodes else "recordings"
+    return {"before step": about["step"] + 1, "who acted": who, "episodes": episodes, "success": success,
+            "observations": about["observations"]}  # fmt: skip
