@@ -176,6 +176,26 @@ def test_the_policys_own_description_says_what_runs(mine, bundle, source, says: 
     assert not ran(mine)
 
 
+def test_a_package_that_a_trusted_description_names_may_run(
+    policy_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "site" / "installed_policy"
+    shutil.copytree(policy_dir, package)
+    (package / "policy.py").rename(package / "__init__.py")
+    monkeypatch.syspath_prepend(package.parent)
+    described = (policy_dir / "policy.yaml").read_text()
+    (policy_dir / "policy.yaml").write_text(described.replace("policy.py:make", "installed_policy:make"))
+    (tmp_path / "bundle").mkdir()
+    with trust.nothing_named():
+        bundle = TorchModule(policy=policy_dir).run(None, tmp_path / "bundle", Context())
+    with pytest.raises(SourceError, match="you did not"):
+        load_modules(bundle)
+    trust.trust(policy_dir)
+    assert "main" in load_modules(bundle)
+    with pytest.raises(SourceError, match="the description in .* does not name"):
+        load_modules(forged(bundle, factory="installed_policy:other"))
+
+
 @pytest.mark.parametrize("folder", ["mine/../other", "relative", "/a/../b", "", "/a\0b", 3, ["/a"]])
 def test_a_place_that_is_no_absolute_path_is_refused(bundle, folder) -> None:
     (bundle.path / LOCATION).write_text(json.dumps({"folder": folder}))

@@ -107,7 +107,8 @@ def origin_of(bundle: Bundle) -> Origin:
     where, function = split_factory(factory)
     named = trust.require(folder, f"{function}() of {where}")
     described = read_description(Path(named.description) if named.description else folder)
-    if factory not in (described.factory, named.factory) or named.remembered:
+    installed = factory == described.factory and factory_file(factory, folder) is None
+    if not installed and (named.remembered or factory not in (described.factory, named.factory)):
         _check_own(factory, folder, bundle)
     own = {"arguments": json.loads(json.dumps(described.arguments, default=str)), "weights": described.weights}
     for key in own:
