@@ -192,7 +192,7 @@ def test_a_package_that_a_trusted_description_names_may_run(
         load_modules(bundle)
     trust.trust(policy_dir)
     assert "main" in load_modules(bundle)
-    with pytest.raises(SourceError, match="the description in .* does not name"):
+    with pytest.raises(SourceError, match=r"the description in .* does not name"):
         load_modules(forged(bundle, factory="installed_policy:other"))
 
 
