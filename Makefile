@@ -33,7 +33,7 @@ $(VENV)/.dev: $(BIN)/vlatool
 demo: $(BIN)/vlatool  ## optimise the sample policy vln-babyai for a Raspberry Pi 5, with a report
 	$(BIN)/vlatool optimize sample_models/vln-babyai --profile raspberry-pi-5 --max-drop 1% --episodes 1500 -o $(OUT)/vln-babyai --force
 
-metaworld: $(BIN)/vlatool  ## install what the sample policy vla-metaworld needs
+metaworld: $(BIN)/vlatool  ## install what the sample policies vla-metaworld and vla-flow need
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,metaworld]'
 	@ldconfig -p | grep -q libEGL.so.1 || apt-get install -y -qq $(SYSTEM_PACKAGES) || \
 	  echo "headless rendering needs the system packages $(SYSTEM_PACKAGES)"

@@ -165,11 +165,10 @@ def run_job(job: Job) -> Frames:
 
 def _load_runner(folder: Path) -> Callable:
     import torch
-    from policy import make
-    from runtime import Runner
+    from acting import load_runner
 
     torch.set_num_threads(1)
-    return Runner.load(make(folder / "weights.safetensors"), folder)
+    return load_runner(folder)
 
 
 def collect(

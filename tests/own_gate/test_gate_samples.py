@@ -57,8 +57,8 @@ def test_a_gate_that_cannot_run_ends_the_run(float_bundle, int8_bundle, tmp_path
     assert ended.value.code == 3
 
 
-@pytest.mark.parametrize("sample", ["vln-babyai", "vla-metaworld"])
-def test_both_samples_have_a_gate(sample):
+@pytest.mark.parametrize("sample", ["vln-babyai", "vla-metaworld", "vla-flow"])
+def test_every_sample_has_a_gate(sample):
     from pathlib import Path
 
     gate = read_gate(Path(__file__).parents[2] / "sample_models" / sample / "gate.yaml")

@@ -13,7 +13,7 @@ from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
 from vlatool.prune._ranking import stacks
-from vlatool.prune._selection import Selection
+from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune.depth import PROTECTED, Depth, spread
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform
@@ -83,7 +83,15 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
         Depth(samples=2).change(modules, source_bundle, Context())
     chosen = Depth(samples=2, include=("action_expert",)).change(modules, source_bundle, Context()).edits
     assert len(chosen[0].keep) == 2
+    parts = {"action_head": ["trunk2", "trunk2.*"], "fusion": ["trunk3"]}
+    of_parts = Selection((), (), PROTECTED, protected_parts(parts, PROTECTED))
+    assert of_parts.protects("trunk2")
+    assert of_parts.protects("trunk2.blocks")
+    assert not of_parts.protects("trunk3")
+    assert not of_parts.has(("trunk2.blocks",))
+    assert Selection(("trunk2.blocks",), (), PROTECTED, of_parts.parts).has(("trunk2.blocks",))
     protects = Selection((), (), PROTECTED).protects
+    assert protects("model.lm_expert.layers")
     assert protects("model.vision_tower.layers")
     assert protects("ActionHead.blocks")
     assert not protects("fusion")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from vlatool.errors import RecipeError, nearest
@@ -16,11 +16,13 @@ class Selection:
     Args:
         include, exclude: Globs of names; everything that is not protected when nothing is included.
         protected: Words in names of what stays unless it is included.
+        parts: Globs of what stays unless it is included, whatever it is called.
     """
 
     include: tuple[str, ...]
     exclude: tuple[str, ...]
     protected: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
 
     def check(self, names: Sequence[str], what: str) -> None:
         """Refuse a pattern that matches nothing.
@@ -40,4 +42,18 @@ class Selection:
 
     def protects(self, name: str) -> bool:
         """Return whether a part stays unless it is included."""
-        return any(word in part for part in name.lower().split(".") for word in self.protected)
+        return _has_word(name, self.protected) or matches(name, self.parts)
+
+
+def protected_parts(parts: Mapping[str, Sequence[str]], words: Sequence[str]) -> tuple[str, ...]:
+    """Return the globs of the parts in a policy's description whose names say that they are protected.
+
+    Args:
+        parts: Name of a part, such as ``action_head`` -> globs of modules.
+        words: Of which one is in the name.
+    """
+    return tuple(pattern for name, globs in parts.items() if _has_word(name, words) for pattern in globs)
+
+
+def _has_word(name: str, words: Sequence[str]) -> bool:
+    return any(word in part for part in name.lower().split(".") for word in words)

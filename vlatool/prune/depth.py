@@ -13,7 +13,7 @@ from vlatool.errors import RecipeError
 from vlatool.module.edits import BLOCKS, Edit
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._ranking import Place, Ranking, Stack, stacks
-from vlatool.prune._selection import Selection
+from vlatool.prune._selection import Selection, protected_parts
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
     from vlatool.hardware.profile import Profile
 
-PROTECTED = ("vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action")
+PROTECTED = (
+    "vision", "visual", "image", "vit", "encoder", "projector", "connector", "head", "decoder", "action", "expert"
+)  # fmt: skip
 """Parts of module names whose blocks stay unless --include names them: what sees and what acts is less redundant than
 the trunk between: with two of its action blocks left, pi0.5 succeeds in 26 %, with as few others in 91 % (DTR, arXiv
 2606.27755)."""
@@ -134,7 +136,7 @@ class Depth(ModuleStage):
                 "class, each of which gives what it takes.",
                 "prune widths instead: vlatool prune neurons",
             )
-        selection = Selection(self.include, self.exclude, PROTECTED)
+        selection = Selection(self.include, self.exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
         selection.check(names, "stack of blocks")
         chosen = {(graph, name): size for (graph, name), size in sizes.items() if selection.has((name,))}
         if not chosen:

@@ -18,7 +18,7 @@ from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._clock import Clock
 from vlatool.prune._prices import Stack, edits_of, is_gone, measured_prices, role_of
 from vlatool.prune._ranking import Ranking, stacks
-from vlatool.prune._selection import Selection
+from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.prune.depth import PROTECTED
 from vlatool.stage.base import Context
@@ -79,7 +79,7 @@ class LatencyPruning(ModuleStage):
         """Return the stacks that may lose blocks."""
         if not self.blocks or self.rank != "gate":
             return []
-        selection = Selection((), self.exclude, PROTECTED)
+        selection = Selection((), self.exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
         sizes = {(graph, name): len(stack) for graph, module in modules.items() for name, stack in stacks(module)
                  if selection.has((name,))}  # fmt: skip
         scores = Ranking(modules, source, self.samples).gate(
