@@ -18,6 +18,7 @@ def plan_document(plan: Plan) -> dict[str, Any]:
         "export": _stages(plan.export),
         "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
         "search": plan.recipe.search,
+        "pruning": plan.recipe.pruning.model_dump(mode="json"),
         "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
         "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
         "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),

@@ -22,8 +22,9 @@ from vlatool.runtime.engine import DEFAULT_ENGINE
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
     from vlatool.optimize.plan import Plan
-    from vlatool.optimize.recipe import Recipe
+    from vlatool.optimize.recipe import Pruning, Recipe
 
+TRAINS = "distill.policy"
 
 PolicySource = Annotated[
     str,
@@ -58,6 +59,13 @@ def optimize(
     search: Annotated[
         bool | None, typer.Option("--search/--no-search", help="search for faster plans (default without --recipe)")
     ] = None,
+    trials: Annotated[
+        int | None, typer.Option(min=0, help="policies to prune, train, quantize and try (0; needs the extra 'search')")
+    ] = None,
+    train_steps: Annotated[int | None, typer.Option(min=1, help="updates in the training of each trial (1500)")] = None,
+    study: Annotated[
+        str | None, typer.Option(help="file or database URL that keeps the trials, so that several machines share them")
+    ] = None,
     recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
     iterations: Annotated[int | None, typer.Option(min=20, help="timed inferences of each candidate (200)")] = None,
@@ -89,6 +97,7 @@ def optimize(
     asked = _limits(max_drop, max_distance, accept, limits)
     effort = {"episodes": episodes, "iterations": iterations, "threads": threads}
     chosen = _recipe(recipe, source, board, asked, {name: value for name, value in effort.items() if value is not None})
+    chosen = chosen.model_copy(update={"pruning": _pruning(chosen.pruning, trials, train_steps, study)})
     if search is not None:
         chosen = chosen.model_copy(update={"search": search})
     plan = make_plan(source, board, chosen, cache or cache_directory(), fresh=fresh)
@@ -135,6 +144,22 @@ def _recipe(
     recipe = read_recipe(file)
     update = {"limits": recipe.limits.model_copy(update=limits), "effort": recipe.effort.model_copy(update=effort)}
     return recipe.model_copy(update=update)
+
+
+def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str | None) -> Pruning:
+    """Return what a recipe says of trials with the options that were given.
+
+    Raises:
+        UsageError: for steps of a training that the recipe does not name.
+    """
+    update: dict[str, Any] = {"trials": trials, "study": study}
+    if steps is not None:
+        recover = [{name: {**(options or {}), "steps": steps} if name == TRAINS else options}
+                   for stage in pruning.recover for name, options in stage.items()]  # fmt: skip
+        if not any(TRAINS in stage for stage in recover):
+            raise UsageError(f"--train-steps is of {TRAINS}, which the recipe does not name under pruning.recover.")
+        update["recover"] = tuple(recover)
+    return pruning.model_copy(update={name: value for name, value in update.items() if value is not None})
 
 
 def _show_plan(plan: Plan, as_json: bool) -> None:

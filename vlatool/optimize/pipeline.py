@@ -1,9 +1,9 @@
 """``optimize``: export, quantize in several ways, measure and evaluate each, keep the fastest inside the limits.
 
 A run goes through the modules of this package in this order, and none of them imports a later one: ``recipe`` (what is
-asked), ``budget``, ``plan`` (checked before anything runs), ``search`` (further plans), ``timings`` and ``evidence``
-(what is measured), ``judge`` and ``choice`` (``choice_apart`` where engines cannot be compared), ``summary`` (the
-report).
+asked), ``budget``, ``plan`` (checked before anything runs), ``search`` (further plans), ``space``, ``study`` and
+``pruned`` (pruned and trained policies), ``timings`` and ``evidence`` (what is measured), ``judge`` and ``choice``
+(``choice_apart`` where engines cannot be compared), ``summary`` (the report).
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from vlatool.optimize.choice_apart import choose_apart
 from vlatool.optimize.evidence import is_recorded, unjudged, with_accuracy
 from vlatool.optimize.judge import Judged, judge
 from vlatool.optimize.plan import BASELINE, Plan, make_plan, transforms
-from vlatool.optimize.recipe import Recipe
+from vlatool.optimize.pruned import PrunedSearch
+from vlatool.optimize.recipe import Pruning, Recipe, StageList
 from vlatool.optimize.search import Search
 from vlatool.optimize.summary import report_of
 from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, placed
@@ -116,11 +117,12 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     baseline = _chain(plan.export, source, plan, context)[-1]
     _check_metric(plan, baseline, context)
     plan, tried = _searched(plan, baseline, context)
+    plan, trials = _pruned(plan, source, baseline, context)
     bundles, failures, trained = _candidates(plan, source, baseline, context)
     rows, notes = _measured(plan, source, {BASELINE: baseline, **bundles}, context)
     rows = {name: with_trainings(row, trained.get(name, ())) for name, row in rows.items()}
     judged, trust = judged_rows(plan, rows, {name: engine_of(bundle) for name, bundle in bundles.items()})
-    tables = {**tried, **_explained(judged, bundles, baseline, context)}
+    tables = {**trials, **tried, **_explained(judged, bundles, baseline, context)}
     judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
     report = report_of(plan, baseline, bundles, judged, failures, notes, trust, context.command)
     chosen = chosen_of(judged).row
@@ -160,10 +162,21 @@ def _searched(plan: Plan, baseline: Bundle, context: Context) -> tuple[Plan, Tab
     if not plan.recipe.search:
         return plan, {}
     search = Search(baseline, plan.recipe.limits, plan.profile, plan.cache, context, plan.recipe.effort.threads)
-    candidates = {**plan.recipe.candidates, **search.run(plan.recipe.candidates)}
-    recipe = plan.recipe.model_copy(update={"candidates": candidates})
+    return _with_candidates(plan, search.run(plan.recipe.candidates)), search.tables()
+
+
+def _pruned(plan: Plan, source: Bundle, baseline: Bundle, context: Context) -> tuple[Plan, Tables]:
+    """Add the pruned policies that did best in trials to the candidates; return also a table of all trials."""
+    if not plan.recipe.pruning.trials:
+        return plan, {}
+    found, table = PrunedSearch(plan, source, baseline, context).run()
+    return _with_candidates(plan, found), table
+
+
+def _with_candidates(plan: Plan, found: Mapping[str, StageList]) -> Plan:
+    candidates = {**plan.recipe.candidates, **found}
     stages = {name: transforms(entries) for name, entries in candidates.items()}
-    return replace(plan, recipe=recipe, candidates=stages), search.tables()
+    return replace(plan, recipe=plan.recipe.model_copy(update={"candidates": candidates}), candidates=stages)
 
 
 def _candidates(
@@ -253,7 +266,7 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
     )
     reseal(bundle, draft, manifest, ROBOT_FOLDERS)
     stages = plan.recipe.candidates.get(chosen.name)
-    only = {"candidates": {chosen.name: stages}, "search": False}
+    only = {"candidates": {chosen.name: stages}, "search": False, "pruning": Pruning()}
     repeat = plan.recipe if stages is None else plan.recipe.model_copy(update=only)
     (draft / "recipe.yaml").write_text(repeat.to_yaml(), encoding="utf-8")
 

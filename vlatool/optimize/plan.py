@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vlatool.errors import RecipeError
+from vlatool.errors import RecipeError, require_present
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
 from vlatool.module.description import read_description
-from vlatool.optimize.recipe import Limits, Recipe, StageList, stage_entries
+from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Stage, Transform, build_stage
 
@@ -82,6 +82,8 @@ class Plan:
         limits = self.recipe.limits
         if self.recipe.search:
             yield "search      engines, methods, mixed-precision plans; the fastest inside the budget become candidates"
+        if (pruning := self.recipe.pruning).trials:
+            yield f"trials      {_trials(pruning)}"
         yield f"limits      {', '.join(_limits(limits))}"
         origin = "predicted, unless this host is that board" if self.profile else "measured"
         yield f"profile     {self.board} ({origin})"
@@ -116,7 +118,30 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
             )
         if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
             raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
+    if recipe.pruning.trials:
+        _check_pruning(recipe.pruning, stage)
+    elif recipe.pruning.study:
+        raise RecipeError(f"The study {recipe.pruning.study} keeps trials, and none are asked for.", "add --trials 8")
     return Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
+
+
+def _check_pruning(pruning: Pruning, source: Source) -> None:
+    """Refuse trials that could not be made.
+
+    Raises:
+        RecipeError: when the source has no modules, or something else than a training is to recover them.
+        MissingExtra: without Optuna.
+    """
+    if source.has_graphs:
+        raise RecipeError("What is exported has no modules that could be pruned.", "name the policy, or drop --trials")
+    stages = transforms(pruning.recover)
+    if not stages or not all(stage.takes_modules for stage in stages):
+        raise RecipeError(
+            "Under pruning, 'recover' names what trains a pruned policy; got "
+            f"{', '.join(stage.name() for stage in stages) or 'nothing'}.",
+            "name distill.policy, with its options",
+        )
+    require_present("optuna", "search")
 
 
 def transforms(stages: StageList) -> tuple[Transform, ...]:
@@ -144,6 +169,13 @@ def _limits(limits: Limits) -> list[str]:
     words += [f"latency <= {limits.max_latency_ms:g} ms"] if limits.max_latency_ms else []
     words += [f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else []
     return words + ([] if limits.metric else [f"distance from float32 <= {100 * limits.max_distance:g} %"])
+
+
+def _trials(pruning: Pruning) -> str:
+    """Return the trials in words."""
+    trained = ", ".join(f"{stage.name()} {_options(stage)}".rstrip() for stage in transforms(pruning.recover))
+    study = f", shared through {pruning.study}" if pruning.study else ""
+    return f"{pruning.trials} policies, pruned, trained ({trained}), quantized and tried{study}"
 
 
 def _options(stage: Stage) -> str:

@@ -60,6 +60,19 @@ class Effort(Numeric):
     threads: int = Field(1, ge=1, description="intra-op threads while timing")
 
 
+class Pruning(Numeric):
+    """What is tried of pruned policies; each is trained to do what the whole one does, then quantized."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    trials: int = Field(0, ge=0, le=10_000, description="policies that are pruned, trained and tried; 0 for none")
+    study: str = Field("", description="URL or file that keeps the trials, so that several machines share them")
+    recover: StageList = Field(({"distill.policy": {}},), description="what trains a pruned policy")
+    episodes: int = Field(300, ge=1, description="closed-loop episodes of each trial")
+    least: float = Field(0.25, gt=0, lt=1, description="share of the work of a policy that stays in any case")
+    seed: int = Field(0, ge=0, description="of what is tried next")
+
+
 class Recipe(Numeric):
     """Export, candidates and limits of one ``optimize`` run."""
 
@@ -69,6 +82,7 @@ class Recipe(Numeric):
     export: StageList = ({"export.onnx": {}},)
     candidates: dict[str, StageList] = Field(min_length=1)
     search: bool = False
+    pruning: Pruning = Pruning()
     limits: Limits = Limits()
     effort: Effort = Effort()
 

@@ -1,0 +1,211 @@
+"""Pruned, trained and quantized policies, tried one after the other: the fastest that keep to the budget are judged."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from vlatool.accuracy.paired import compare_success
+from vlatool.benchmark.latency import Latency
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import VlatoolError
+from vlatool.evaluate.recorded import Recorded, carries_recordings
+from vlatool.machine import host
+from vlatool.optimize.budget import budget_of
+from vlatool.optimize.plan import Plan, transforms
+from vlatool.optimize.recipe import StageList
+from vlatool.optimize.space import Shape, Space, quantizations, space_of
+from vlatool.optimize.study import Study, Tried
+from vlatool.optimize.trained import trainings
+from vlatool.report import TRAINING_TIME
+from vlatool.runtime.engine import DEFAULT_ENGINE
+from vlatool.runtime.policy import refuse_findings
+from vlatool.stage.base import Context
+from vlatool.stage.cache import STREAMS
+from vlatool.stage.run import cached_measure, cached_transform
+
+SELECTION_SEEDS = 4_000_000
+"""Seeds of the episodes that trials play: neither of a training nor of an evaluation."""
+FINALISTS = 3
+TIMED = 60
+QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False}
+
+
+@dataclass(frozen=True)
+class PrunedSearch:
+    """Trials of one run.
+
+    Args:
+        plan: With the recipe; its candidates are how a pruned policy may be quantized.
+        source: Of the policy.
+        baseline: The whole policy in float32.
+        context: For progress.
+    """
+
+    plan: Plan
+    source: Bundle
+    baseline: Bundle
+    context: Context
+
+    def run(self) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
+        """Try as many as the recipe says; return the finalists, fastest first, and a table of all.
+
+        Raises:
+            RecipeError: when nothing of the policy can be pruned.
+            UsageError: when the study cannot be opened.
+        """
+        pruning = self.plan.recipe.pruning
+        name = self._name()
+        study = Study(pruning.study or _own(name), name, self._allowed, pruning.seed)
+        quantized = study.agreed(self._quantizations())
+        space = space_of(self.source, pruning, quantized, self.plan.cache, self.context)
+        study.begin(space)
+        while (asked := study.ask(pruning.trials)) is not None:
+            number, shape = asked
+            self.context.tell(f"trial {number + 1}, {pruning.trials} in all: {space.name(shape)}", None)
+            study.tell(number, self._try(shape, space))
+        tried = study.tried()
+        chosen = self._finalists(tried, space)
+        return (
+            {space.name(each.shape): space.stages(each.shape) for each in chosen},
+            {_titled(study.under_way()): self._table(tried, space)},
+        )
+
+    def _name(self) -> str:
+        """Return what trials share that may be compared: the policy, how it is trained and judged, and the limits."""
+        recipe = self.plan.recipe
+        asked = recipe.pruning.model_dump(mode="json", exclude={"trials", "study", "seed"})
+        said = [self.source.hash, asked, recipe.limits.model_dump(mode="json"), recipe.effort.threads]
+        digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+        return f"{self.baseline.manifest.name}-{digest}"
+
+    def _quantizations(self) -> dict[str, StageList]:
+        """Return how the whole policy was quantized: name -> stages, the fastest first."""
+        speeds: dict[str, float] = {}
+        found = quantizations(self.plan.recipe.candidates)
+        for name, stages in found.items():
+            try:
+                bundle = self.baseline
+                for stage in transforms(stages):
+                    stage.check(bundle, self.plan.profile)
+                    bundle = cached_transform(stage, bundle, self.plan.cache, self.context)
+                refuse_findings(bundle, self.plan.recipe.limits.accept)
+                speeds[name] = self._speedup(bundle)
+            except VlatoolError as failure:
+                if failure.exit_code not in (3, 4):
+                    raise
+        return {name: found[name] for name in sorted(speeds, key=lambda name: -speeds[name])}
+
+    def _try(self, shape: Shape, space: Space) -> Tried:
+        """Make a policy of a shape, time it and see what it loses; failures say why."""
+        try:
+            bundle, seconds = self._made(shape, space)
+            return Tried(shape, self._speedup(bundle), self._drop(bundle), seconds)
+        except VlatoolError as failure:
+            if failure.exit_code not in (3, 4):
+                raise
+            return Tried(shape, note=failure.message)
+
+    def _made(self, shape: Shape, space: Space) -> tuple[Bundle, float]:
+        """Return the bundle of a shape, and the seconds that its training took when it was trained."""
+        stages = transforms(space.stages(shape))
+        changing = [stage for stage in stages if stage.takes_modules]
+        bundle, seconds = self.source, 0.0
+        for stage in (*changing, *self.plan.export, *(stage for stage in stages if not stage.takes_modules)):
+            stage.check(bundle, self.plan.profile)
+            bundle = cached_transform(stage, bundle, self.plan.cache, self.context)
+            for row in trainings([bundle]):
+                seconds += sum(item.value for item in row.measurements if item.name.startswith(TRAINING_TIME))
+        refuse_findings(bundle, self.plan.recipe.limits.accept)
+        return bundle, seconds
+
+    def _speedup(self, bundle: Bundle) -> float:
+        engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.confined else ""
+        threads = self.plan.recipe.effort.threads
+        timing = Latency(against=(bundle.path,), iterations=TIMED, threads=threads, engine=engine, **QUICK)
+        return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value("speedup")
+
+    def _drop(self, bundle: Bundle) -> float:
+        """Return what a policy loses in paired episodes; without an environment, its error on recorded observations."""
+        loop = self.plan.closed_loop
+        if loop is None or self.plan.recipe.limits.metric:
+            return self._error(bundle)
+        loop = loop.model_copy(
+            update={"episodes": self.plan.recipe.pruning.episodes, "first_seed": SELECTION_SEEDS, "baseline": None}
+        )
+        rows = [cached_measure(loop, each, self.plan.cache, self.context).rows[-1] for each in (self.baseline, bundle)]
+        return compare_success(*rows).value("success_drop")
+
+    def _error(self, bundle: Bundle) -> float:
+        if not carries_recordings(self.baseline):
+            return math.inf
+        recorded = Recorded(baseline=self.baseline.path)
+        row = cached_measure(recorded, bundle, self.plan.cache, self.context).rows[-1]
+        measured = budget_of(self.plan.recipe.limits, self.baseline.manifest.spec, proxy=False).of(row)
+        return math.inf if measured is None or not measured.known else measured.value
+
+    @property
+    def _allowed(self) -> float:
+        limits = self.plan.recipe.limits
+        return limits.max_metric or 0.0 if limits.metric else limits.max_drop
+
+    def _finalists(self, tried: list[Tried], space: Space) -> list[Tried]:
+        """Return the fastest pruned ones within the budget; the most accurate where none is."""
+        pruned = [each for each in _best_of_each(tried) if each.speedup > 0 and not space.is_whole(each.shape)]
+        inside = sorted((each for each in pruned if each.drop <= self._allowed), key=lambda each: -each.speedup)
+        return inside[:FINALISTS] or sorted(pruned, key=lambda each: each.drop)[:1]
+
+    def _told(self, drop: float) -> str:
+        if not math.isfinite(drop):
+            return ""
+        points = self.plan.closed_loop is not None and not self.plan.recipe.limits.metric
+        return f"{100 * drop:.1f} points" if points else f"{drop:.4g}"
+
+    def _table(self, tried: list[Tried], space: Space) -> list[dict[str, Any]]:
+        front = front_of(tried)
+        return [
+            {
+                "policy": space.name(each.shape),
+                "speed-up": f"{each.speedup:.2f}x" if each.speedup else "",
+                "drop": self._told(each.drop),
+                "within": "yes" if each.drop <= self._allowed else "no",
+                "on the front": "yes" if each in front else "",
+                "training": f"{each.training_s / 60:.1f} min" if each.training_s else "",
+                "note": each.note or ("another process" if each.elsewhere else ""),
+            }
+            for each in sorted(tried, key=lambda each: -each.speedup)
+        ]
+
+
+def front_of(tried: list[Tried]) -> list[Tried]:
+    """Return the trials that no other one beats in both respects."""
+    made = [each for each in tried if each.speedup > 0]
+    return [
+        each
+        for each in made
+        if not any(
+            other.speedup >= each.speedup and other.drop <= each.drop and
+            (other.speedup, other.drop) != (each.speedup, each.drop)
+            for other in made
+        )
+    ]  # fmt: skip
+
+
+def _best_of_each(tried: list[Tried]) -> list[Tried]:
+    """Return one trial of each shape: chance may choose one twice."""
+    return list({each.shape: each for each in tried}.values())
+
+
+def _own(name: str) -> str:
+    """Return the study of a run that names none: this machine's, so that an interrupted run goes on."""
+    folder = host.cache_directory() / STREAMS / f"optimize.trials-{name.rpartition('-')[2]}"
+    folder.mkdir(parents=True, exist_ok=True)
+    return f"sqlite:///{folder / 'trials.db'}"
+
+
+def _titled(elsewhere: int) -> str:
+    more = f"; {elsewhere} under way in other processes" if elsewhere else ""
+    return f"Pruned policies, by trials{more}"

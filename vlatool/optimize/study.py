@@ -1,0 +1,243 @@
+"""The trials of ``optimize`` in an Optuna study: what is tried next, and what was found, also by other machines."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import platform
+import uuid
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import psutil
+
+from vlatool.errors import DataError, UsageError, VlatoolError, require
+from vlatool.optimize.recipe import StageList
+from vlatool.optimize.space import FLOAT32, Shape, Space, quantizations
+
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial, Trial
+
+STARTUP = 6
+"""Trials after which what was found says what is tried next; before, the first shapes, then random ones."""
+QUANTIZED = "quantized"
+NOTE, AGAIN, WORKER, TRAINING = "note", "again", "worker", "training_s"
+REPEATS = 10
+"""Shapes that are drawn in the hope of one that was not tried yet; after that, the first such one is taken."""
+LONGEST = 400
+"""Characters of a note."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What a trial found.
+
+    Args:
+        shape: What was tried.
+        speedup: Against the whole policy in float32; 0 when it could not be made.
+        drop: Accuracy lost, a share of episodes or in the measure of the budget; infinite when not known.
+        training_s: Seconds that its training took, wherever that was; 0 for none.
+        note: Why it could not be made.
+        elsewhere: Whether another machine or process tried it.
+    """
+
+    shape: Shape
+    speedup: float = 0.0
+    drop: float = math.inf
+    training_s: float = 0.0
+    note: str = ""
+    elsewhere: bool = False
+
+
+class Study:
+    """One Optuna study: ask for a shape, tell what it gave.
+
+    Args:
+        url: ``sqlite:///FILE``, ``mysql://``, ``postgresql://``, or a file for a journal.
+        name: Of the study; trials of other policies or limits have another.
+        allowed: Drop that a shape may have.
+        seed: Of what is tried next.
+
+    Raises:
+        UsageError: when it cannot be opened.
+        MissingExtra: without Optuna.
+    """
+
+    def __init__(self, url: str, name: str, allowed: float, seed: int) -> None:
+        self._optuna = require("optuna", "search")
+        self._optuna.logging.set_verbosity(self._optuna.logging.ERROR)
+        self._allowed, self._seed = allowed, seed
+        self._worker = worker()
+        self._space = Space((1.0,), 1, 1, {}, ())
+        with _opened(url):
+            storage = _storage(self._optuna, url)
+            self._study = self._optuna.create_study(
+                storage=storage, study_name=name, directions=["maximize", "minimize"], load_if_exists=True
+            )
+
+    def agreed(self, quantized: Mapping[str, StageList]) -> dict[str, StageList]:
+        """Return how all who share the study quantize: what the first of them found.
+
+        Args:
+            quantized: What was found here.
+
+        Raises:
+            DataError: when the study holds something else.
+        """
+        if QUANTIZED not in self._study.user_attrs:
+            self._study.set_user_attr(QUANTIZED, [[name, list(stages)] for name, stages in quantized.items()])
+        try:
+            agreed = {str(name): tuple(stages) for name, stages in self._study.user_attrs[QUANTIZED]}
+            known = quantizations(agreed)
+        except (AttributeError, TypeError, ValueError, VlatoolError) as error:
+            raise DataError(f"The study says of quantization what vlatool cannot read: {error}.") from error
+        if known != agreed or FLOAT32 in agreed:
+            raise DataError("The study names stages that do not quantize.", "name another study")
+        return {**agreed, FLOAT32: ()}
+
+    def begin(self, space: Space) -> None:
+        """Say what may be chosen, and take up what a process of this machine left when it was killed."""
+        self._space = space
+        for shape in space.first():
+            self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
+        self._again()
+
+    def ask(self, trials: int) -> tuple[int, Shape] | None:
+        """Return the number and shape of the next trial, None when so many are done or under way, or all was tried.
+
+        Raises:
+            DataError: when the study is of another space.
+        """
+        for attempt in range(REPEATS + 1):
+            counted = [trial.params for trial in self._trials() if self._counts(trial)]
+            if len(counted) >= trials:
+                return None
+            if attempt == REPEATS:  # what was found leads to the same shapes again and again
+                new = next((shape for shape in self._space.all() if asdict(shape) not in counted), None)
+                if new is None:
+                    return None
+                self._study.enqueue_trial(asdict(new))
+            number, shape = self._asked()
+            if asdict(shape) not in counted:
+                return number, shape
+            self._drop(number)
+        return None
+
+    def _asked(self) -> tuple[int, Shape]:
+        self._study.sampler = self._optuna.samplers.TPESampler(
+            n_startup_trials=STARTUP, seed=self._seed + len(self._trials()), multivariate=True
+        )  # fmt: skip
+        trial, space = self._study.ask(), self._space
+        trial.set_user_attr(WORKER, self._worker)
+        try:
+            shape = Shape(
+                trial.suggest_categorical("width", space.widths),
+                trial.suggest_int("blocks", 1, space.blocks),
+                trial.suggest_int("steps", 1, space.steps, log=True),
+                trial.suggest_categorical("quantized", tuple(space.quantized)),
+            )
+        except ValueError as error:
+            raise DataError(f"The study's trials are of another space: {error}.", "name another study") from error
+        return trial.number, shape
+
+    def _drop(self, number: int) -> None:
+        """End a trial that does not count."""
+        self._trial(number).set_user_attr(AGAIN, True)
+        self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
+
+    def tell(self, number: int, tried: Tried) -> None:
+        """Keep what a trial found; one that could not be made is kept with the reason."""
+        trial = self._trial(number)
+        trial.set_user_attr(TRAINING, tried.training_s)
+        if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
+            trial.set_user_attr(NOTE, tried.note[:LONGEST] or "its accuracy could not be measured")
+            self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
+        else:
+            trial.set_constraint("drop", tried.drop - self._allowed)
+            self._study.tell(number, [tried.speedup, tried.drop])
+
+    def tried(self) -> list[Tried]:
+        """Return what is known of all trials that ended.
+
+        Raises:
+            DataError: when what the study holds is not what a trial finds.
+        """
+        return [self._read(trial) for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
+
+    def under_way(self) -> int:
+        """Return how many trials other processes have under way."""
+        running = self._optuna.trial.TrialState.RUNNING
+        return sum(trial.state == running for trial in self._trials())
+
+    def _trials(self) -> list[FrozenTrial]:
+        trials: list[FrozenTrial] = self._study.get_trials(deepcopy=False)
+        return trials
+
+    def _counts(self, trial: FrozenTrial) -> bool:
+        return trial.state != self._optuna.trial.TrialState.WAITING and not trial.user_attrs.get(AGAIN)
+
+    def _trial(self, number: int) -> Trial:
+        """Return a trial that may be written to."""
+        trial: Trial = self._optuna.trial.Trial(self._study, self._trials()[number]._trial_id)
+        return trial
+
+    def _again(self) -> None:
+        """Take up trials that a process of this machine had under way when it was killed."""
+        state = self._optuna.trial.TrialState
+        for trial in self._trials():
+            if trial.state == state.RUNNING and _is_dead(str(trial.user_attrs.get(WORKER, ""))):
+                self._drop(trial.number)
+                if set(trial.params) == set(Shape.__dataclass_fields__):
+                    self._study.enqueue_trial(trial.params)
+
+    def _read(self, trial: FrozenTrial) -> Tried:
+        try:
+            shape = Shape(**trial.params)
+            speedup, drop = trial.values or (0.0, math.inf)
+            seconds, note = float(trial.user_attrs.get(TRAINING, 0.0)), str(trial.user_attrs.get(NOTE, ""))
+        except (TypeError, ValueError) as error:
+            raise DataError(f"Trial {trial.number} of the study is no trial of vlatool: {error}.") from error
+        if not self._space.holds(shape) or not speedup >= 0 or math.isnan(drop):
+            raise DataError(
+                f"Trial {trial.number} of the study is not of this policy: {trial.params}, {trial.values}.",
+                "name another study",
+            )
+        elsewhere = trial.user_attrs.get(WORKER) != self._worker
+        return Tried(shape, speedup, drop, seconds, note[:LONGEST], elsewhere)
+
+
+def worker() -> str:
+    """Return what tells this process from others that share a study: a machine, when it booted, the process."""
+    return f"{uuid.getnode():x}-{platform.node()}/{psutil.boot_time():.0f}/{os.getpid()}"
+
+
+def _is_dead(other: str) -> bool:
+    """Return whether a process of this machine is no more; of other machines nothing is known."""
+    ours, theirs = worker().split("/"), other.split("/")
+    if len(theirs) != len(ours) or theirs[0] != ours[0] or not theirs[2].isdigit():
+        return False
+    return theirs[1] != ours[1] or not psutil.pid_exists(int(theirs[2]))
+
+
+def _storage(optuna: Any, url: str) -> Any:
+    if "://" in url:
+        return url
+    backend = optuna.storages.journal.JournalFileBackend(url)
+    return optuna.storages.JournalStorage(backend)
+
+
+@contextlib.contextmanager
+def _opened(url: str) -> Iterator[None]:
+    """Turn what Optuna and its databases raise of an address into a sentence."""
+    try:
+        yield
+    except (KeyboardInterrupt, MemoryError):
+        raise
+    except Exception as error:
+        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise UsageError(
+            f"The study {url} cannot be opened: {reason[0]}.",
+            "name a file, such as trials.journal, or a database, such as sqlite:///trials.db",
+        ) from error
