@@ -14,6 +14,7 @@ from vlatool.optimize.space import FLOAT32, Shape, Space, quantizations, space_o
 from vlatool.prune.depth import Depth
 from vlatool.stage.base import Context
 
+
 @pytest.fixture(autouse=True)
 def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stages run without a child of their own."""

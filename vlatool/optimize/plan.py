@@ -135,7 +135,9 @@ def _check_pruning(pruning: Pruning, source: Source) -> None:
     if source.has_graphs:
         raise RecipeError("What is exported has no modules that could be pruned.", "name the policy, or drop --trials")
     stages = transforms(pruning.recover)
-    if not stages or not all(stage.takes_modules for stage in stages):
+    if not any(stage.trains for stage in stages) or not all(
+        stage.kind() in ("distill", "quantize") for stage in stages
+    ):
         raise RecipeError(
             "Under pruning, 'recover' names what trains a pruned policy; got "
             f"{', '.join(stage.name() for stage in stages) or 'nothing'}.",

@@ -1,0 +1,147 @@
+"""Trials of pruned policies in ``optimize``, end to end on the tiny policy, through the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlatool.cli import main
+from vlatool.optimize.pruned import front_of
+from vlatool.optimize.recipe import read_recipe
+from vlatool.optimize.space import FLOAT32, Shape
+from vlatool.optimize.study import Tried
+from vlatool.report import Report, read_report
+
+RECIPE = """\
+candidates: {static_int8: [quantize.static_int8: {samples: 8}]}
+pruning:
+  trials: 3
+  episodes: 4
+  recover: [distill.policy: {steps: 3, batch: 6, episodes: 0, student_episodes: 0, precision: float32, threads: 1}]
+effort: {episodes: 4, iterations: 20}
+limits: {max_drop: 1.0, max_distance: 1000}
+"""
+TABLE = "Pruned policies, by trials"
+
+
+@pytest.fixture
+def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A recipe with three trials; stages run without a child of their own."""
+    monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+    path = tmp_path / "recipe.yaml"
+    path.write_text(RECIPE)
+    return path
+
+
+def optimized(*words: Any) -> int:
+    try:
+        main(["optimize", *map(str, words)])
+    except SystemExit as left:
+        return int(left.code or 0)
+    return 0
+
+
+def table_of(report: Report) -> list[dict[str, Any]]:
+    chosen = next(row for row in report.rows if row.role == "chosen")
+    return list(next(table for title, table in chosen.details.items() if title.startswith(TABLE)))
+
+
+def test_pruned_policies_are_trained_tried_and_judged_beside_the_others(
+    policy_template: Path, recipe: Path, tmp_path: Path
+) -> None:
+    out, study = tmp_path / "out", tmp_path / "trials.journal"
+    words = (policy_template, "--recipe", recipe, "--study", study, "--workers", 1)
+    assert optimized(*words, "-o", out) == 0
+    report = read_report(out / "reports")
+    table = table_of(report)
+    assert {each["policy"] for each in table[:3]} >= {"whole_static_int8", "width70_static_int8"}
+    assert len(table) == 3
+    trained = {each["policy"]: each["training"] for each in table}
+    assert trained["whole_static_int8"] == ""
+    assert trained["width70_static_int8"].endswith(" min")
+    assert [each["on the front"] for each in table].count("yes") >= 1
+    rows = {row.name: row for row in report.rows}
+    assert "width70_static_int8" in rows
+    assert rows["width70_static_int8"].get("success_drop") is not None
+    assert rows["float32"].role in ("baseline", "chosen")
+    again = read_recipe(out / "recipe.yaml")
+    assert again.pruning.trials == 0, "what was chosen is made again without trials"
+
+
+def test_without_episodes_the_error_on_recorded_observations_decides(
+    policy_template: Path, recipe: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = ("--trials", 2, "--episodes", 0, "--train-steps", 2, "--workers", 1, "--json", "-o", out)
+    assert optimized(policy_template, "--recipe", recipe, *words) == 0
+    table = table_of(read_report(out / "reports"))
+    assert [each["drop"] for each in table if each["policy"] == "width70_static_int8"] != [""]
+    assert not any("points" in each["drop"] for each in table)
+
+
+@pytest.mark.parametrize(
+    ("words", "pruning", "code", "said"),
+    [
+        (["--study", "trials"], "trials: 0", 3, "none are asked for"),
+        (["--trials", "-1"], "trials: 1", 2, "greater than or equal to 0"),
+        (["--trials", "many"], "trials: 1", 2, "valid integer"),
+        (["--train-steps", "0"], "trials: 1", 2, "greater than or equal to 1"),
+        (["--train-steps", "5"], "{trials: 1, recover: [quantize.qat: {}]}", 2, "--train-steps is of distill.policy"),
+        ([], "{trials: 1, recover: [export.onnx: {}]}", 3, "names what trains a pruned policy; got export.onnx"),
+        ([], "{trials: 1, recover: []}", 3, "got nothing"),
+        ([], "{trials: 1, recover: [distill.police: {}]}", 3, "distill.police"),
+        ([], "{trials: 1, recover: [distill.policy: {step: 3}]}", 3, "step"),
+        ([], "{trials: -1}", 3, "pruning.trials"),
+        ([], "{trials: .nan}", 3, "pruning.trials"),
+        ([], "{least: 1.5}", 3, "pruning.least"),
+        ([], "{episodes: 0}", 3, "pruning.episodes"),
+        ([], "{tirals: 3}", 3, "tirals"),
+        ([], "7", 3, "pruning"),
+        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "cannot be opened"),
+        (["--trials", "2", "--study", "sqlite:////proc/none/x.db"], "trials: 1", 2, "cannot be opened"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)  # fmt: skip
+def test_wrong_inputs_are_named_and_leave_nothing(
+    policy_template: Path, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    words: list[str], pruning: str, code: int, said: str,
+) -> None:  # fmt: skip
+    head, _, rest = RECIPE.partition("pruning:\n")
+    recipe.write_text(
+        f"{head}pruning: {pruning if pruning[0] in '{7' else '{' + pruning + '}'}\n{rest[rest.index('effort') :]}"
+    )
+    out = tmp_path / "out"
+    assert optimized(policy_template, "--recipe", recipe, "--workers", 1, *words, "-o", out) == code
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+
+
+def test_an_exported_policy_has_nothing_to_prune(
+    onnx_file: Path, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert optimized(onnx_file, "--recipe", recipe, "-o", tmp_path / "out") == 3
+    assert "no modules that could be pruned" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_plan_tells_of_the_trials(
+    policy_template: Path, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (policy_template, "--recipe", recipe, "--trials", 5, "--dry-run", "-o", tmp_path / "out")
+    assert optimized(*words) == 0
+    assert "5 policies, pruned, trained (distill.policy" in capsys.readouterr().out
+    assert optimized(*words, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["plan"]["pruning"]["trials"] == 5
+
+
+def _tried(speedup: float, drop: float, width: float = 0.55) -> Tried:
+    return Tried(Shape(width, 1, 1, FLOAT32), speedup, drop)
+
+
+def test_the_front_is_what_no_other_beats_in_both() -> None:
+    slow, fast, beaten, even = _tried(1, 0), _tried(4, 0.02), _tried(2, 0.03), _tried(4, 0.02, 0.7)
+    failed = Tried(Shape(0.4, 1, 1, FLOAT32), note="no")
+    assert front_of([slow, fast, beaten, failed, even]) == [slow, fast, even]
