@@ -1,25 +1,21 @@
-"""Flow matching: the regression of velocities, the optimiser loop, averaged weights, and checkpoints."""
+"""Flow matching: the regression of velocities, and checkpoints."""
 
-import copy
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import neighbor  # noqa: F401
-import numpy as np
 import torch
-from batches import Batches, Budget, rate_at
+from averaged import AveragedLearner
+from batches import Batches, Budget
 from policy import make
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 BATCH = 32
 LEARNING_RATE = 4e-4
 TRUNK_RATE = 1.5e-4
-WEIGHT_DECAY = 0.02
-AVERAGE_DECAY = 0.998
-LATE_STEP_WEIGHT = 0.5
 DRAWS = 4
 CHECKPOINT_EVERY = 250
 
@@ -45,73 +41,43 @@ def draw_flow(target: Tensor, draws: int) -> tuple[Tensor, Tensor, Tensor]:
     return share * noise + (1 - share) * actions, t, noise - actions
 
 
-class FlowLearner:
-    """Trains both graphs with bfloat16 autocast and keeps an exponential average of their weights."""
+class FlowLearner(AveragedLearner):
+    """Trains both graphs with bfloat16 autocast; the trunk, which is trained already, more slowly."""
 
     def __init__(self, seed: int, budget: Budget, trunk: Path) -> None:
         torch.manual_seed(seed)
-        self.policy = nn.ModuleDict(make(None)).to(memory_format=torch.channels_last)
-        old = from_trunk(self.policy, trunk)
-        self.average = copy.deepcopy(self.policy).requires_grad_(False)
-        self.budget = budget
-        self.step = 0
-        self.curve: list[tuple[int, float, float]] = []
-        named = list(self.policy.named_parameters())
+        policy = nn.ModuleDict(make(None)).to(memory_format=torch.channels_last)
+        old = from_trunk(policy, trunk)
+        named = list(policy.named_parameters())
         groups = [
             {"params": [value for name, value in named if name in old], "peak": TRUNK_RATE},
             {"params": [value for name, value in named if name not in old], "peak": LEARNING_RATE},
         ]
-        self._optimiser = torch.optim.AdamW(
-            groups, LEARNING_RATE, betas=(0.9, 0.95), weight_decay=WEIGHT_DECAY, fused=True
-        )
-        weights = torch.ones(8)
-        weights[4:] = LATE_STEP_WEIGHT
-        self._step_weights = (weights / weights.mean())[:, None]
+        super().__init__(policy, groups, budget)
 
-    def run(self, batches: Batches, until: float, report: Callable[[int, float], None], checkpoint: Path) -> None:
-        """Trains until the share `until` of the budget is used."""
-        self.policy.train()
-        losses: list[float] = []
-        while self.budget.progress(self.step) < until:
-            losses.append(self._update(batches))
-            if self.step % 50 == 0:
-                self.curve.append((self.step, self._elapsed() / 60.0, float(np.mean(losses))))
-                report(self.step, self.curve[-1][2])
-                losses.clear()
+    def train(self, batches: Batches, until: float, report: Callable[[int, float], None], checkpoint: Path) -> None:
+        """Trains until the share `until` of the budget is used, and writes checkpoints."""
+
+        def keep() -> None:
             if self.step % CHECKPOINT_EVERY == 0:
                 self.checkpoint(checkpoint, batches)
 
-    def _update(self, batches: Batches) -> float:
-        rate = rate_at(self.step, self.budget.progress(self.step))
-        for group in self._optimiser.param_groups:
-            group["lr"] = group["peak"] * rate
-        loss = self._loss(*batches.draw(BATCH))
-        self._optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 1.0)
-        self._optimiser.step()
-        self.step += 1
-        keep = min(AVERAGE_DECAY, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.average.parameters()), list(self.policy.parameters()), 1.0 - keep)
-        return loss.item()
+        self.run(batches, until, report, keep)
 
-    def _loss(self, image: Tensor, proprio: Tensor, words: Tensor, target: Tensor) -> Tensor:
+    def _loss(self, batches: Batches) -> Tensor:
+        image, proprio, words, target = batches.draw(BATCH)
         x, t, velocity = draw_flow(target, DRAWS)
         with torch.autocast("cpu", torch.bfloat16):
             context = self.policy["prefix"](image, proprio, words)
             predicted = self.policy["step"].velocity(x, t, context[:, None])
         return ((predicted.float() - velocity).square() * self._step_weights).mean()
 
-    def _elapsed(self) -> float:
-        return time.monotonic() - self.budget.started
-
     def checkpoint(self, path: Path, batches: Batches) -> None:
         """Writes everything that training goes on from."""
         state = {
             "policy": self.policy.state_dict(), "average": self.average.state_dict(),
             "optimiser": self._optimiser.state_dict(), "random": torch.get_rng_state(), "batches": batches.state,
-            "step": self.step, "elapsed": self._elapsed(), "curve": self.curve,
+            "step": self.step, "elapsed": self.elapsed(), "curve": self.curve,
         }  # fmt: skip
         torch.save(state, path.with_suffix(".new"))
         path.with_suffix(".new").replace(path)
@@ -128,8 +94,3 @@ class FlowLearner:
         self.step, self.curve = state["step"], state["curve"]
         self.budget.started = time.monotonic() - state["elapsed"]
         return state["batches"]
-
-    def save(self, path: Path) -> None:
-        """Writes the averaged weights as float16 safetensors."""
-        state = {name: value.half().contiguous() for name, value in self.average.state_dict().items()}
-        save_file(state, path)

@@ -1,4 +1,4 @@
-"""Puts vla-metaworld behind this folder on the import path: its demonstrations, batches and episodes are used here.
+"""Puts vla-metaworld behind this folder on the import path: what it collects, trains and plays with is used here.
 
 `policy`, `acting` and `environment` are found in this folder first, so what collects and evaluates there runs the
 policy of this folder.

@@ -5,8 +5,6 @@ checkpoints stay in `--work`, and a run that was interrupted goes on from there.
 """
 
 import argparse
-import csv
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,17 +14,16 @@ import neighbor
 import numpy as np
 import torch
 from batches import Batches, Budget, reuse_large_buffers
-from closed_loop import evaluate, show
 from collection import Display, gather
 from demonstrations import Frames
 from flow_learning import FlowLearner
 from rich.console import Console
+from script import first_seed, run, training_options, write_curve
 
 DEMONSTRATIONS = 80
 DAGGER_EPISODES = 15
 DAGGER_AT = (0.4, 0.7)
 STEPS = 1800
-SEED_STRIDE = 10_000
 SHARED_FILES = ("vocabulary.json", "statistics.json")
 RECORDINGS = ("calibration.npz", "evaluation.npz")
 
@@ -58,10 +55,9 @@ def copy_shared(out: Path) -> None:
 
 def learn(learner: FlowLearner, display: Display, options: Any) -> None:
     """Trains with DAgger rounds at fixed shares of the steps."""
-    first = (options.seed + 1) * 10 * SEED_STRIDE
     frames = kept(
         options.work / "demonstrations.npz",
-        lambda: gather(display, "demonstrations", first, DEMONSTRATIONS, options.threads),
+        lambda: gather(display, "demonstrations", first_seed(options.seed), DEMONSTRATIONS, options.threads),
     )
     checkpoint = options.work / "checkpoint.pt"
     state = learner.resume(checkpoint)
@@ -70,14 +66,14 @@ def learn(learner: FlowLearner, display: Display, options: Any) -> None:
         if state is not None:
             batches.restore(state)
         with display.bar("training", options.steps) as move:
-            learner.run(batches, until, lambda step, loss: move(step, f"loss {loss:.3f}"), checkpoint)
+            learner.train(batches, until, lambda step, loss: move(step, f"loss {loss:.3f}"), checkpoint)
         learner.save(options.out / "weights.safetensors")
         if until < 1.0:
             added = kept(
                 options.work / f"dagger_{number}.npz",
                 lambda number=number: gather(
-                    display, f"DAgger round {number}", first + number * SEED_STRIDE, DAGGER_EPISODES, options.threads,
-                    options.out,
+                    display, f"DAgger round {number}", first_seed(options.seed, number), DAGGER_EPISODES,
+                    options.threads, options.out,
                 ),
             )  # fmt: skip
             frames = Frames.join([frames, added])
@@ -90,32 +86,19 @@ def reproduce(options: argparse.Namespace, console: Console) -> None:
     copy_shared(options.out)
     learner = FlowLearner(options.seed, Budget(options.steps, options.minutes), neighbor.NEIGHBOR)
     learn(learner, Display(console), options)
-    with (options.out / "training_curve.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("step", "minutes", "loss"), *learner.curve])
+    write_curve(options.out, learner.curve)
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder for the files of the policy")
+    parser = training_options(__doc__, Path(__file__).parent, STEPS)
     parser.add_argument("--work", type=Path, required=True, help="folder for frames and checkpoints (about 1 GB)")
     parser.add_argument(
         "--minutes", type=float, default=float("inf"), help="upper limit; cut short, no run is repeated"
     )
-    parser.add_argument("--steps", type=int, default=STEPS, help="optimiser steps")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int, default=2, help="worker processes for collection and evaluation")
-    parser.add_argument("--train-threads", type=int, default=1, help="torch threads of the optimiser")
-    parser.add_argument("--evaluate", action="store_true", help="print the success tables afterwards")
     options = parser.parse_args()
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # the software renderer of each worker process
-    for folder in (options.out, options.work):
-        folder.mkdir(parents=True, exist_ok=True)
-    console = Console()
-    reproduce(options, console)
-    if options.evaluate:
-        for instruction, episodes in (("right", 64), ("wrong", 32)):
-            show(evaluate(options.out, episodes, instruction, options.threads), f"{instruction} instruction", console)
+    options.work.mkdir(parents=True, exist_ok=True)
+    run(options, reproduce)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ Run `python train.py --out DIR --threads 2`; every generated file lands in DIR.
 """
 
 import argparse
-import csv
-import os
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from demonstrations import Frames
 from learning import Learner
 from rich.console import Console
 from runtime import build_vocabulary, summarise
+from script import first_seed, run, training_options, write_curve
 
 DEMONSTRATIONS = 80
 DAGGER_EPISODES = 25
@@ -26,7 +25,6 @@ STEPS = 4500
 EVALUATION_EPISODES = 8
 CALIBRATION_SAMPLES = 128
 EVALUATION_SAMPLES = 256
-SEED_STRIDE = 10_000
 
 
 def learn(learner: Learner, display: Display, frames: Frames, options: Any) -> None:
@@ -37,8 +35,7 @@ def learn(learner: Learner, display: Display, frames: Frames, options: Any) -> N
             learner.run(batches, until, lambda step, loss: move(step, f"loss {loss:.3f}"))
         learner.save(options.out / "weights.safetensors")
         if until < 1.0:
-            first = (options.seed + 1) * 10 * SEED_STRIDE + number * SEED_STRIDE
-            title = f"DAgger round {number}"
+            first, title = first_seed(options.seed, number), f"DAgger round {number}"
             added = gather(display, title, first, DAGGER_EPISODES, options.threads, options.out)
             frames = Frames.join([frames, added])
 
@@ -48,8 +45,7 @@ def reproduce(options: argparse.Namespace, console: Console) -> None:
     torch.set_num_threads(options.train_threads)
     reuse_large_buffers()
     display, budget = Display(console), Budget(options.steps, options.minutes)
-    first = (options.seed + 1) * 10 * SEED_STRIDE
-    frames = gather(display, "demonstrations", first, DEMONSTRATIONS, options.threads)
+    frames = gather(display, "demonstrations", first_seed(options.seed), DEMONSTRATIONS, options.threads)
     console.print(f"{len(frames)} demonstration frames")
     words = build_vocabulary([sentence for wordings in tasks.INSTRUCTIONS.values() for sentence in wordings])
     statistics = {"proprio": summarise(frames.proprio), "action": summarise(frames.action)}
@@ -60,29 +56,14 @@ def reproduce(options: argparse.Namespace, console: Console) -> None:
     write_samples(options.out / "evaluation.npz", sample(held_out, EVALUATION_SAMPLES, options.seed), True)
     learner = Learner(options.seed, budget)
     learn(learner, display, frames, options)
-    with (options.out / "training_curve.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([("step", "minutes", "loss"), *learner.curve])
+    write_curve(options.out, learner.curve)
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder for all generated files")
+    parser = training_options(__doc__, Path(__file__).parent, STEPS)
     parser.add_argument("--minutes", type=float, default=55.0, help="upper limit for collection and training")
-    parser.add_argument("--steps", type=int, default=STEPS, help="optimiser steps")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int, default=2, help="worker processes for collection and evaluation")
-    parser.add_argument("--train-threads", type=int, default=1, help="torch threads of the optimiser")
-    parser.add_argument("--evaluate", action="store_true", help="print the success tables afterwards")
-    options = parser.parse_args()
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # the software renderer of each worker process
-    options.out.mkdir(parents=True, exist_ok=True)
-    console = Console()
-    reproduce(options, console)
-    if options.evaluate:
-        for instruction, episodes in (("right", 64), ("wrong", 32)):
-            results = closed_loop.evaluate(options.out, episodes, instruction, options.threads)
-            closed_loop.show(results, f"{instruction} instruction", console)
+    run(parser.parse_args(), reproduce)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ import torch
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.distill.policy import PolicyDistillation
+from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import DataError, OutputError, RecipeError, SourceError
+from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.export.onnx import ExportOnnx
 from vlatool.machine.host import cache_directory
 from vlatool.module.edits import read_edits
@@ -161,9 +163,25 @@ def test_the_student_is_not_its_own_teacher(pruned: Bundle, tmp_path: Path):
         distilled(pruned, tmp_path / "out", teacher=str(pruned.path))
 
 
-def test_episodes_to_train_on_are_not_those_of_evaluations(pruned: Bundle, tmp_path: Path):
-    with pytest.raises(RecipeError, match=r"take the seeds 4999998 to 500\d+; evaluations begin at 5000000"):
-        distilled(pruned, tmp_path / "out", first_seed=4_999_998)
+@pytest.mark.parametrize(("first", "says"), [
+    (4_999_998, r"take the seeds 4999998 to 500\d+; evaluations begin at 5000000"),
+    (EVALUATION_SEEDS, r"take the seeds 5000000 to 500\d+; evaluations begin at 5000000"),
+    (6_000_000, r"take the seeds 6000000 to 600\d+; evaluations begin at 5000000"),
+])  # fmt: skip
+def test_episodes_to_train_on_are_not_those_of_evaluations(pruned: Bundle, tmp_path: Path, first: int, says: str):
+    with pytest.raises(RecipeError, match=says):
+        distilled(pruned, tmp_path / "out", first_seed=first)
+
+
+def test_episodes_up_to_the_evaluations_are_trained_on(pruned: Bundle):
+    options = {"episodes": 10, "student_episodes": 0}
+    build_stage("distill.policy", {**options, "first_seed": EVALUATION_SEEDS - 10}).check(pruned, None)
+    with pytest.raises(RecipeError, match="evaluations begin at 5000000"):
+        build_stage("distill.policy", {**options, "first_seed": EVALUATION_SEEDS - 9}).check(pruned, None)
+
+
+def test_evaluations_begin_where_trainings_end():
+    assert ClosedLoop().first_seed == EVALUATION_SEEDS
 
 
 def changed_code(policy_dir: Path, old: str, new: str, place: Path) -> Bundle:

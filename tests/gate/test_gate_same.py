@@ -47,6 +47,48 @@ def test_another_program_is_another_policy(float_bundle: Bundle, fields, says: s
         check(changed(float_bundle, program=(replace(step, **fields),)), float_bundle, GATE)
 
 
+def repeated(bundle: Bundle, schedule: dict[str, list[float]], *stages: str) -> Bundle:
+    """A bundle whose program repeats its graph as often as its schedule says, made by stages."""
+    (step,) = bundle.manifest.program
+    step = replace(step, repeat=len(next(iter(schedule.values()))), schedule=schedule)
+    build = (*bundle.manifest.build, *({"stage": stage} for stage in stages))
+    return changed(bundle, program=(step,), build=build)
+
+
+FOUR = {"t": [1.0, 0.75, 0.5, 0.25], "dt": [-0.25] * 4}
+FEWER = {"t": [1.0, 0.5], "dt": [-0.5] * 2}
+
+
+def test_steps_may_become_fewer_where_a_stage_made_them_fewer(float_bundle: Bundle) -> None:
+    whole = repeated(float_bundle, FOUR)
+    check(repeated(float_bundle, FEWER, "prune.steps"), whole, GATE)
+    check(repeated(float_bundle, FOUR, "prune.steps"), whole, GATE)
+    with pytest.raises(BundleError, match=r"the program's schedule .*; the program's repeat 2 in the candidate, 4 in"):
+        check(repeated(float_bundle, FEWER, "prune.depth"), whole, GATE)
+
+
+@pytest.mark.parametrize(
+    ("schedule", "says"),
+    [
+        ({"t": [1.0] * 8, "dt": [-0.125] * 8}, "the program's repeat 8 in the candidate, 4 in the baseline"),
+        ({"t": [1.0, 0.7, 0.4, 0.1], "dt": [-0.3] * 4}, "the program's schedule"),
+        ({"t": [1.0]}, "the program's schedule .*; the program's repeat 1 in"),
+        ({"t": [1.0], "dt": [-1.0], "more": [0.0]}, "the program's schedule .*; the program's repeat 1 in"),
+    ],
+)
+def test_fewer_steps_excuse_no_other_program(float_bundle: Bundle, schedule: dict[str, list[float]], says: str) -> None:
+    with pytest.raises(BundleError, match=says):
+        check(repeated(float_bundle, schedule, "prune.steps"), repeated(float_bundle, FOUR), GATE)
+
+
+@pytest.mark.parametrize("word", ["keep", "noise"])
+def test_fewer_steps_keep_and_draw_the_same(float_bundle: Bundle, word: str) -> None:
+    fewer = repeated(float_bundle, FEWER, "prune.steps")
+    step = replace(fewer.manifest.program[0], **{word: {"x": {"shape": [1]}}})
+    with pytest.raises(BundleError, match=f"the program's {word}"):
+        check(changed(fewer, program=(step,)), repeated(float_bundle, FOUR), GATE)
+
+
 def test_an_engine_that_is_none_is_told(float_bundle: Bundle) -> None:
     with pytest.raises(BundleError, match="made for the engine 'ort_cpus'; did you mean 'ort_cpu'"):
         check(changed(float_bundle, engine="ort_cpus"), float_bundle, GATE)

@@ -157,6 +157,16 @@ def test_lists_of_several_kinds_are_taken_when_they_are_named(source_bundle: Bun
         kept(modules, source_bundle, include=("turns",))
 
 
+def test_stacks_in_blocks_of_a_stack_are_cut_before_it(source_bundle: Bundle):
+    class Stages(Net):
+        def __init__(self):
+            super().__init__()
+            self.trunk = nn.ModuleList(nn.Sequential(Residual(size), Residual(0.01)) for size in SIZES)
+
+    made = apply({"main": Stages()}, Depth(samples=1).change({"main": Stages().eval()}, source_bundle, Context()).edits)
+    assert [len(stage) for stage in made["main"].trunk] == [1, 1]
+
+
 def test_a_stack_that_graphs_share_is_cut_once(source_bundle: Bundle):
     one, other = Net(), Net()
     other.trunk = one.trunk

@@ -6,15 +6,21 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from torch import nn
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError
 from vlatool.export.onnx import ExportOnnx
+from vlatool.module.axes import Member
 from vlatool.module.edits import Edit, apply, read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune import latency
 from vlatool.prune._clock import Clock
+from vlatool.prune._prices import Stack, edits_of, is_gone
+from vlatool.prune._units import Group
 from vlatool.prune.latency import LatencyPruning
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
@@ -126,3 +132,123 @@ def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
     exported = Bundle.open(tmp_path / "2-graphs")
     assert exported.graph_bytes < Bundle.open(tmp_path / "1-graphs").graph_bytes
     assert load(exported.path).spec == torch_policy(deep, 0).spec
+
+
+class Streamed(nn.Module):
+    """Blocks that add to a stream that nothing normalises: its channels are units with members in every block."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(1)
+        self.trunk = nn.Sequential()
+        for name, size in (("first", 0.01), ("second", 1.0), ("third", 0.02)):
+            self.trunk.add_module(name, Added(size))
+        self.state = nn.Linear(3, 16)
+        self.head = nn.Linear(16, 8)
+
+    def forward(self, image, proprio, instruction):
+        return self.head(self.trunk(self.state(proprio))).reshape(1, 4, 2)
+
+
+class Added(nn.Module):
+    def __init__(self, size: float) -> None:
+        super().__init__()
+        self.linear = nn.Linear(16, 16)
+        self.size = size
+
+    def forward(self, tokens):
+        return tokens + self.size * torch.tanh(self.linear(tokens))
+
+
+def trunk(importance: Sequence[float] = (1.0, 2.0, 3.0), **fields) -> Stack:
+    return Stack({"main": "trunk"}, ("0", "1", "2"), list(importance), **fields)
+
+
+def group(*weights: str, keep: Sequence[int] = (0, 2)) -> Group:
+    members = [Member(weight, 0, place, (1,) * place + (3,)) for place, weight in enumerate(weights)]
+    return Group("main", 0, 3, members, 1, np.ones(3), list(keep))
+
+
+def test_units_are_named_after_a_weight_that_stays():
+    stack = trunk()
+    stack.keep.remove(0)
+    gone, home, both = group("trunk.0.a"), group("trunk.2.a"), group("trunk.0.a", "trunk.1.b", "head.c")
+    assert is_gone("main", "trunk.0.a", [stack])
+    assert not is_gone("main", "trunk.1.b", [stack])
+    assert not is_gone("other", "trunk.0.a", [stack])
+    assert edits_of([gone, home, both, group("trunk.1.b", keep=range(3))], [stack]) == (
+        Edit("main", "trunk", "blocks", (1, 2)),
+        Edit("main", "trunk.1.a", "units 0.0", (0, 2)),
+        Edit("main", "trunk.0.b", "units 0.1", (0, 2)),
+    )
+
+
+def test_stacks_in_blocks_are_cut_before_the_blocks_are_numbered_anew():
+    outer = trunk()
+    inner = [Stack({"main": f"trunk.{number}.parts"}, ("0", "1"), [1.0, 2.0]) for number in range(3)]
+    for stack in (outer, *inner[:2]):
+        stack.keep.remove(0)
+    edits = edits_of([group("trunk.1.parts.1.weight")], [outer, *inner])
+    assert edits == (
+        Edit("main", "trunk.1.parts", "blocks", (1,)),
+        Edit("main", "trunk", "blocks", (1, 2)),
+        Edit("main", "trunk.0.parts.0.weight", "units 0.0", (0, 2)),
+    )
+    module = nn.Module()
+    module.trunk = nn.ModuleList(nn.Module() for _ in range(3))
+    for number, block in enumerate(module.trunk):
+        block.parts = nn.Sequential(nn.Linear(number + 1, 1), nn.Linear(10 * (number + 1), 1))
+    apply({"main": module}, edits[:2])
+    assert module.trunk[0].parts[0].in_features == 20
+    assert [len(block.parts) for block in module.trunk] == [1, 2]
+
+
+def test_blocks_that_have_names_and_share_units_may_go(counted: None, deep: Bundle, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("test_latency.load_modules", lambda _: {"main": Streamed().eval()})
+    target = 0.5 * (Counted(deep).ms(()) - 1) + 1
+    edits = LatencyPruning(target_ms=target, **FINE).change({"main": Streamed().eval()}, deep, Context()).edits
+    kept = [edit.keep for edit in edits if edit.axis == "blocks"]
+    assert kept in ([(1,)], [(1, 2)], [(0, 1)]), edits
+    assert any(edit.axis != "blocks" for edit in edits)
+    assert 0.96 * target <= Counted(deep).ms(edits) <= target
+
+
+def chosen(module: nn.Module, source: Bundle, **options: object) -> list[str]:
+    stage = LatencyPruning(target_ms=1, samples=2, **options)
+    return [stack.places["main"] for stack in stage.stacks({"main": module}, source)]
+
+
+@pytest.mark.parametrize(("options", "names"), [
+    ({}, ["trunk"]),
+    ({"include": ("trunk.*",)}, ["trunk"]),
+    ({"include": ("trunk.first.*", "trunk.second.*", "trunk.third.*")}, ["trunk"]),
+    ({"include": ("trunk.*.weight",)}, []),
+    ({"include": ("state.*",)}, []),
+    ({"exclude": ("trunk.second.*",)}, []),
+    ({"exclude": ("head.*",)}, ["trunk"]),
+    ({"rank": "magnitude"}, []),
+])  # fmt: skip
+def test_blocks_go_only_where_all_of_their_weights_may(source_bundle: Bundle, options: dict[str, object], names):
+    assert chosen(Streamed().eval(), source_bundle, **options) == names
+
+
+def test_protected_blocks_go_when_they_are_included(source_bundle: Bundle):
+    class Acting(Streamed):
+        def __init__(self) -> None:
+            super().__init__()
+            self.action_expert = self.trunk
+            del self.trunk
+
+        def forward(self, image, proprio, instruction):
+            return self.head(self.action_expert(self.state(proprio))).reshape(1, 4, 2)
+
+    assert chosen(Acting().eval(), source_bundle) == []
+    assert chosen(Acting().eval(), source_bundle, exclude=("head.*",)) == []
+    assert chosen(Acting().eval(), source_bundle, include=("action_expert.*",)) == ["action_expert"]
+
+
+def test_a_policy_without_blocks_loses_units_alone(counted: None, source_bundle: Bundle):
+    target = 0.8 * Counted(source_bundle).ms(())
+    edits = LatencyPruning(target_ms=target, **FINE).change(load_modules(source_bundle), source_bundle, Context()).edits
+    assert edits
+    assert all(edit.axis.startswith("units ") for edit in edits)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from _flow import write_flow
+from safetensors.torch import save_file
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import RecipeError
+from vlatool.errors import RecipeError, SourceError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.gate.config import Gate
 from vlatool.gate.same import check
-from vlatool.module.torch_policy import torch_policy
+from vlatool.module import stage, stored
+from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune.steps import Steps, fewer
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
@@ -63,6 +67,47 @@ def test_the_program_has_larger_steps_and_runs(one: Bundle, source: Bundle, fold
     assert rebuild(exported, Context(), source=str(folder), cache=tmp_path / "cache").identical
     whole = run_transform(ExportOnnx(), source, tmp_path / "whole", Context())
     check(exported, whole, Gate(accuracy=None))
+
+
+@pytest.fixture
+def sharded(folder: Path, source: Bundle, tmp_path: Path) -> Bundle:
+    """The same policy with other weights, which are in two shards that its description names."""
+    place = Path(shutil.copytree(folder, tmp_path / "sharded"))
+    for graph, module in load_modules(source).items():
+        save_file({f"{graph}.{name}": 1.5 * value for name, value in module.state_dict().items()},
+                  place / f"{graph}.safetensors")  # fmt: skip
+    description = place / "policy.yaml"
+    description.write_text(description.read_text() + 'weights: "*.safetensors"\n')
+    return run_transform(TorchModule(policy=place), None, tmp_path / "sharded-source", Context())
+
+
+def test_weights_in_shards_stay_there(sharded: Bundle, one: Bundle, tmp_path: Path):
+    made = run_transform(Steps(to=1), sharded, tmp_path / "out", Context())
+    assert [name for name in made.manifest.files if name.startswith("module/")] == ["module/edits.json"]
+    assert made.manifest.program == one.manifest.program
+    got, wanted = load_modules(made), load_modules(sharded)
+    for graph, module in wanted.items():
+        assert all(torch.equal(got[graph].state_dict()[name], value) for name, value in module.state_dict().items())
+    exported = run_transform(ExportOnnx(), made, tmp_path / "onnx", Context())
+    assert error(made, sharded) > 0.01
+    state = {"state": np.ones(3, np.float32)}
+    actions = [policy.infer(state).chunk for policy in (load(exported.path, seed=0), torch_policy(made, 0))]
+    assert relative_error(*actions) < 1e-5
+    assert rebuild(made, Context(), source=str(tmp_path / "sharded"), cache=tmp_path / "cache").identical
+    save_file({"see.weight": torch.zeros(16, 3), "see.bias": torch.zeros(16)}, tmp_path / "sharded/prefix.safetensors")
+    with pytest.raises(SourceError, match=r"have changed since .* was made"):
+        load_modules(made)
+
+
+def test_weights_in_large_shards_are_not_read(sharded: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    read = list[str]()
+    monkeypatch.setattr(stored, "read_tensor", lambda _reader, tensor, _dtype: read.append(tensor.name))
+    monkeypatch.setattr("vlatool.module.torch_policy.shard_files", lambda *_: read.append("all") or [])
+    monkeypatch.setattr(stage, "RUN_BELOW", 0)
+    (tmp_path / "out").mkdir()
+    made = Steps(to=2).run(sharded, tmp_path / "out", Context())
+    assert made.manifest.program[1].repeat == 2
+    assert not read
 
 
 def test_what_many_steps_reached_is_learnt(one: Bundle, source: Bundle, tmp_path: Path):

@@ -11,8 +11,12 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.cli import main
+from vlatool.cli._run import following
 from vlatool.data import recorded_observations
+from vlatool.errors import RecipeError
 from vlatool.export.onnx import ExportOnnx
+from vlatool.hardware.profile import load_profile
 from vlatool.module.to_onnx import quiet_exporter
 from vlatool.module.torch_policy import torch_policy
 from vlatool.quantize._blocks import METHODS, Format, Scratch, dequantize, planes_of_rows, quantize_planes
@@ -120,3 +124,36 @@ def test_an_export_of_the_tuned_policy_is_in_float32(source_bundle: Bundle, tmp_
     tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
     exported = run_transform(ExportOnnx(), tuned, tmp_path / "exported", Context())
     assert exported.manifest.graphs["main"].precision == {"float32": 1.0}
+
+
+@pytest.mark.parametrize(("given", "board", "wanted"), [
+    ({}, "", {}),
+    ({"layout": "qdq"}, "", {"layout": "qdq"}),
+    ({}, "jetson-orin-nano", {"layout": "qdq", "activations": "int8"}),
+    ({"layout": "ort"}, "jetson-orin-nano", {"activations": "int8"}),
+    ({"weights": "int4"}, "jetson-orin-nano", {"search": False, "layout": "qdq"}),
+    ({"weights": "int4", "layout": "ort"}, "jetson-orin-nano", {"search": False}),
+])  # fmt: skip
+def test_what_follows_is_as_the_board_runs_it_unless_it_is_said(
+    given: dict[str, str], board: str, wanted: dict[str, object]
+):
+    export, quantization = following(Qat(**given), load_profile(board) if board else None)
+    assert export.name() == "export.onnx"
+    assert quantization.options() == wanted
+
+
+def test_a_command_line_with_a_board_makes_what_the_board_runs(policy_dir: Path, tmp_path: Path):
+    quick = "--steps 2 --batch 4 --episodes 0 --student-episodes 0 --threads 1"
+    line = f"quantize qat {policy_dir} -o {tmp_path / 'out'} --profile jetson-orin-nano {quick}"
+    with pytest.raises(SystemExit) as left:
+        main(line.split())
+    assert not left.value.code
+    made_by = Bundle.open(tmp_path / "out").manifest.made_by
+    assert made_by["stage"] == "quantize.static_int8"
+    assert made_by["options"] == {"layout": "qdq", "activations": "int8"}
+
+
+def test_a_layout_that_cannot_follow_is_told_before_the_training(source_bundle: Bundle):
+    with pytest.raises(RecipeError, match=r"quantize.weight_only: layout = 'openvino': input should be 'ort' or 'qdq'"):
+        Qat(weights="int4", layout="openvino").check(source_bundle, None)
+    Qat(weights="int8", layout="openvino").check(source_bundle, None)

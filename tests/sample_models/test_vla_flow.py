@@ -169,7 +169,7 @@ def train(imported: Imported, checkpoint: Path, until: float) -> dict[str, torch
     state = learner.resume(checkpoint)
     if state is not None:
         batches.restore(state)
-    learner.run(batches, until, lambda *_: None, checkpoint)
+    learner.train(batches, until, lambda *_: None, checkpoint)
     return dict(learner.average.state_dict())
 
 

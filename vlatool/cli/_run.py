@@ -92,6 +92,7 @@ def transform(
         raise UsageError(f"--events {events} is in the output {out}, which appears whole or not at all.")
     board = load_profile(profile) if profile else None
     stage = stage.on(board) if board else stage
+    then = following(stage, board)
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)
@@ -103,9 +104,9 @@ def transform(
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         context = replace(context, events=str(events.absolute()) if events else "")
-        for name, options in stage.then():
+        for other in then:
             bundle = cached_transform(stage, bundle, cache_directory(), context)
-            stage = cast(Transform, build_stage(name, options))
+            stage = other
         result = run_transform(stage, bundle, out, context, force=force)
         on_board = board_summary(result, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""
@@ -130,6 +131,12 @@ def transform(
     for line in on_board.lines() if on_board else ():
         typer.echo(f"  {line}")
     _refuse(result, baseline)
+
+
+def following(stage: Transform, board: Profile | None) -> list[Transform]:
+    """Return the stages that the command line runs after one, with the options that the board needs."""
+    stages = [cast(Transform, build_stage(name, options)) for name, options in stage.then()]
+    return [each.on(board) if board else each for each in stages]
 
 
 def _onnx_source(export: Transform, source: Transform) -> Transform:

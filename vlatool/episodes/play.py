@@ -30,6 +30,8 @@ from vlatool.user_code.children import spread
 SLICE = 10
 """Episodes of one task that a worker plays at a time."""
 STEP_LIMIT = 100_000
+EVALUATION_SEEDS = 5_000_000
+"""First seed of the episodes that policies are judged by; those that they are trained on have smaller ones."""
 PRELOAD = ("numpy", "onnxruntime", __name__)
 
 

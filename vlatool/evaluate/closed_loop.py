@@ -11,7 +11,7 @@ from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.paired import compare_success, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.play import EpisodesJob, jobs_for, run_jobs
+from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for, run_jobs
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.machine.host import fingerprint
@@ -24,7 +24,6 @@ from vlatool.user_code import trust
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
-FIRST_SEED = 5_000_000
 CONTROL_EPISODES = 20
 """Episodes of each control, or a tenth of the policy's where that is more."""
 
@@ -40,7 +39,7 @@ class ClosedLoop(Measure):
     environment: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
     tasks: tuple[str, ...] = Field((), description="tasks; those in policy.yaml when empty")
     episodes: int = Field(200, ge=1, description="episodes over all tasks, spread evenly")
-    first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode of every task")
+    first_seed: int = Field(EVALUATION_SEEDS, ge=0, description="seed of the first episode of every task")
     baseline: Path | None = Field(None, description="bundle to pair with, usually float32")
     control: Literal["", "random", "constant"] = Field(
         "", description="actions that do not look, in the place of the policy's: what succeeds by chance"

@@ -13,7 +13,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, require, require_present
-from vlatool.module.edits import read_edits
+from vlatool.module.edits import is_changed
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
 from vlatool.module.to_onnx import EXTERNAL_DATA_BYTES, exported_by_torch, name_by_module, strip_notes, weight_bytes
@@ -72,7 +72,7 @@ class ExportOnnx(Transform):
         A pruned policy whose weights stay in shards may be too large to be there as a whole: it runs with one weight at
         a time, and the weights of one graph are read to export it, which go into a file of their own.
         """
-        stored = stored_modules(bundle) if read_edits(bundle) and takes_shards(bundle) else None
+        stored = stored_modules(bundle) if is_changed(bundle) and takes_shards(bundle) else None
         modules = stored.modules if stored else load_modules(bundle)
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
         context.tell("running the torch policy", None)

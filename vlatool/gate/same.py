@@ -66,19 +66,26 @@ def _rates(mine: Manifest, theirs: Manifest) -> str:
 def _program(mine: Manifest, theirs: Manifest) -> str:
     """Return what the candidate keeps between inferences, draws, or repeats otherwise than the baseline.
 
-    How a program is cut into graphs is each bundle's own business; that it has fewer steps is, where it was made so.
+    How a program is cut into graphs is each bundle's own business; that it has fewer steps is, where it was made so:
+    success tells what that is worth.
     """
-    words = ("keep", "noise") if _has_fewer_steps(mine) else ("keep", "noise", "schedule")
+    words = ("keep", "noise") if _has_fewer_steps(mine, theirs) else ("keep", "noise", "schedule")
     parts: list[tuple[str, Any, Any]] = [(word, _of_all(mine, word), _of_all(theirs, word)) for word in words]
-    if not _has_fewer_steps(mine):
-        one, two = (max(step.repeat for step in manifest.program) for manifest in (mine, theirs))
-        parts.append(("repeat", one, two))
+    if not _has_fewer_steps(mine, theirs):
+        parts.append(("repeat", _repeat(mine), _repeat(theirs)))
     return "; ".join(text for word, one, two in parts if (text := _told(f"the program's {word}", one, two)))
 
 
-def _has_fewer_steps(manifest: Manifest) -> bool:
-    """Return whether a stage reduced the steps of the program: success tells what that is worth."""
-    return any(entry.get("stage") == FEWER_STEPS for entry in manifest.build)
+def _has_fewer_steps(mine: Manifest, theirs: Manifest) -> bool:
+    """Return whether a stage reduced the steps of the candidate's program, and it differs in that alone."""
+    reduced = any(entry.get("stage") == FEWER_STEPS for entry in mine.build)
+    same_names = set(_of_all(mine, "schedule")) == set(_of_all(theirs, "schedule"))
+    return reduced and same_names and _repeat(mine) < _repeat(theirs)
+
+
+def _repeat(manifest: Manifest) -> int:
+    """Return how often the graph that runs most often runs in an inference."""
+    return max(step.repeat for step in manifest.program)
 
 
 def _of_all(manifest: Manifest, word: str) -> dict[str, Any]:

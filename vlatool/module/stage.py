@@ -59,7 +59,7 @@ class ModuleStage(Transform):
     packages: ClassVar[tuple[str, ...]] = ("torch", "safetensors", "numpy")
     takes_modules: ClassVar[bool] = True
     keeps_weights: ClassVar[bool] = False
-    """Whether it takes whole blocks away alone, so that weights in a policy's shards can stay there."""
+    """Whether it takes whole blocks away or changes the program alone, so that weights in shards can stay there."""
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The bundle has modules, and no graphs yet."""
@@ -104,29 +104,32 @@ class ModuleStage(Transform):
         bundle = source_of(source, self.name())
         self.check(bundle, None)
         if self.keeps_weights and takes_shards(bundle):
-            return self._run_on_shards(bundle, out, context)
+            changed = self._written(bundle, out, self._chosen_on_shards(bundle, context), {}, context)
+            _run_once(changed)
+            return changed
         modules = load_modules(bundle)
         done = self.change(modules, bundle, context)
-        modules = apply(modules, done.edits, bundle)
+        changed = self._written(bundle, out, done, apply(modules, done.edits, bundle), context)
+        torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
+        return changed
+
+    def _chosen_on_shards(self, bundle: Bundle, context: Context) -> Changed:
+        """Return what is to be changed; no more than one weight is in memory, unless the choice needs all."""
+        if not self.in_parts():
+            return self.change(load_modules(bundle), bundle, context)
+        stored = stored_modules(bundle)
+        with weights_read(stored):
+            return self.change(stored.modules, bundle, context)
+
+    def _written(
+        self, bundle: Bundle, out: Path, done: Changed, modules: Mapping[str, nn.Module], context: Context
+    ) -> Bundle:
+        """Write what was changed, with the modules; without them, where the weights stay in shards."""
         made_by = self.made_by()
         made_by["options"] = {**made_by["options"], **done.options}
         edits = joined_edits(read_edits(bundle), done.edits)
         changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program)
         context.tell("running the changed policy", None)
-        torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
-        return changed
-
-    def _run_on_shards(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
-        """Write the edits alone; no more than one weight is in memory, unless the choice needs all."""
-        if self.in_parts():
-            stored = stored_modules(bundle)
-            with weights_read(stored):
-                done = self.change(stored.modules, bundle, context)
-        else:
-            done = self.change(load_modules(bundle), bundle, context)
-        changed = write_changed(bundle, out, joined_edits(read_edits(bundle), done.edits), {}, self.made_by())
-        context.tell("running the changed policy", None)
-        _run_once(changed)
         return changed
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
-from vlatool.module.edits import BLOCKS, holds_weights, read_edits
+from vlatool.module.edits import BLOCKS, holds_weights, is_changed, read_edits
 from vlatool.module.faked import Weightless, weightless
 from vlatool.module.origin import AGAIN, origin_of
 from vlatool.weights.shards import NUMPY_NAMES, Reader, StoredTensor, read_shards, reading, sampled_hash, shard_files
@@ -70,7 +70,7 @@ def stored_modules(bundle: Bundle) -> StoredModules:
     folder, pattern = policy_weights(bundle)
     shards = read_shards(folder, pattern)
     recorded = bundle.manifest.source.get("shards")
-    if read_edits(bundle) and recorded != sampled_hash(shard_files(folder, pattern)):
+    if is_changed(bundle) and recorded != sampled_hash(shard_files(folder, pattern)):
         raise SourceError(f"The weights in {folder} have changed since {bundle.path} was made.", AGAIN)
     made = weightless(bundle)
     places = {graph: _locate(graph, made, shards, folder / "policy.yaml") for graph in made.modules}

@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import require
 from vlatool.module.batched import run_module
-from vlatool.module.edits import edited, load_tensors, read_edits, read_tensors
+from vlatool.module.edits import edited, is_changed, load_tensors, read_tensors
 from vlatool.module.modules import modules_of
 from vlatool.module.origin import origin_of
 from vlatool.module.stored import filled, stored_modules, takes_shards
@@ -32,7 +32,7 @@ def load_modules(source: Bundle) -> dict[str, nn.Module]:
     Raises:
         SourceError: when the code has changed since the bundle was made, or gives something else than modules.
     """
-    if read_edits(source) and takes_shards(source):
+    if is_changed(source) and takes_shards(source):
         require("torch", "build")
         origin_of(source).check()
         return filled(stored_modules(source))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -60,7 +60,6 @@ class Clock:
         modules = apply(load_modules(self._source), edits, self._source)
         everything = joined_edits(read_edits(self._source), edits)
         bundle = write_changed(self._source, made, everything, modules, self._made_by)
-        stage = build_stage("export.onnx", {})
-        assert isinstance(stage, Transform)
+        stage = cast(Transform, build_stage("export.onnx", {}))
         stage.run(bundle, exported, replace(self._context, tell=lambda _what, _share: None))
         return exported

@@ -47,6 +47,15 @@ def stacks(module: nn.Module, *, mixed: bool = False) -> Iterator[tuple[str, Any
             yield name, part
 
 
+def stacks_of(modules: Mapping[str, nn.Module], *, mixed: bool = False) -> list[tuple[dict[str, str], Any]]:
+    """Return (graph name -> name, stack) of every stack of a policy; one that graphs share comes once."""
+    found: dict[int, tuple[dict[str, str], Any]] = {}
+    for graph, module in modules.items():
+        for name, stack in stacks(module, mixed=mixed):
+            found.setdefault(id(stack), ({}, stack))[0][graph] = name
+    return list(found.values())
+
+
 class Ranking:
     """What the action loses without some blocks, on recorded observations.
 

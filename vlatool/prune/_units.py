@@ -71,14 +71,16 @@ class Group:
         order = sorted(self.keep, key=lambda unit: (self.importance[unit], unit))[:count]
         return float(sum(self.importance[unit] for unit in order)), order
 
-    @property
-    def axis(self) -> str:
-        """How edits name the units, in the first of the weights."""
-        return f"{UNITS}{self.members[0].axis}.{self.members[0].place}"
+    def edit(self, member: Member | None = None, keep: Sequence[int] | None = None) -> Edit:
+        """Return what is to be kept.
 
-    def edit(self) -> Edit:
-        """Return what is to be kept."""
-        return Edit(self.graph, self.members[0].weight, self.axis, tuple(self.keep))
+        Args:
+            member: After whose weight and axis the edit names the units; the first one when None.
+            keep: Numbers of the units that stay; those of the group when None.
+        """
+        member = member or self.members[0]
+        axis = f"{UNITS}{member.axis}.{member.place}"
+        return Edit(self.graph, member.weight, axis, tuple(self.keep if keep is None else keep))
 
 
 def walks_of(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk]:

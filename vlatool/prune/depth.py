@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.edits import BLOCKS, Edit
 from vlatool.module.stage import Changed, ModuleStage
-from vlatool.prune._ranking import Place, Ranking, Stack, stacks
+from vlatool.prune._ranking import Place, Ranking, Stack, stacks_of
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.stage.base import Context
 
@@ -80,16 +80,13 @@ class Depth(ModuleStage):
         """
         sizes = self._chosen(self._sizes(modules), source)
         left = _listed_blocks(sizes, self.keep) if self.keep else self._left(sizes, modules, source, context)
-        return Changed(tuple(Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()))
+        edits = [Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()]
+        return Changed(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
 
     def _sizes(self, modules: Mapping[str, nn.Module]) -> dict[Stack, int]:
         """Return how many blocks each stack has; one that several graphs share is the first one's."""
         mixed = bool(self.include) and (bool(self.keep) or self.rank == "even")
-        found: dict[int, tuple[Stack, int]] = {}
-        for graph, module in modules.items():
-            for name, stack in stacks(module, mixed=mixed):
-                found.setdefault(id(stack), ((graph, name), len(stack)))
-        return dict(found.values())
+        return {next(iter(places.items())): len(stack) for places, stack in stacks_of(modules, mixed=mixed)}
 
     def _left(
         self, sizes: Mapping[Stack, int], modules: Mapping[str, nn.Module], source: Bundle, context: Context

@@ -16,8 +16,17 @@ from vlatool.errors import DataError, RecipeError
 from vlatool.module.edits import Edit, edits_from
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._clock import Clock
-from vlatool.prune._prices import Stack, edits_of, is_gone, measured_prices, role_of
-from vlatool.prune._ranking import Ranking, stacks
+from vlatool.prune._prices import (
+    Stack,
+    edits_of,
+    is_inside_gone,
+    measured_prices,
+    prefix_of,
+    rank_blocks,
+    role_of,
+    staying,
+)
+from vlatool.prune._ranking import Ranking, stacks_of
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.prune.depth import PROTECTED
@@ -45,7 +54,9 @@ class LatencyPruning(ModuleStage):
     engine: str = Field("", description="engine of the runtime; the default one when empty")
     threads: int = Field(1, ge=1, le=1024, description="intra-op threads")
     rank: Rank = Field("gate", description="how units are ranked")
-    blocks: bool = Field(True, description="whether whole blocks may go, those of the trunk")
+    blocks: bool = Field(
+        True, description="whether blocks may go whose weights all may: the trunk's, and those included"
+    )
     samples: int = Field(32, ge=1, description="recorded observations to rank on")
     multiple: int = Field(16, ge=1, description="neurons and channels that stay are a multiple of this")
     least: float = Field(0.125, gt=0, le=1, description="share of each group that stays in any case")
@@ -68,27 +79,32 @@ class LatencyPruning(ModuleStage):
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
         rank_units(groups, self.rank, modules, source, self.samples)
-        blocks = self._stacks(modules, source)
+        blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
         with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
             clock = Clock(source, Path(scratch), self.engine, self.threads, self.made_by(), context)
             edits = self._met(groups, blocks, work, clock, context)
         return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits])})
 
-    def _stacks(self, modules: Mapping[str, nn.Module], source: Bundle) -> list[Stack]:
-        """Return the stacks that may lose blocks."""
+    def stacks(self, modules: Mapping[str, nn.Module], source: Bundle) -> list[Stack]:
+        """Return the stacks that may lose blocks, with the importance of these; none for a policy without blocks."""
         if not self.blocks or self.rank != "gate":
             return []
-        selection = Selection((), self.exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
-        sizes = {(graph, name): len(stack) for graph, module in modules.items() for name, stack in stacks(module)
-                 if selection.has((name,))}  # fmt: skip
-        scores = Ranking(modules, source, self.samples).gate(
-            [(graph, name, block) for (graph, name), size in sizes.items() for block in range(size)], set()
-        )
-        return [
-            Stack(graph, name, [scores[graph, name, block] for block in range(size)])
-            for (graph, name), size in sizes.items()
+        protected = Selection((), (), PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
+        found = [
+            Stack(places, tuple(name for name, _ in blocks.named_children()))
+            for places, blocks in stacks_of(modules)
+            if self._chooses(places, blocks) and (self.include or not any(map(protected.protects, places.values())))
         ]
+        if found:
+            rank_blocks(found, Ranking(modules, source, self.samples))
+        return found
+
+    def _chooses(self, places: Mapping[str, str], blocks: nn.Module) -> bool:
+        """Return whether all weights of a stack may go: those that stay would have no block to stay in."""
+        selection = Selection(self.include, self.exclude)
+        weights = [weight for weight, _ in blocks.named_parameters()]
+        return all(selection.has((prefix_of(name) + weight,)) for name in places.values() for weight in weights)
 
     def _met(
         self, groups: Sequence[Group], blocks: Sequence[Stack], work: Work, clock: Clock, context: Context
@@ -158,7 +174,7 @@ class _Choice:
         for group in self._groups:
             group.keep = list(range(group.size))
         for stack in self._stacks:
-            stack.keep = list(range(len(stack.importance)))
+            stack.keep = list(range(len(stack.blocks)))
         left = whole
         while left > goal:
             offers = [*self._units(), *self._blocks()]
@@ -176,7 +192,7 @@ class _Choice:
     def _units(self) -> Iterator[_Offer]:
         """Yield the next units of each group that is not in a block that is gone."""
         for number, group in enumerate(self._groups):
-            if is_gone(group, self._stacks):
+            if staying(group, self._stacks) is None:
                 continue
             cost, loses = group.cheapest(self._least)
             ms = self._prices[number] * self._work.without(number, group.stays - len(loses)) - self._saved[number]
@@ -186,10 +202,10 @@ class _Choice:
     def _blocks(self) -> Iterator[_Offer]:
         """Yield the next block of each stack; the last one stays."""
         for place, stack in enumerate(self._stacks):
-            if len(stack.keep) < 2:
+            if len(stack.keep) < 2 or is_inside_gone(stack, self._stacks):
                 continue
             block = stack.least
-            inside = (number for number, group in enumerate(self._groups) if stack.block_of(group) == block)
+            inside = (number for number, group in enumerate(self._groups) if stack.is_block_of(group, block))
             ms = stack.ms - sum(self._saved[number] for number in inside)
             if ms > 0:
                 yield _Offer(stack.importance[block] / ms, ms, len(self._groups) + place, (block,))

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
@@ -33,6 +33,8 @@ class Steps(ModuleStage):
     policy to reach in few steps what it reached in many.
     """
 
+    keeps_weights: ClassVar[bool] = True
+
     to: int = Field(ge=1, le=1000, description="steps that stay")
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -40,6 +42,10 @@ class Steps(ModuleStage):
         super().check(source, profile)
         if source is not None:
             self._program(source.manifest.program)
+
+    def in_parts(self) -> bool:
+        """No weight is needed."""
+        return True
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Change the program alone."""

@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from vlatool.runtime.engine import layouts
+from vlatool.stage.base import build_stage
 from vlatool.training.fake_quantization import BLOCK, fake_quantization
 from vlatool.training.imitation import ImitationStage
 
 if TYPE_CHECKING:
+    from vlatool.bundle.bundle import Bundle
+    from vlatool.hardware.profile import Profile
+
     LayoutName = str
 else:
     LayoutName = Literal[tuple(layouts())]
@@ -30,15 +34,26 @@ class Qat(ImitationStage):
 
     weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
     learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
-    layout: LayoutName = Field("ort", description="of the bundle, as quantize static-int8 takes it; ort for int4")
+    layout: LayoutName = Field(
+        "ort",
+        description="of the bundle, as the method that follows takes it; that of --profile's board unless given",
+    )
 
     def computed(self) -> contextlib.AbstractContextManager[Any]:
         """Products are rounded."""
         rounded: contextlib.AbstractContextManager[Any] = fake_quantization(self.weights)
         return rounded
 
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """What follows takes the layout."""
+        for name, options in self.then():
+            build_stage(name, options)
+        super().check(source, profile)
+
     def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
-        """Export, and quantize to the grid that the weights were trained for."""
+        """Export, and quantize to the grid that the weights were trained for, in the layout that was asked for."""
+        layout = {"layout": self.layout} if "layout" in self.model_fields_set else {}
         if self.weights == "int4":
-            return ("export.onnx", {}), ("quantize.weight_only", {"bits": 4, "block": BLOCK, "search": False})
-        return ("export.onnx", {}), ("quantize.static_int8", {"layout": self.layout})
+            blocks = {"bits": 4, "block": BLOCK, "search": False}
+            return ("export.onnx", {}), ("quantize.weight_only", {**blocks, **layout})
+        return ("export.onnx", {}), ("quantize.static_int8", layout)

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from vlatool.bundle.bundle import REPORTS, Bundle
+from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.work import forget, work_directory
 from vlatool.machine import host
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 
     from vlatool.hardware.profile import Profile
 
-FIRST_SEED, EVALUATION_SEEDS = 1_000_000, 5_000_000
-"""Of the first episode to train on, and from where evaluations take theirs."""
+FIRST_SEED = 1_000_000
+"""Of the first episode to train on."""
 LAST_SHARE = 0.9
 """Share of the steps after which no further episodes are played: what they bring could hardly be learnt any more."""
 
@@ -86,7 +87,7 @@ class TrainingStage(ModuleStage):
             )
         rounds = len(self.pauses()) + bool(self.patience)
         last = self.first_seed + self.episodes + rounds * self.student_episodes
-        if self.first_seed < EVALUATION_SEEDS < last:
+        if max(self.first_seed + 1, last) > EVALUATION_SEEDS:
             raise RecipeError(
                 f"The episodes to train on take the seeds {self.first_seed} to {last}; evaluations begin at "
                 f"{EVALUATION_SEEDS}, and would see episodes of the training.",
