@@ -8,29 +8,33 @@ from typing import Any
 
 import pytest
 
+from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
-from vlatool.optimize.pruned import front_of
+from vlatool.optimize.plan import make_plan
+from vlatool.optimize.pruned import PrunedSearch, front_of
 from vlatool.optimize.recipe import read_recipe
 from vlatool.optimize.space import FLOAT32, Shape
 from vlatool.optimize.study import Tried
 from vlatool.report import Report, read_report
+from vlatool.stage.base import Context
 
 RECIPE = """\
 candidates: {static_int8: [quantize.static_int8: {samples: 8}]}
 pruning:
-  trials: 3
+  trials: 2
   episodes: 4
   recover: [distill.policy: {steps: 3, batch: 6, episodes: 0, student_episodes: 0, precision: float32, threads: 1}]
 effort: {episodes: 4, iterations: 20}
-limits: {max_drop: 1.0, max_distance: 1000}
+limits: {max_drop: 1.0, max_distance: 1000, hz: 1000000}
 """
 TABLE = "Pruned policies, by trials"
 
 
 @pytest.fixture
 def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A recipe with three trials; stages run without a child of their own."""
+    """A recipe with two trials; stages run without a child of their own."""
     monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
+    monkeypatch.setattr("vlatool.optimize.pipeline.explanation", lambda *_, **__: ())  # has tests of its own
     monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
     path = tmp_path / "recipe.yaml"
     path.write_text(RECIPE)
@@ -55,11 +59,10 @@ def test_pruned_policies_are_trained_tried_and_judged_beside_the_others(
 ) -> None:
     out, study = tmp_path / "out", tmp_path / "trials.journal"
     words = (policy_template, "--recipe", recipe, "--study", study, "--workers", 1)
-    assert optimized(*words, "-o", out) == 0
+    assert optimized(*words, "-o", out) in (1, 5), "the nearest to a rate that nothing reaches"
     report = read_report(out / "reports")
     table = table_of(report)
-    assert {each["policy"] for each in table[:3]} >= {"whole_static_int8", "width70_static_int8"}
-    assert len(table) == 3
+    assert {each["policy"] for each in table} == {"whole_static_int8", "width70_static_int8"}
     trained = {each["policy"]: each["training"] for each in table}
     assert trained["whole_static_int8"] == ""
     assert trained["width70_static_int8"].endswith(" min")
@@ -73,14 +76,16 @@ def test_pruned_policies_are_trained_tried_and_judged_beside_the_others(
 
 
 def test_without_episodes_the_error_on_recorded_observations_decides(
-    policy_template: Path, recipe: Path, tmp_path: Path
+    policy_template: Path, float_bundle: Bundle, int8_bundle: Bundle, recipe: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    words = ("--trials", 2, "--episodes", 0, "--train-steps", 2, "--workers", 1, "--json", "-o", out)
-    assert optimized(policy_template, "--recipe", recipe, *words) == 0
-    table = table_of(read_report(out / "reports"))
-    assert [each["drop"] for each in table if each["policy"] == "width70_static_int8"] != [""]
-    assert not any("points" in each["drop"] for each in table)
+    asked = read_recipe(recipe)
+    asked = asked.model_copy(update={"effort": asked.effort.model_copy(update={"episodes": 0})})
+    plan = make_plan(str(policy_template), None, asked, tmp_path / "cache")
+    search = PrunedSearch(plan, float_bundle, float_bundle, Context())
+    drop = search._drop(int8_bundle)
+    assert 0 < drop < 0.2
+    assert search._told(drop) == f"{drop:.4g}"
+    assert search._told(float("inf")) == ""
 
 
 @pytest.mark.parametrize(
