@@ -13,11 +13,12 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError
+from vlatool.module.blocks import stacks
 from vlatool.module.edits import Edit, edits_from
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._clock import Clock
 from vlatool.prune._prices import Stack, edits_of, is_gone, measured_prices, role_of
-from vlatool.prune._ranking import Ranking, stacks
+from vlatool.prune._ranking import Ranking
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.prune.depth import PROTECTED

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,11 +79,22 @@ class Lesson:
         modules: The student's, which are trained in place.
         loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
             computed in parts.
+        judged: What of it says how good the student is on rows that it has not seen; all of it when None.
+        along: Name -> module that is trained along, and no part of the student.
+        about: What else is to be known of the training, as JSON values.
     """
 
     name: str
     modules: Mapping[str, nn.Module]
     loss: Callable[[Mapping[str, Any]], Tensor]
+    judged: Callable[[Mapping[str, Any]], Tensor] | None = None
+    along: Mapping[str, nn.Module] = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def trained(self) -> dict[str, nn.Module]:
+        """Everything that is trained."""
+        return {**self.modules, **self.along}
 
 
 class Session:
@@ -120,7 +131,7 @@ class Session:
         self._encode = ObservationEncoder(self._spec, source)
         self._frames = Frames(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
-        self._trainer = Trainer(lesson.modules, settings, place, self._crew.group)
+        self._trainer = Trainer(lesson.trained, settings, place, self._crew.group)
         self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
@@ -171,7 +182,8 @@ class Session:
             return float(about["successes"] / about["episodes"])
         self._trainer.swap()
         try:
-            loss = self._held_out.loss(self._lesson.loss, self._plan.batch, bfloat16=self._settings.bfloat16)
+            judged = self._lesson.judged or self._lesson.loss
+            loss = self._held_out.loss(judged, self._plan.batch, bfloat16=self._settings.bfloat16)
         finally:
             self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
@@ -184,6 +196,7 @@ class Session:
         scores = best.scores if self._held_out is None else [-score for score in best.scores]
         return {
             "loss": self._lesson.name,
+            **self._lesson.about,
             "precision": "bfloat16" if self._settings.bfloat16 else "float32",
             "threads": require("torch", "build").get_num_threads(),
             **({"processes": several} if several > 1 else {}),

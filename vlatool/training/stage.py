@@ -120,6 +120,7 @@ class TrainingStage(ModuleStage):
         return (
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
+            *_compared(training.get("hints", {})),
             *_judged(training.get("judged")),
             *([f"loss curve: {page}"] if (page := made.path / REPORTS / "report.html").is_file() else []),
             *super().lines(made),
@@ -182,6 +183,20 @@ class TrainingStage(ModuleStage):
 
     def _place(self, source: Bundle) -> Path:
         return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+
+
+def _compared(hints: Mapping[str, Any]) -> tuple[str, ...]:
+    """Say which blocks were compared with the teacher's, and which stacks were not."""
+    lines = []
+    for name, about in hints.items():
+        blocks: dict[str, list[str]] = {}
+        for graph, stack, ours, theirs in about["blocks"]:
+            blocks.setdefault(f"{graph} {stack}".strip(), []).append(f"{ours}:{theirs}")
+        told = "; ".join(f"{stack} {' '.join(pairs)}" for stack, pairs in blocks.items())
+        lines.append(f"{name} of blocks (student:teacher): {told}")
+        lines += [f"{name}: {f'{graph} {stack}'.strip()} left out, {why}" for graph, stack, why in
+                  about.get("left_out", ())]  # fmt: skip
+    return tuple(lines)
 
 
 def _judged(judged: Mapping[str, Any] | None) -> tuple[str, ...]:
