@@ -27,6 +27,7 @@ from vlatool.training.held_out import HeldOut
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
 from vlatool.training.teacher import Teacher
+from vlatool.training.yielded import write_yielded
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -50,6 +51,7 @@ class Plan:
         first_seed: Of the first episode of each task; the others follow.
         patience: Pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: Parts of a batch, computed one after the other.
+        samples: Rows that are taken from the function of the policy's that yields batches.
     """
 
     batch: int
@@ -60,6 +62,7 @@ class Plan:
     first_seed: int
     patience: int = 0
     accumulate: int = 1
+    samples: int = 0
 
     def asked(self, number: int) -> int:
         """Return how many episodes a round has."""
@@ -142,7 +145,7 @@ class Session:
         if self._trainer.step:
             self._context.tell(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
-            self._held_out.prepare(self._source, RECORDED, self._write_held_out)
+            self._held_out.prepare(self._source, RECORDED, self._write_held_out, self._yield_held_out)
         next_round(self._frames, 0, self._first)
         pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
         for number, end in enumerate([*pauses, self._settings.steps]):
@@ -220,11 +223,23 @@ class Session:
         write_recorded(self._encode, observations, target)
         self._label(target, 0, 1)
 
+    def _yield_held_out(self, target: Path) -> bool:
+        """Write rows to judge with that the policy's function yields; say whether it does."""
+        if self._plan.samples:
+            self._yield(-(-self._plan.samples // 10), self._settings.seed + 1, target)
+            self._label(target, 0, 1)
+        return bool(self._plan.samples)
+
+    def _yield(self, count: int, seed: int, target: Path) -> None:
+        write_yielded(self._source, count, seed, target, self._context)
+
     def _first(self, target: Path) -> None:
-        """Write the first round: recordings, and the teacher's episodes."""
+        """Write the first round: recordings, batches of the policy's own, and the teacher's episodes."""
         recorded = recorded_observations(self._source, RECORDED)
         chosen = self._held_out.others if self._held_out is not None else recorded
         write_recorded(self._encode, chosen, target / "recorded")
+        if self._plan.samples:
+            self._yield(self._plan.samples, self._settings.seed, target / "yielded")
         self._play(target, 0)
 
     def _students(self, number: int, target: Path) -> None:
@@ -248,8 +263,9 @@ class Session:
             ]
             outcomes = run_jobs(self._actor(target / "actor", number), jobs, "", self._context)
             about |= {"episodes": len(outcomes), "successes": sum(outcome.success for outcome in outcomes)}
-        about["observations"] = joined((target / "recorded", *sorted(folder.glob("*"))), target)
-        for part in ("recorded", "episodes", "actor"):
+        about |= {"yielded": self._plan.samples} if self._plan.samples and not number else {}
+        about["observations"] = joined((target / "recorded", target / "yielded", *sorted(folder.glob("*"))), target)
+        for part in ("recorded", "yielded", "episodes", "actor"):
             shutil.rmtree(target / part, ignore_errors=True)
         (self._place / ROUND.format(number)).write_text(json.dumps(about))
         self._label(target, number)
