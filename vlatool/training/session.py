@@ -19,6 +19,7 @@ from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.batches import Batches
+from vlatool.training.constraint import Constraint
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
 from vlatool.training.forecast import Forecast
@@ -85,6 +86,7 @@ class Lesson:
         judged: What of it says how good the student is on rows that it has not seen; all of it when None.
         along: Name -> module that is trained along, and no part of the student.
         about: What else is to be known of the training, as JSON values.
+        constraint: What holds of the weights after each step.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Lesson:
     judged: Callable[[Mapping[str, Any]], Tensor] | None = None
     along: Mapping[str, nn.Module] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)
+    constraint: Constraint | None = None
 
     @property
     def trained(self) -> dict[str, nn.Module]:
@@ -134,7 +137,7 @@ class Session:
         self._encode = ObservationEncoder(self._spec, source)
         self._frames = Frames(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
-        self._trainer = Trainer(lesson.trained, settings, place, self._crew.group)
+        self._trainer = Trainer(lesson.trained, settings, place, self._crew.group, lesson.constraint)
         self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
