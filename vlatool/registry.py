@@ -19,7 +19,8 @@ from vlatool.errors import PluginError, UsageError, VlatoolError, nearest
 
 PACKAGES = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
-    "sections": "vlatool.render.sections", "losses": "vlatool.training.losses"}  # fmt: skip
+    "sections": "vlatool.render.sections", "losses": "vlatool.training.losses",
+    "hints": "vlatool.training.hints"}  # fmt: skip
 """Kind -> the package that holds its files, where that has another name."""
 NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",

@@ -48,7 +48,9 @@ def follow(
 def test_the_complete_policy_runs_as_the_guide_shows_it(tmp_path: Path, monkeypatch, vlatool):
     monkeypatch.chdir(tmp_path)
     printed = dict(follow(vlatool))
-    assert len(printed) == 6
+    assert len(printed) == 8
+    (trained,) = [out for line, out in printed.items() if "distill" in line]
+    assert re.search(r"in 20 steps on 256 observations", trained), trained
     (episodes,) = [out for line, out in printed.items() if "closed-loop" in line]
     assert re.search(r"100\.0% of 40 episodes succeed", episodes), episodes
     assert {path.name for path in Path("reach").iterdir()} >= {"statistics.json", "vocabulary.json", "environment.py"}

@@ -57,6 +57,11 @@ def test_recorded_data_may_have_another_name(tmp_path: Path):
     assert read_description(write(tmp_path, calibration="walks.npz")).calibration == tmp_path / "walks.npz"
 
 
+def test_a_function_to_train_with_is_in_the_folder(tmp_path: Path):
+    (tmp_path / "train.py").touch()
+    assert read_description(write(tmp_path, training="train.py:batches")).training == "train.py:batches"
+
+
 @pytest.mark.parametrize("named", ["file", "folder"])
 def test_no_description(tmp_path: Path, named):
     with pytest.raises(SourceError, match=r"No such file: .*policy.yaml") as caught:
@@ -79,6 +84,14 @@ def test_no_description(tmp_path: Path, named):
             "calibration data absent.npz, which does not exist",
         ),
         ({"name": "tiny", "spec": SPEC, "evaluation": "absent.npz"}, "evaluation data absent.npz"),
+        ({"name": "tiny", "spec": SPEC, "training": "train.py:batches"}, "there is no file train.py"),
+        ({"name": "tiny", "spec": SPEC, "training": "train.py"}, "as train.py:batches; got 'train.py'"),
+        ({"name": "tiny", "spec": SPEC, "training": "train.py:a.b"}, "must be a function in a file of the folder"),
+        ({"name": "tiny", "spec": SPEC, "training": "package:batches"}, "got 'package:batches'"),
+        ({"name": "tiny", "spec": SPEC, "training": "../train.py:batches"}, "must be a function in a file"),
+        ({"name": "tiny", "spec": SPEC, "training": "/train.py:batches"}, "must be a function in a file"),
+        ({"name": "tiny", "spec": SPEC, "training": {"make": "train.py:batches"}}, "must be a function in a file"),
+        ({"name": "tiny", "spec": SPEC, "training": None}, "got None"),
     ],
 )
 def test_a_description_that_is_wrong(tmp_path: Path, data, message):

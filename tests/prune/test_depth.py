@@ -12,7 +12,6 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
-from vlatool.prune._ranking import stacks
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune.depth import PROTECTED, Depth, spread
 from vlatool.stage.base import Context, build_stage
@@ -96,19 +95,6 @@ def test_what_sees_and_acts_is_protected_unless_it_is_named(source_bundle: Bundl
     assert protects("ActionHead.blocks")
     assert not protects("fusion")
     assert not protects("language_model.layers")
-
-
-def test_stacks_are_blocks_of_one_kind():
-    shared = nn.Linear(2, 2)
-    net = nn.ModuleDict({
-        "same": nn.ModuleList(nn.Linear(2, 2) for _ in range(3)),
-        "sizes": nn.ModuleList([nn.Linear(2, 2), nn.Linear(2, 3)]),
-        "kinds": nn.Sequential(nn.Linear(2, 2), nn.LayerNorm(2)),
-        "one": nn.ModuleList([nn.Linear(2, 2)]),
-        "shared": nn.ModuleList([shared, shared]),
-        "weightless": nn.Sequential(nn.ReLU(), nn.ReLU()),
-    })  # fmt: skip
-    assert [name for name, _ in stacks(net)] == ["same"]
 
 
 @pytest.mark.parametrize(("options", "says"), [

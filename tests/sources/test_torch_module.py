@@ -5,6 +5,7 @@ import pytest
 
 from vlatool.bundle.bundle import LOCATION, Bundle, hash_file
 from vlatool.errors import SourceError, SpecError
+from vlatool.module.origin import origin_of
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 
@@ -63,6 +64,37 @@ def test_another_factory_may_be_given(policy_dir: Path, tmp_path: Path):
 def test_a_factory_of_a_package_has_no_code_beside_the_policy(policy_dir: Path, tmp_path: Path):
     bundle = build(policy_dir, tmp_path / "out", factory="torch.nn:Identity")
     assert bundle.manifest.source["code"] == {}
+
+
+def with_batches(policy_dir: Path, named: str = "train.py:batches") -> Path:
+    """Let the policy name a function that yields batches, in a file that imports a neighbour."""
+    with (policy_dir / "policy.yaml").open("a") as stream:
+        stream.write(f"training: {named}\n")
+    file = policy_dir / named.partition(":")[0]
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("import worlds\n\n\ndef batches(seed, size): ...\n")
+    (file.parent / "worlds.py").write_text("SIZE = 3\n")
+    return policy_dir
+
+
+@pytest.mark.parametrize("factory", ["", "torch.nn:Identity"], ids=["beside", "of a package"])
+def test_the_function_that_yields_batches_is_a_part_of_the_policy(policy_dir: Path, tmp_path: Path, factory: str):
+    before = build(policy_dir, tmp_path / "before", factory=factory)
+    policy = with_batches(policy_dir)
+    first = build(policy, tmp_path / "first", factory=factory)
+    assert {*first.manifest.source["code"]} - {*before.manifest.source["code"]} == {"train.py", "worlds.py"}
+    stage = TorchModule(policy=policy, factory=factory)
+    key = stage.key("")
+    (policy / "worlds.py").write_text("SIZE = 4\n")
+    assert stage.key("") != key
+    assert build(policy, tmp_path / "second", factory=factory).hash != first.hash
+    with pytest.raises(SourceError, match=r"worlds\.py has changed since the source bundle was made"):
+        origin_of(first).check()
+
+
+def test_batches_from_elsewhere_are_refused(policy_dir: Path):
+    with pytest.raises(SourceError, match=r"says training: data/train.py:batches, which lies in .*tiny/data; the"):
+        TorchModule(policy=with_batches(policy_dir, "data/train.py:batches")).inputs()
 
 
 def test_a_policy_without_recorded_data(policy_dir: Path, tmp_path: Path):

@@ -69,6 +69,14 @@ class BatchedProgram:
         if len(next(iter(inputs.values()))) > 1 and self._batches is None:
             self._batches = self._takes_batches(inputs, noise)
 
+    def together(self, size: int) -> bool:
+        """Return whether a batch of that size runs at once, and not row by row; ``look`` at one before."""
+        return size > 1 and bool(self._batches)
+
+    def modules_for(self, size: int) -> dict[str, nn.Module]:
+        """Return what runs for a batch of that size: graph name -> module, traced anew where it must be."""
+        return {graph: self._module(graph, size if self.together(size) else 1) for graph in self.modules}
+
     def _takes_batches(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> bool:
         """Say whether two rows together give what each gives alone."""
         torch = require("torch", "build")

@@ -23,7 +23,7 @@ from vlatool.runtime.statistics import load_normaliser
 FILE = "policy.yaml"
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
-    "parts", "calibration", "evaluation", "weights", "files",
+    "parts", "calibration", "evaluation", "weights", "files", "training",
 )  # fmt: skip
 IN_MANIFEST = ("name", "version", "spec", "program", "environment", "parts", "description", "license")
 """Fields that a bundle's manifest takes from the description."""
@@ -43,6 +43,7 @@ class Description:
         calibration, evaluation: Recorded observations, or None.
         weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
             module alone. Empty when the factory loads the weights.
+        training: ``FILE.py:FUNCTION`` of the folder that yields batches of observations to train on; empty for none.
         files: Globs of the files that the factory reads; None: every file of weights beside it.
     """
 
@@ -61,6 +62,7 @@ class Description:
     license: str = ""
     weights: str = ""
     files: tuple[str, ...] | None = None
+    training: str = ""
 
     def assets(self) -> list[Path]:
         """Files in the folder that the spec needs on the robot."""
@@ -124,6 +126,7 @@ def read_description(path: Path) -> Description:
         license=str(data.get("license", "")),
         weights=_weights(file, data.get("weights", "")),
         files=_files(file, data.get("files")),
+        training=_training(file, data.get("training", "")),
     )
 
 
@@ -142,6 +145,20 @@ def _weights(file: Path, pattern: Any) -> str:
     if not _inside(pattern):
         raise SourceError(f"{file}: 'weights' must be a glob inside the folder, as \"*.safetensors\"; got {pattern!r}.")
     return str(pattern)
+
+
+def _training(file: Path, named: Any) -> str:
+    """A function in a Python file of the policy's folder."""
+    if named == "":
+        return ""
+    where, _, function = named.rpartition(":") if isinstance(named, str) else ("", "", "")
+    if not (where.endswith(".py") and function.isidentifier() and _inside(where)):
+        raise SourceError(
+            f"{file}: 'training' must be a function in a file of the folder, as train.py:batches; got {named!r}."
+        )
+    if not (file.parent / where).is_file():
+        raise SourceError(f"{file} names the function {named} to train with; there is no file {where}.")
+    return str(named)
 
 
 def _inside(pattern: Any) -> bool:

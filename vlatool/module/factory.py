@@ -7,7 +7,7 @@ import hashlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,6 +19,8 @@ from vlatool.user_code.children import left
 
 OWN_NAME = "vlatool_source_"
 """How the names begin that files of a policy are imported under."""
+_END = object()
+"""What comes after the last value of an iterator."""
 
 
 def split_factory(factory: str) -> tuple[str, str]:
@@ -94,9 +96,42 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
         SourceError: when the call raises.
     """
     make = import_factory(factory, folder)
+    with _running(factory, folder, f"the factory '{factory}'"):
+        return make(**arguments)
+
+
+def yielded(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[Any]:
+    """Import a function that yields, call it, and yield what it does.
+
+    Args:
+        function: As a factory is named.
+        folder: Where its file lies.
+        arguments: Of the call.
+
+    Raises:
+        SourceError: when it raises, or gives nothing to go through.
+    """
+    make = import_factory(function, folder)
+    with _running(function, folder, f"'{function}'"):
+        product = make(**arguments)
+        values = iter(product) if isinstance(product, Iterable) else None
+    if values is None:
+        kind = type(product).__name__
+        raise SourceError(f"'{function}' gives a value of type {kind}; it must yield.", "let it yield its values")
+    while True:
+        with _running(function, folder, f"'{function}'"):
+            value = next(values, _END)
+        if value is _END:
+            return
+        yield value
+
+
+@contextlib.contextmanager
+def _running(factory: str, folder: Path, what: str) -> Iterator[None]:
+    """Turn whatever a user's function raises in this block into an error that names it."""
     try:
-        with _importable(factory_file(factory, folder)), exits_caught(f"the factory '{factory}'"):
-            return make(**arguments)
+        with _importable(factory_file(factory, folder)), exits_caught(what):
+            yield
     except (VlatoolError, MemoryError):
         raise
     except ModuleNotFoundError as error:
@@ -104,7 +139,8 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
             f"'{factory}' needs the package '{error.name}', which is not installed.", _install_hint(str(error.name))
         ) from error
     except Exception as error:  # the seam: user code may raise anything
-        raise SourceError(f"The factory '{factory}' failed: {type(error).__name__}: {message_of(error)}.") from error
+        about = what[:1].upper() + what[1:]
+        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.") from error
 
 
 @contextlib.contextmanager

@@ -32,6 +32,7 @@ class Origin:
         code: File beside the factory -> its SHA-256 when the source bundle was made.
         environment: ``make`` and ``tasks`` of the environment that the policy's description names.
         program: How the description lets its graphs run.
+        training: ``FILE.py:FUNCTION`` that yields batches to train on, as the description has it; empty for none.
     """
 
     folder: Path
@@ -41,6 +42,7 @@ class Origin:
     code: Mapping[str, str] = field(default_factory=dict)
     environment: Mapping[str, Any] = field(default_factory=dict)
     program: tuple[ProgramStep, ...] = ()
+    training: str = ""
 
     def check(self, endings: tuple[str, ...] = ()) -> None:
         """Raise when a file is not what it was: every one, or those with these endings.
@@ -117,8 +119,9 @@ def origin_of(bundle: Bundle) -> Origin:
                 f"{bundle.path} says {key}: {recorded[key]!r}; the policy's description says {own[key]!r}.", AGAIN
             )
     return Origin(
-        folder, factory, described.arguments, described.weights, _code(bundle), described.environment, described.program
-    )
+        folder, factory, described.arguments, described.weights, _code(bundle), described.environment,
+        described.program, described.training,
+    )  # fmt: skip
 
 
 def _check_own(factory: str, folder: Path, bundle: Bundle) -> None:

@@ -1,4 +1,4 @@
-"""Stacks of blocks, and how much the action needs each block."""
+"""How much the action needs each block of a stack."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, require
 from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.blocks import first, stacks
 from vlatool.module.feeds import recorded_inputs
 from vlatool.prune._slopes import slopes_of
 from vlatool.runtime.policy import relative_error
@@ -23,37 +24,6 @@ Stack = tuple[str, str]
 """Blocks one behind the other: their graph and the name of the list."""
 Place = tuple[str, str, int]
 """A block: its graph, the name of the stack, and its number there."""
-
-
-def stacks(module: nn.Module, *, mixed: bool = False) -> Iterator[tuple[str, Any]]:
-    """Yield (name, stack) of every list or sequence of at least two modules of one class with equal weights' shapes.
-
-    Args:
-        module: In which they are looked for.
-        mixed: Also yield lists of modules of several kinds, such as layers that alternate.
-    """
-    nn = require("torch", "build").nn
-    for name, part in module.named_modules():
-        if not isinstance(part, nn.ModuleList | nn.Sequential) or len(part) < 2:
-            continue
-        kinds = {type(block) for block in part}
-        shapes = {
-            tuple((key, tuple(value.shape)) for key, value in block.state_dict(keep_vars=True).items())
-            for block in part
-        }
-        shared = len({id(block) for block in part}) < len(part)
-        alike = len(kinds) == 1 and len(shapes) == 1
-        if (alike or (mixed and isinstance(part, nn.ModuleList))) and shapes != {()} and not shared:
-            yield name, part
-
-
-def stacks_of(modules: Mapping[str, nn.Module], *, mixed: bool = False) -> list[tuple[dict[str, str], Any]]:
-    """Return (graph name -> name, stack) of every stack of a policy; one that graphs share comes once."""
-    found: dict[int, tuple[dict[str, str], Any]] = {}
-    for graph, module in modules.items():
-        for name, stack in stacks(module, mixed=mixed):
-            found.setdefault(id(stack), ({}, stack))[0][graph] = name
-    return list(found.values())
 
 
 class Ranking:
@@ -100,7 +70,7 @@ class Ranking:
 
         def looking(place: Place) -> Any:
             def look(_module: Any, given: Any, named: Any, gives: Any) -> None:
-                similar = torch.nn.functional.cosine_similarity(_stream(given, named), _first(gives), dim=-1)
+                similar = torch.nn.functional.cosine_similarity(_stream(given, named), first(gives), dim=-1)
                 turned[place].append(1 - float(similar.mean()))
 
             return look
@@ -122,7 +92,7 @@ class Ranking:
         def gated(place: Place) -> Any:
             def scale(_module: Any, given: Any, named: Any, gives: Any) -> Any:
                 stream = _stream(given, named)
-                mixed = stream + gates[place] * (_first(gives) - stream)
+                mixed = stream + gates[place] * (first(gives) - stream)
                 return (mixed, *gives[1:]) if isinstance(gives, tuple) else mixed
 
             return scale
@@ -144,10 +114,6 @@ class Ranking:
                 handle.remove()
 
 
-def _first(gives: Any) -> Any:
-    return gives[0] if isinstance(gives, tuple | list) else gives
-
-
 def _stream(given: Any, named: Any) -> Any:
     """Return what passes through a block: its first argument."""
     return given[0] if given else next(iter(named.values()))
@@ -156,9 +122,9 @@ def _stream(given: Any, named: Any) -> Any:
 def _passes_on(_module: Any, given: Any, named: Any, gives: Any) -> Any:
     """Take the place of a block that is removed: what it is given, beside what else it gives."""
     stream = _stream(given, named)
-    if _first(gives).shape != stream.shape:
+    if first(gives).shape != stream.shape:
         raise SourceError(
-            f"A block gives {list(_first(gives).shape)} for {list(stream.shape)}: without it, shapes would not fit.",
+            f"A block gives {list(first(gives).shape)} for {list(stream.shape)}: without it, shapes would not fit.",
             "leave its stack out: --exclude NAME",
         )
     return (stream, *gives[1:]) if isinstance(gives, tuple) else stream

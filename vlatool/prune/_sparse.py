@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 PATTERNS = {"2:4": (2, 4), "4:8": (4, 8)}
 """Pattern -> how many of how many neighbours along the inputs stay."""
+Pattern = Literal["unstructured", "2:4", "4:8"]
 PROTECTED = ("embed", "norm", "head", "action")
 """Parts of names of layers that stay dense unless --include names them."""
 
@@ -35,7 +36,7 @@ class Sparse(ModuleStage):
     """Whether the method looks at what layers are given."""
 
     ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that becomes zero")
-    pattern: Literal["unstructured", "2:4", "4:8"] = Field(
+    pattern: Pattern = Field(
         "unstructured",
         description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
     )
@@ -49,9 +50,8 @@ class Sparse(ModuleStage):
         Raises:
             RecipeError: when no layer is chosen, or the ratio is not that of the pattern.
         """
-        if self.pattern != "unstructured" and self.ratio != 0.5:
-            raise RecipeError(f"The pattern {self.pattern} keeps half of the weights.", "leave --ratio out")
-        layers = self._layers(modules, source)
+        check_pattern(self.pattern, self.ratio)
+        layers = sparse_layers(modules, source, self.include, self.exclude)
         given = self._given(layers, modules, source, context) if self.looks else {}
         for number, (name, layer) in enumerate(layers.items()):
             context.tell(f"pruning {name}", number / len(layers))
@@ -75,52 +75,11 @@ class Sparse(ModuleStage):
             score: (outputs, inputs).
             rows: Whether weights compete within their row, rather than in the whole layer.
         """
-        torch = require("torch", "build")
-        if self.pattern != "unstructured":
-            stay, of = PATTERNS[self.pattern]
-            padded = torch.nn.functional.pad(score, (0, -score.shape[1] % of), value=torch.inf)
-            ranks = padded.reshape(len(score), -1, of).argsort(dim=-1, stable=True).argsort(dim=-1)
-            whole = (ranks < of - stay).reshape(len(score), -1)
-            within: Tensor = whole[:, : score.shape[1]]
-            return within
-        flat = score if rows else score.reshape(1, -1)
-        count = round(flat.shape[1] * self.ratio)
-        ranks = flat.argsort(dim=1, stable=True).argsort(dim=1)
-        least: Tensor = (ranks < count).reshape(score.shape)
-        return least
+        return least(score, self.pattern, self.ratio, rows=rows)
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Say how many weights are zero, and which engine gains by it."""
-        zeros = total = 0
-        for name in made.manifest.files:
-            for tensor in read_tensors(made.file(name)).values() if name.endswith(".safetensors") else ():
-                zeros += int((tensor == 0).sum()) if tensor.dim() > 1 else 0
-                total += tensor.numel() if tensor.dim() > 1 else 0
-        engines = usable_engines().values()
-        gains = [engine.title for engine in engines if self.pattern in engine.sparse]
-        others = " and ".join(engine.title for engine in engines)
-        return (
-            f"{zeros / max(1, total):.1%} of the weights are zero; no tensor is smaller",
-            f"faster in {', '.join(gains)}" if gains else f"{others} multiply zeros like other numbers: nothing is "
-            "faster (measure it: vlatool compare). 2:4 is for sparse tensor cores; for speed: vlatool prune structured",
-            *super().lines(made),
-        )  # fmt: skip
-
-    def _layers(self, modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Any]:
-        nn = require("torch", "build").nn
-        kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
-        named = {
-            name: part
-            for module in modules.values()
-            for name, part in module.named_modules()
-            if isinstance(part, kinds)
-        }
-        selection = Selection(self.include, self.exclude, PROTECTED)
-        selection.check(list(named), "layer")
-        chosen = {name: part for name, part in named.items() if selection.has((name,))}
-        if not chosen:
-            raise RecipeError(f"{source.manifest.name} has no layer to prune.", "look at --include and --exclude")
-        return chosen
+        return (*zeros_told(made, self.pattern), *super().lines(made))
 
     def _given(
         self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context
@@ -148,6 +107,84 @@ class Sparse(ModuleStage):
                 context.tell("looking at what layers are given", number / len(recorded))
                 program.run(inputs, noise)
         return {name: total / counts[name] for name, total in sums.items()}
+
+
+def check_pattern(pattern: Pattern, ratio: float) -> None:
+    """Refuse a ratio that is not that of the pattern.
+
+    Raises:
+        RecipeError: saying so.
+    """
+    if pattern != "unstructured" and ratio != 0.5:
+        raise RecipeError(f"The pattern {pattern} keeps half of the weights.", "leave --ratio out")
+
+
+def least(score: Tensor, pattern: Pattern, share: float, *, rows: bool) -> Tensor:
+    """Return which elements have the least scores; of equal ones the first.
+
+    Args:
+        score: (outputs, inputs).
+        pattern: Whether they compete with their neighbours alone.
+        share: Of the elements (rounded: of the neighbours).
+        rows: Without a pattern: whether they compete within their row, rather than in the whole layer.
+    """
+    torch = require("torch", "build")
+    if pattern != "unstructured":
+        _, of = PATTERNS[pattern]
+        padded = torch.nn.functional.pad(score, (0, -score.shape[1] % of), value=torch.inf)
+        ranks = padded.reshape(len(score), -1, of).argsort(dim=-1, stable=True).argsort(dim=-1)
+        whole = (ranks < round(share * of)).reshape(len(score), -1)
+        within: Tensor = whole[:, : score.shape[1]]
+        return within
+    flat = score if rows else score.reshape(1, -1)
+    count = round(flat.shape[1] * share)
+    ranks = flat.argsort(dim=1, stable=True).argsort(dim=1)
+    smallest: Tensor = (ranks < count).reshape(score.shape)
+    return smallest
+
+
+def zeros_told(made: Bundle, pattern: Pattern) -> tuple[str, str]:
+    """Say how many weights of a bundle are zero, and which engine gains by it."""
+    zeros = total = 0
+    for name in made.manifest.files:
+        for tensor in read_tensors(made.file(name)).values() if name.endswith(".safetensors") else ():
+            zeros += int((tensor == 0).sum()) if tensor.dim() > 1 else 0
+            total += tensor.numel() if tensor.dim() > 1 else 0
+    engines = usable_engines().values()
+    gains = [engine.title for engine in engines if pattern in engine.sparse]
+    others = " and ".join(engine.title for engine in engines)
+    return (
+        f"{zeros / max(1, total):.1%} of the weights are zero; no tensor is smaller",
+        f"faster in {', '.join(gains)}" if gains else f"{others} multiply zeros like other numbers: nothing is "
+        "faster (measure it: vlatool compare). 2:4 is for sparse tensor cores; for speed: vlatool prune structured",
+    )  # fmt: skip
+
+
+def sparse_layers(
+    modules: Mapping[str, nn.Module], source: Bundle, include: tuple[str, ...], exclude: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return name -> Linear or convolution layer whose weights may become zero; ``GRAPH.name`` of several graphs.
+
+    A layer that several graphs share is the first one's.
+
+    Raises:
+        RecipeError: when a pattern matches none, or there is none.
+    """
+    nn = require("torch", "build").nn
+    kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
+    found: dict[int, tuple[tuple[str, str], Any]] = {}
+    for graph, module in modules.items():
+        for name, part in module.named_modules():
+            if isinstance(part, kinds):
+                found.setdefault(id(part), ((graph, name), part))
+    named = dict(found.values())
+    full = {(graph, name): f"{graph}.{name}" if len(modules) > 1 else name for graph, name in named}
+    selection = Selection(include, exclude, PROTECTED)
+    selection.check([*full.values(), *(name for _, name in named)], "layer")
+    chosen = {full[place]: part for place, part in named.items() if selection.has({place[1], full[place]})}
+    if not chosen:
+        raise RecipeError(f"{source.manifest.name} has no layer to prune.", "look at --include and --exclude")
+    return chosen
 
 
 def _rows(layer: Any, given: Tensor) -> Tensor:

@@ -10,9 +10,10 @@ from pydantic import Field, field_validator
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
+from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import BLOCKS, Edit
 from vlatool.module.stage import Changed, ModuleStage
-from vlatool.prune._ranking import Place, Ranking, Stack, stacks_of
+from vlatool.prune._ranking import Place, Ranking, Stack
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.stage.base import Context
 

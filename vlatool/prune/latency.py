@@ -13,6 +13,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError
+from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._clock import Clock
@@ -26,7 +27,7 @@ from vlatool.prune._prices import (
     role_of,
     staying,
 )
-from vlatool.prune._ranking import Ranking, stacks_of
+from vlatool.prune._ranking import Ranking
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.prune.depth import PROTECTED

@@ -108,14 +108,15 @@ class TorchModule(Source):
         return factory
 
     def _code(self, described: Description) -> list[Path]:
-        """Return the code that the policy and its environment import from its folder, and the data that they read."""
-        path = factory_file(self._factory(described), described.folder)
+        """Return the code that the policy, its environment and its batches import, and the data that they read."""
+        path, folder = factory_file(self._factory(described), described.folder), self._root(described)
+        training = _training(described, folder)
         if path is None:
-            return []
-        folder = self._root(described)
+            read = self._data(described, folder) if training and described.files is not None else set()
+            return sorted(imported_files(training, folder) | read)
         environment = str(described.environment.get("make", "")).rpartition(":")[0]
         beside = (described.folder / environment).resolve() if environment.endswith(".py") else path
-        roots = [path, *([beside] if beside.is_relative_to(folder) else [])]
+        roots = [path, *([beside] if beside.is_relative_to(folder) else []), *training]
         shards = set(described.folder.resolve().glob(described.weights)) if described.weights else set()
         return sorted((imported_files(roots, folder) | self._data(described, folder)) - shards)
 
@@ -138,6 +139,24 @@ class TorchModule(Source):
         """Return the folder that the factory's imports begin in."""
         path = factory_file(self._factory(described), described.folder)
         return path.parent if path is not None else described.folder.resolve()
+
+
+def _training(described: Description, folder: Path) -> list[Path]:
+    """Return the file that yields batches to train on, if there is one; it lies where imports begin.
+
+    Raises:
+        SourceError: when it lies elsewhere: what it imports would not be found.
+    """
+    if not described.training:
+        return []
+    file = (described.folder / described.training.rpartition(":")[0]).resolve()
+    if file.parent != folder.resolve():
+        raise SourceError(
+            f"{described.folder} says training: {described.training}, which lies in {file.parent}; the policy's code "
+            f"lies in {folder}.",
+            "put both into the same folder",
+        )
+    return [file]
 
 
 def _shards(described: Description) -> str:

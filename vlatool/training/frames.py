@@ -94,7 +94,8 @@ def joined(parts: Iterable[Path], target: Path) -> int:
     if not folders:
         raise DataError(
             "There are no observations to train on.",
-            "record some and name them in policy.yaml (calibration: FILE.npz), or name an environment there",
+            "record some and name them in policy.yaml (calibration: FILE.npz), or name an environment there, or a "
+            "function that yields batches (training: train.py:batches)",
         )
     names = sorted(file.name for file in folders[0].glob("*.npy"))
     for name in names:

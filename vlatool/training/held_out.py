@@ -35,7 +35,7 @@ class HeldOut:
 
     def __init__(self, place: Path) -> None:
         self._frames = Frames(place / FOLDER)
-        self._others: Recording | None = None
+        self._others: Counted | None = None
 
     @property
     def others(self) -> Counted:
@@ -44,24 +44,25 @@ class HeldOut:
             raise RuntimeError("prepare() comes first")
         return self._others
 
-    def prepare(self, source: Bundle, most: int, write: Callable[[Counted, Path], None]) -> None:
+    def prepare(
+        self, source: Bundle, most: int, write: Callable[[Counted, Path], None], instead: Callable[[Path], bool]
+    ) -> None:
         """Split the recording, and write what is held out unless an earlier run did.
 
         Args:
             source: The student's bundle.
             most: Observations that are used of it.
             write: Called with observations and the folder for them.
+            instead: Called with the folder where there are not two observations to split; says whether it wrote others.
 
         Raises:
             DataError: when there are not two observations to split.
         """
         recording = calibration_recording(source)
         if recording is None or len(recording) < 2:
-            raise DataError(
-                f"--patience needs something to judge with: episodes of the student's, or two recorded observations; "
-                f"there are {len(recording) if recording else 0}.",
-                "record some (calibration: FILE.npz in policy.yaml), name an environment there, or omit --patience",
-            )
+            self._others = [] if recording is None else recording
+            next_round(self._frames, 0, partial(_required, instead, len(self._others)))
+            return
         used = np.zeros(len(recording), np.bool_)
         used[recording.spread(most)] = True
         recording = recording.only(used)
@@ -83,6 +84,16 @@ class HeldOut:
             for part in parts:
                 total += float(loss(self._frames.batch(part))) * len(part)
         return total / len(self._frames)
+
+
+def _required(instead: Callable[[Path], bool], recorded: int, target: Path) -> None:
+    if not instead(target):
+        raise DataError(
+            f"--patience needs something to judge with: episodes of the student's, or two recorded observations; "
+            f"there are {recorded}.",
+            "record some (calibration: FILE.npz in policy.yaml), name an environment or a function that yields batches "
+            "there (training: train.py:batches), or omit --patience",
+        )
 
 
 def held_out(recording: Recording) -> NDArray[np.bool_]:

@@ -13,6 +13,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest
 from vlatool.module.batched import BatchedProgram
+from vlatool.training.hinted import with_hints
 from vlatool.training.rounds import LABEL, NOISE, tensors
 from vlatool.training.session import Lesson
 from vlatool.training.stage import TrainingStage
@@ -30,6 +31,12 @@ class ImitationStage(TrainingStage):
     loss: str = Field("auto", description="kl (discrete actions), l1, l2 or huber; kl or l1 when auto")
     temperature: float = Field(2.0, gt=0, le=100, description="of kl")
     delta: float = Field(0.1, gt=0, le=1000, description="of huber")
+    features: float = Field(
+        0.0, ge=0, le=1e6, description="weight in the loss of what blocks give, compared with the teacher's; 0 for none"
+    )
+    attention: float = Field(
+        0.0, ge=0, le=1e6, description="weight of which tokens are alike in what blocks give; 0 for none"
+    )
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The loss is known, and fits the action."""
@@ -58,7 +65,8 @@ class ImitationStage(TrainingStage):
             far: Tensor = distance(values[action.name].float(), tensors(rows, LABEL)[action.name])
             return far
 
-        return Lesson(name, modules, loss)
+        hints = {"features": self.features, "attention": self.attention}
+        return with_hints(Lesson(name, modules, loss), hints, student, source, teacher, self.seed)
 
     def _distance(self, name: str) -> Any:
         """Return the loss with the options that it takes."""

@@ -22,6 +22,7 @@ from vlatool.files.printable import message_of
 from vlatool.module.batched import no_gradient
 from vlatool.module.edits import save_tensors
 from vlatool.training.best import Best
+from vlatool.training.constraint import Constraint
 from vlatool.training.group import Group
 
 if TYPE_CHECKING:
@@ -87,13 +88,19 @@ class Trainer:
         settings: How long and how fast.
         folder: For checkpoints.
         group: The processes that train together; the first one writes checkpoints.
+        constraint: What holds of the weights after each step.
     """
 
     def __init__(
-        self, modules: Mapping[str, nn.Module], settings: Settings, folder: Path, group: Group | None = None
+        self,
+        modules: Mapping[str, nn.Module],
+        settings: Settings,
+        folder: Path,
+        group: Group | None = None,
+        constraint: Constraint | None = None,
     ) -> None:
         torch = require("torch", "build")
-        self._settings, self._group = settings, group or Group()
+        self._settings, self._group, self._constraint = settings, group or Group(), constraint or Constraint()
         self._file = folder / CHECKPOINT
         self._weights = {
             f"{graph}.{name}": value.requires_grad_()
@@ -148,7 +155,8 @@ class Trainer:
         for group in self._optimizer.param_groups:
             group["lr"] = self._settings.rate(self.step)
         require("torch", "build").nn.utils.clip_grad_norm_(list(self._weights.values()), CLIP)
-        self._optimizer.step()
+        with self._constraint.step(self.step + 1):
+            self._optimizer.step()
         self._follow()
         self.step += 1
         self.losses.append(loss)
@@ -175,6 +183,7 @@ class Trainer:
         with require("torch", "build").no_grad():
             for name, value in self._weights.items():
                 self._average[name].lerp_(value, 1 - decay)
+                self._constraint.average(value, self._average[name])
 
     def swap(self) -> None:
         """Exchange the weights and their average."""

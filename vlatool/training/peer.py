@@ -46,7 +46,7 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
     source, place = Bundle.open(Path(job["source"]), verify=False), Path(job["place"])
     group, frames = Group(job["rank"], job["size"]), Frames(place)
     _, lesson = stage.prepared(load_modules(source), source)
-    trainer = Trainer(lesson.modules, stage.settings(), place, group)
+    trainer = Trainer(lesson.trained, stage.settings(), place, group, lesson.constraint)
     batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
     _peer[:] = [Peer(place / MEETING, group, frames, trainer, batches, contextlib.ExitStack())]
 

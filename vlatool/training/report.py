@@ -51,6 +51,6 @@ def _round(about: Record) -> Record:
     """Return what a person wants to know of a round."""
     episodes = about.get("episodes")
     success = f"{about['successes'] / episodes:.1%}" if episodes else None
-    who = about["actor"] if episodes else "recordings"
+    who = about["actor"] if episodes else "batches" if about.get("yielded") else "recordings"
     return {"before step": about["step"] + 1, "who acted": who, "episodes": episodes, "success": success,
             "observations": about["observations"]}  # fmt: skip

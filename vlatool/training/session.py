@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.batches import Batches
+from vlatool.training.constraint import Constraint
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
 from vlatool.training.forecast import Forecast
@@ -27,6 +28,7 @@ from vlatool.training.held_out import HeldOut
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
 from vlatool.training.teacher import Teacher
+from vlatool.training.yielded import write_yielded
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -50,6 +52,7 @@ class Plan:
         first_seed: Of the first episode of each task; the others follow.
         patience: Pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: Parts of a batch, computed one after the other.
+        samples: Rows that are taken from the function of the policy's that yields batches.
     """
 
     batch: int
@@ -60,6 +63,7 @@ class Plan:
     first_seed: int
     patience: int = 0
     accumulate: int = 1
+    samples: int = 0
 
     def asked(self, number: int) -> int:
         """Return how many episodes a round has."""
@@ -79,11 +83,24 @@ class Lesson:
         modules: The student's, which are trained in place.
         loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
             computed in parts.
+        judged: What of it says how good the student is on rows that it has not seen; all of it when None.
+        along: Name -> module that is trained along, and no part of the student.
+        about: What else is to be known of the training, as JSON values.
+        constraint: What holds of the weights after each step.
     """
 
     name: str
     modules: Mapping[str, nn.Module]
     loss: Callable[[Mapping[str, Any]], Tensor]
+    judged: Callable[[Mapping[str, Any]], Tensor] | None = None
+    along: Mapping[str, nn.Module] = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)
+    constraint: Constraint | None = None
+
+    @property
+    def trained(self) -> dict[str, nn.Module]:
+        """Everything that is trained."""
+        return {**self.modules, **self.along}
 
 
 class Session:
@@ -120,7 +137,7 @@ class Session:
         self._encode = ObservationEncoder(self._spec, source)
         self._frames = Frames(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
-        self._trainer = Trainer(lesson.modules, settings, place, self._crew.group)
+        self._trainer = Trainer(lesson.trained, settings, place, self._crew.group, lesson.constraint)
         self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
@@ -131,7 +148,7 @@ class Session:
         if self._trainer.step:
             self._context.tell(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
-            self._held_out.prepare(self._source, RECORDED, self._write_held_out)
+            self._held_out.prepare(self._source, RECORDED, self._write_held_out, self._yield_held_out)
         next_round(self._frames, 0, self._first)
         pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
         for number, end in enumerate([*pauses, self._settings.steps]):
@@ -171,7 +188,8 @@ class Session:
             return float(about["successes"] / about["episodes"])
         self._trainer.swap()
         try:
-            loss = self._held_out.loss(self._lesson.loss, self._plan.batch, bfloat16=self._settings.bfloat16)
+            judged = self._lesson.judged or self._lesson.loss
+            loss = self._held_out.loss(judged, self._plan.batch, bfloat16=self._settings.bfloat16)
         finally:
             self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
@@ -184,6 +202,7 @@ class Session:
         scores = best.scores if self._held_out is None else [-score for score in best.scores]
         return {
             "loss": self._lesson.name,
+            **self._lesson.about,
             "precision": "bfloat16" if self._settings.bfloat16 else "float32",
             "threads": require("torch", "build").get_num_threads(),
             **({"processes": several} if several > 1 else {}),
@@ -207,11 +226,23 @@ class Session:
         write_recorded(self._encode, observations, target)
         self._label(target, 0, 1)
 
+    def _yield_held_out(self, target: Path) -> bool:
+        """Write rows to judge with that the policy's function yields; say whether it does."""
+        if self._plan.samples:
+            self._yield(-(-self._plan.samples // 10), self._settings.seed + 1, target)
+            self._label(target, 0, 1)
+        return bool(self._plan.samples)
+
+    def _yield(self, count: int, seed: int, target: Path) -> None:
+        write_yielded(self._source, count, seed, target, self._context)
+
     def _first(self, target: Path) -> None:
-        """Write the first round: recordings, and the teacher's episodes."""
+        """Write the first round: recordings, batches of the policy's own, and the teacher's episodes."""
         recorded = recorded_observations(self._source, RECORDED)
         chosen = self._held_out.others if self._held_out is not None else recorded
         write_recorded(self._encode, chosen, target / "recorded")
+        if self._plan.samples:
+            self._yield(self._plan.samples, self._settings.seed, target / "yielded")
         self._play(target, 0)
 
     def _students(self, number: int, target: Path) -> None:
@@ -235,8 +266,9 @@ class Session:
             ]
             outcomes = run_jobs(self._actor(target / "actor", number), jobs, "", self._context)
             about |= {"episodes": len(outcomes), "successes": sum(outcome.success for outcome in outcomes)}
-        about["observations"] = joined((target / "recorded", *sorted(folder.glob("*"))), target)
-        for part in ("recorded", "episodes", "actor"):
+        about |= {"yielded": self._plan.samples} if self._plan.samples and not number else {}
+        about["observations"] = joined((target / "recorded", target / "yielded", *sorted(folder.glob("*"))), target)
+        for part in ("recorded", "yielded", "episodes", "actor"):
             shutil.rmtree(target / part, ignore_errors=True)
         (self._place / ROUND.format(number)).write_text(json.dumps(about))
         self._label(target, number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -23,8 +24,10 @@ from vlatool.training.crew import crew_of
 from vlatool.training.events import check_events
 from vlatool.training.loop import Settings, has_bfloat16, seconds_of
 from vlatool.training.report import write_training_report
+from vlatool.training.rounds import scene_of
 from vlatool.training.session import Lesson, Plan, Session
 from vlatool.training.teacher import Teacher
+from vlatool.training.yielded import rows_asked
 
 if TYPE_CHECKING:
     from torch import nn
@@ -59,6 +62,10 @@ class TrainingStage(ModuleStage):
     student_episodes: int = Field(300, ge=0, description="episodes that the student plays each time")
     every: int = Field(250, ge=1, description="steps between the student's episodes")
     noise: float = Field(0.1, ge=0, le=1, description="disturbs the actions in these episodes: share of their spread")
+    samples: int | None = Field(
+        None, ge=0, description="rows from the function that policy.yaml names under training; 8192 where no episodes "
+        "are played first, else none",
+    )  # fmt: skip
     first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode to train on")
     seed: int = Field(0, ge=0, description="of batches and noise")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
@@ -121,6 +128,7 @@ class TrainingStage(ModuleStage):
         return (
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
+            *_compared(training.get("hints", {})),
             *_judged(training.get("judged")),
             *([f"loss curve: {page}"] if (page := made.path / REPORTS / "report.html").is_file() else []),
             *super().lines(made),
@@ -145,9 +153,11 @@ class TrainingStage(ModuleStage):
             torch.set_num_threads(before)
 
     def _trained(self, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context) -> Changed:
+        plays = self.episodes > 0 and scene_of(source) is not None
+        plan = replace(self.plan(), samples=rows_asked(self.samples, source, plays))
         teacher, lesson = self.prepared(modules, source)
         with crew_of(self._job(source), self.processes, place, self.runs(source)) as crew:
-            session = Session(self.plan(), self.settings(), lesson, source, teacher, place, context, crew)
+            session = Session(plan, self.settings(), lesson, source, teacher, place, context, crew)
             return Changed(training=session.run())
 
     def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
@@ -183,6 +193,20 @@ class TrainingStage(ModuleStage):
 
     def _place(self, source: Bundle) -> Path:
         return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+
+
+def _compared(hints: Mapping[str, Any]) -> tuple[str, ...]:
+    """Say which blocks were compared with the teacher's, and which stacks were not."""
+    lines = []
+    for name, about in hints.items():
+        blocks: dict[str, list[str]] = {}
+        for graph, stack, ours, theirs in about["blocks"]:
+            blocks.setdefault(f"{graph} {stack}".strip(), []).append(f"{ours}:{theirs}")
+        told = "; ".join(f"{stack} {' '.join(pairs)}" for stack, pairs in blocks.items())
+        lines.append(f"{name} of blocks (student:teacher): {told}")
+        lines += [f"{name}: {f'{graph} {stack}'.strip()} left out, {why}" for graph, stack, why in
+                  about.get("left_out", ())]  # fmt: skip
+    return tuple(lines)
 
 
 def _judged(judged: Mapping[str, Any] | None) -> tuple[str, ...]:

@@ -1,0 +1,72 @@
+"""Gradual magnitude pruning: zeros are added while the policy is trained, which learns to do without the weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+from pydantic import Field
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError
+from vlatool.prune._sparse import Pattern, check_pattern, least, sparse_layers, zeros_told
+from vlatool.training.constraint import GrowingZeros
+from vlatool.training.imitation import ImitationStage
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from vlatool.hardware.profile import Profile
+    from vlatool.training.session import Lesson
+    from vlatool.training.teacher import Teacher
+
+
+class Gradual(ImitationStage):
+    """Set the smallest weights of each layer to zero step by step, while the teacher says what the policy should do.
+
+    After step t of n the share of zeros is ``s (1 - (1 - t/n)^3)`` (Zhu and Gupta, arXiv 1710.01878, from no zeros at
+    the start): many early, when there are many weights to spare, and few in the end. What is zero stays zero. The rest
+    of the training goes on with the zeros as they are. Shapes stay: processors multiply zeros like other numbers, so
+    that nothing is faster there; --pattern 2:4 is for sparse tensor cores.
+    """
+
+    changed_first: ClassVar[bool] = False
+
+    ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that is zero in the end")
+    pattern: Pattern = Field(
+        "unstructured",
+        description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
+    )
+    until: float = Field(0.6, gt=0, le=1, description="share of the steps after which no more weights become zero")
+    interval: int = Field(10, ge=1, description="steps from one time that weights become zero to the next")
+    include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
+    exclude: tuple[str, ...] = Field((), description="globs of layers to leave as they are")
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """The ratio is that of the pattern, and the last weights count."""
+        super().check(source, profile)
+        check_pattern(self.pattern, self.ratio)
+        if self.patience:
+            raise RecipeError(
+                "--patience would choose weights from before the last ones became zero.", "leave --patience out"
+            )
+
+    def shares(self) -> dict[int, float]:
+        """Return the number of each step that adds zeros -> the share of zeros after it."""
+        last = max(1, round(self.steps * self.until))
+        numbers = [*range(self.interval, last, self.interval), last]
+        return {number: self.ratio * (1 - (1 - number / last) ** 3) for number in numbers}
+
+    def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
+        """The student does what the teacher does, with more and more zeros."""
+        layers = sparse_layers(modules, source, self.include, self.exclude).values()
+        zeros = GrowingZeros([layer.weight for layer in layers], self._goes, self.shares())
+        return replace(super().lesson(modules, source, teacher), constraint=zeros)
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Say how many weights are zero, and what was learnt."""
+        return (*zeros_told(made, self.pattern), *super().lines(made))
+
+    def _goes(self, sizes: Tensor, share: float) -> Tensor:
+        return least(sizes, self.pattern, share, rows=False)

@@ -1,0 +1,189 @@
+"""A lesson that compares what blocks of student and teacher give, beside their actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool import registry
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError, SourceError, require
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.feeds import recorded_inputs
+from vlatool.training.matching import Pair, Stack, pairs_of
+from vlatool.training.rounds import NOISE, tensors
+from vlatool.training.session import Lesson
+from vlatool.training.taps import Form, Place, Taps
+from vlatool.training.teacher import Teacher
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+ALONG = "(hints)"
+"""Under what the projections are trained, beside the graphs of the student."""
+Forms = Mapping[Place, Form]
+
+
+@dataclass(frozen=True)
+class Hint:
+    """A term of the loss.
+
+    Args:
+        name: Of the option that gives its weight.
+        weight: In the sum.
+        distance: Features of the student and of the teacher, (N, ..., D) -> their distance, a mean over rows.
+        pairs: Blocks that are compared.
+        left_out: Stack -> why it is not compared.
+        projections: Number of a pair -> what brings the student's features to the teacher's width.
+    """
+
+    name: str
+    weight: float
+    distance: Callable[[Tensor, Tensor], Tensor]
+    pairs: Sequence[Pair]
+    left_out: Mapping[Stack, str]
+    projections: nn.ModuleDict
+
+    def __call__(self, ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Any:
+        """Return the mean over all pairs, times the weight."""
+        terms = [self._far(str(number), pair, ours, theirs) for number, pair in enumerate(self.pairs)]
+        return self.weight * sum(terms) / len(terms)
+
+    def _far(self, number: str, pair: Pair, ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Tensor:
+        student, teacher = ours[pair.ours], theirs[pair.theirs]
+        if number in self.projections:
+            student = self.projections[number](student)
+        if student.shape[:-1] != teacher.shape[:-1]:
+            raise SourceError(
+                f"For a batch, the block '{pair.ours[1]}' gives {list(student.shape)}, the teacher's "
+                f"'{pair.theirs[1]}' {list(teacher.shape)}; for one observation they agreed.",
+                f"let both have the batch in front, or leave --{self.name} out",
+            )
+        return self.distance(student, teacher)
+
+    def about(self) -> dict[str, Any]:
+        """Return what is compared with what, as JSON values."""
+        blocks = [[*pair.stack, *pair.numbers] for pair in self.pairs]
+        left_out = [[*stack, why] for stack, why in self.left_out.items()]
+        return {"weight": self.weight, "blocks": blocks, **({"left_out": left_out} if left_out else {})}
+
+
+def with_hints(
+    lesson: Lesson, weights: Mapping[str, float], student: BatchedProgram, source: Bundle, teacher: Teacher, seed: int
+) -> Lesson:
+    """Return a lesson with further terms; the lesson itself where all weights are 0.
+
+    The teacher runs on the same rows and the same noise as the student, in the same precision, without gradients.
+
+    Args:
+        lesson: Its loss runs the student once on the rows that it is given.
+        weights: Name of a hint -> its weight in the loss.
+        student: What the lesson runs.
+        source: The student's bundle.
+        teacher: The teacher.
+        seed: Of the projections.
+
+    Raises:
+        RecipeError: when there is nothing to compare.
+        SourceError: when student or teacher fails.
+    """
+    asked = {name: weight for name, weight in weights.items() if weight}
+    if not asked:
+        return lesson
+    pairs = pairs_of(student.modules, source, teacher)
+    if not pairs:
+        raise RecipeError(
+            f"{source.manifest.name} and its teacher have no stack of blocks in common (an nn.ModuleList or "
+            f"nn.Sequential of modules of one class, of the same name in both), so --{' and --'.join(asked)} "
+            "would compare nothing.",
+            f"leave --{' and --'.join(asked)} out",
+        )
+    ours, theirs = Taps(student, (pair.ours for pair in pairs)), Taps(teacher.program, (pair.theirs for pair in pairs))
+    forms = _forms(ours, theirs, source)
+    hints = [_hint(name, weight, pairs, forms, seed) for name, weight in asked.items()]
+
+    def loss(rows: Mapping[str, Any]) -> Tensor:
+        size = len(next(iter(rows.values())))
+        _look(rows, student, teacher.program)
+        with ours.open(size):
+            far = lesson.loss(rows)
+        with require("torch", "build").no_grad(), theirs.open(size):
+            teacher.program.run(tensors(rows), tensors(rows, NOISE))
+        whole: Tensor = far + _sum(hints, ours.taken(size), theirs.taken(size))
+        return whole
+
+    nn = require("torch", "build").nn
+    along = {ALONG: nn.ModuleDict({hint.name: hint.projections for hint in hints})}
+    name = ", ".join([lesson.name, *(f"{hint.weight:g} {hint.name}" for hint in hints)])
+    about = {"hints": {hint.name: hint.about() for hint in hints}}
+    return replace(lesson, name=name, loss=loss, judged=lesson.loss, along=along, about={**lesson.about, **about})
+
+
+def _look(rows: Mapping[str, Any], *programs: BatchedProgram) -> None:
+    """Let programs find out in float32 whether they take batches, before anything is kept of them."""
+    torch = require("torch", "build")
+    with torch.autocast("cpu", enabled=False):
+        for program in programs:
+            program.look(tensors(rows), tensors(rows, NOISE))
+
+
+def _sum(hints: Sequence[Hint], ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Any:
+    with require("torch", "build").autocast("cpu", enabled=False):
+        return sum(hint(ours, theirs) for hint in hints)
+
+
+def _forms(ours: Taps, theirs: Taps, source: Bundle) -> tuple[Forms, Forms]:
+    """Return what the blocks of student and teacher give for one observation."""
+    inputs = recorded_inputs(source, 1)[0]
+    noise = drawn(ours.program.noise, 1, np.random.default_rng(0))
+    return ours.forms(inputs, noise), theirs.forms(inputs, noise)
+
+
+def _hint(name: str, weight: float, pairs: Sequence[Pair], forms: tuple[Forms, Forms], seed: int) -> Hint:
+    """Return a hint over all stacks that it can compare.
+
+    Raises:
+        RecipeError: when there is none.
+    """
+    kind = registry.load("hints", name)()
+    left_out: dict[Stack, str] = {}
+    for pair in pairs:
+        if why := _why_not(forms[0][pair.ours], forms[1][pair.theirs], kind):
+            left_out.setdefault(pair.stack, why)
+    compared = [pair for pair in pairs if pair.stack not in left_out]
+    if not compared:
+        reasons = "; ".join(f"{stack or 'the module itself'}: {why}" for (_, stack), why in left_out.items())
+        raise RecipeError(f"--{name} can compare no stack of blocks: {reasons}.", f"leave --{name} out")
+    projections = _projections(compared, forms, seed) if kind.projects else require("torch", "build").nn.ModuleDict()
+    return Hint(name, weight, kind, compared, left_out, projections)
+
+
+def _why_not(ours: Form, theirs: Form, kind: Any) -> str:
+    """Return why what two blocks give cannot be compared, empty where it can."""
+    if not ours.calls or not theirs.calls:
+        return "its blocks are not called as modules"
+    if ours.calls != theirs.calls:
+        return f"the student runs its blocks {ours.calls} times in an inference, the teacher {theirs.calls} times"
+    if ours.shape is None or theirs.shape is None:
+        return "its blocks do not give a tensor of floats, always of the same shape"
+    if ours.features[:-1] != theirs.features[:-1]:
+        return f"the student's blocks give {list(ours.shape)}, the teacher's {list(theirs.shape)}"
+    reasons = (kind.why_not(form.shape, form.channels_first) for form in (ours, theirs))
+    return next(filter(None, reasons), "")
+
+
+def _projections(pairs: Iterable[Pair], forms: tuple[Forms, Forms], seed: int) -> nn.ModuleDict:
+    """Return a linear map for each pair of different widths, which keeps the size of what is normalised."""
+    torch = require("torch", "build")
+    made: nn.ModuleDict = torch.nn.ModuleDict()
+    for number, pair in enumerate(pairs):
+        width, wanted = forms[0][pair.ours].features[-1], forms[1][pair.theirs].features[-1]
+        if width != wanted:
+            random = torch.Generator().manual_seed(seed * 1000 + number)
+            made[str(number)] = projection = torch.nn.utils.skip_init(torch.nn.Linear, width, wanted, bias=False)
+            with torch.no_grad():
+                projection.weight.normal_(std=width**-0.5, generator=random)
+    return made

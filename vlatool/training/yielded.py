@@ -1,0 +1,171 @@
+"""Observations to train on that a function of the user's yields: ``training: train.py:batches`` in policy.yaml.
+
+The function is a user's code, as an environment is: it runs in a child process, which writes what it yields.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import DataError, RecipeError
+from vlatool.files.printable import message_of
+from vlatool.module.factory import yielded
+from vlatool.module.origin import origin_of
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.stage.base import Context
+from vlatool.training.rounds import write_recorded
+from vlatool.user_code.children import call
+
+HERE = "vlatool.training.yielded"
+PRELOAD = ("numpy", HERE)
+ROWS = 8192
+"""That are taken where nobody says how many."""
+BATCH = 256
+"""Rows of a batch that the function is asked for, at most."""
+GUIDE = "docs/guides/your-own-policy.md shows one"
+Tell = Callable[[str, float | None], None]
+
+
+def rows_asked(asked: int | None, source: Bundle, plays: bool) -> int:
+    """Return how many rows are taken from the policy's function.
+
+    Args:
+        asked: By the user; None when the user says nothing.
+        source: Of the policy.
+        plays: Whether the teacher plays episodes: then none are taken unless they are asked for.
+
+    Raises:
+        RecipeError: when rows are asked for, and the policy's description names no function.
+    """
+    named = origin_of(source).training
+    if asked and not named:
+        raise RecipeError(
+            f"--samples takes rows from the function that policy.yaml names under 'training'; that of "
+            f"{source.manifest.name} names none.",
+            "add training: train.py:batches to it, or leave --samples out",
+        )
+    return (ROWS if named and not plays else 0) if asked is None else asked
+
+
+def write_yielded(source: Bundle, count: int, seed: int, target: Path, context: Context) -> None:
+    """Write encoded observations that the policy's function yields, as a part of a round.
+
+    Args:
+        source: Of the policy.
+        count: How many.
+        seed: That the function is called with.
+        target: Folder for ``NAME.npy`` of each input, (count, ...).
+        context: For progress.
+
+    Raises:
+        DataError: when it yields something else than batches of observations, or too few.
+        SourceError: when it fails, ends its process, or may not run.
+    """
+    job = {"source": str(source.path.absolute()), "count": count, "seed": seed, "target": str(target.absolute())}
+    call(f"{HERE}:write", job, context.tell, origin_of(source).training.rpartition(":")[0], PRELOAD)
+
+
+def write(job: Mapping[str, Any], tell: Tell) -> None:
+    """Do what ``write_yielded`` says, in this process."""
+    source = Bundle.open(Path(job["source"]), verify=False)
+    origin = origin_of(source)
+    origin.check((".py",))
+    size = min(BATCH, job["count"])
+    batches = yielded(origin.training, origin.folder, {"seed": job["seed"], "size": size})
+    rows = _Rows(batches, origin.training, ObservationEncoder(source.manifest.spec, source), job["count"], size, tell)
+    write_recorded(rows.encode, rows, Path(job["target"]))
+
+
+class _Rows:
+    """The rows of batches, one after the other.
+
+    Args:
+        batches: What the function yields.
+        function: Its name, for messages.
+        encode: The policy's own.
+        count: Rows in all.
+        size: Rows of a batch, at most.
+        tell: For progress.
+    """
+
+    def __init__(
+        self, batches: Iterator[Any], function: str, encode: ObservationEncoder, count: int, size: int, tell: Tell
+    ) -> None:
+        self._batches, self._function, self._encode = batches, function, encode
+        self._count, self._size, self._tell = count, size, tell
+        self._row = ""
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Mapping[str, Any]]:
+        done = 0
+        for number, batch in enumerate(self._batches, 1):
+            columns = self._columns(f"{number} of '{self._function}'", batch)
+            for row in range(min(len(next(iter(columns.values()))), self._count - done)):
+                self._row = f"Row {row} of batch {number} of '{self._function}'"
+                yield {name: column[row] for name, column in columns.items()}
+                done += 1
+            self._tell(f"{done} of {self._count} rows of {self._function}", done / self._count)
+            if done == self._count:
+                return
+        if not done:
+            raise DataError(f"'{self._function}' yields nothing; wanted {self._count} rows.", f"let it yield; {GUIDE}")
+        raise DataError(
+            f"'{self._function}' ends after {done} rows; wanted {self._count}.",
+            f"let it go on, or take fewer: --samples {done}",
+        )
+
+    def encode(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the policy is given of the row that came last.
+
+        Raises:
+            DataError: when it is not what the policy takes.
+        """
+        try:
+            return self._encode(observation)
+        except DataError as error:
+            raise DataError(f"{self._row}: {error.message}", error.fix) from error
+
+    def _columns(self, place: str, batch: Any) -> dict[str, Any]:
+        """Return the inputs of a batch, each with a row for each observation."""
+        takes = f"the policy takes {', '.join(self._encode.names)}."
+        if not isinstance(batch, Mapping):
+            raise DataError(
+                f"Batch {place} is a {type(batch).__name__}; it must be a mapping of names to arrays: {takes}", GUIDE
+            )
+        if missing := [name for name in self._encode.names if name not in batch]:
+            has = ", ".join(map(str, batch)) or "nothing"
+            raise DataError(f"Batch {place} has no '{missing[0]}' (it has: {has}); {takes}", GUIDE)
+        columns = {name: _array(f"'{name}' in batch {place}", batch[name]) for name in self._encode.names}
+        rows = {name: len(column) for name, column in columns.items()}
+        if len(set(rows.values())) > 1:
+            told = ", ".join(f"{name} {count}" for name, count in rows.items())
+            raise DataError(
+                f"Batch {place} has different numbers of rows: {told}.", "each input needs a row an observation"
+            )
+        if not 1 <= (count := next(iter(rows.values()))) <= self._size:
+            raise DataError(
+                f"Batch {place} has {count} rows; allowed: 1 to {self._size}, the 'size' that it was asked for."
+            )
+        return columns
+
+
+def _array(what: str, value: Any) -> Any:
+    """Return an array with rows."""
+    try:
+        array = np.asarray(value)
+    except Exception as error:  # the seam: numpy asks the object for an array
+        raise DataError(
+            f"{what} is a {type(value).__name__}, which cannot be converted to a numpy array: "
+            f"{(message_of(error).splitlines() or [''])[0]}.",
+            "yield numpy arrays; tensors as tensor.numpy()",
+        ) from error
+    if not array.ndim:
+        raise DataError(f"{what} is a single value; wanted a row for each observation.", GUIDE)
+    return array
