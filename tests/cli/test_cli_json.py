@@ -43,6 +43,7 @@ LINES = {
     "prune neurons": "{policy} -o {out}",
     "prune structured": "{policy} -o {out} --samples 2 --multiple 1",
     "prune depth": "{deep} -o {out} --samples 2",
+    "prune gradual": "{policy} -o {out} --steps 2 --batch 2 --episodes 0 --student-episodes 0 --threads 1",
     "prune latency": "{deep} -o {out} --target-ms 1 --chosen {chosen}",
     "prune steps": "{flow} -o {out} --to 2",
     "distill policy": "{pruned} -o {out} --trust {policy} --steps 2 --batch 2 --episodes 1 --student-episodes 0",

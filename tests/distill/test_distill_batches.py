@@ -42,7 +42,7 @@ def batches(seed, size):
         }
         yield batch
 """
-ALONE = {"samples": 20, "episodes": 0, "student_episodes": 0}
+ALONE = {"from_batches": 20, "episodes": 0, "student_episodes": 0}
 
 
 def policy(folder: Path, *swaps: tuple[str, str], recorded: bool = False, plays: bool = False) -> Path:
@@ -71,7 +71,7 @@ def test_rows_of_the_function_are_what_the_student_learns_from(policy_dir: Path,
     source = pruned(policy(policy_dir))
     told: list[str] = []
     made = distilled(source, tmp_path / "out", Context(lambda what, _share: told.append(what)),
-                     samples=300, steps=60, batch=16, average=0.9)  # fmt: skip
+                     from_batches=300, steps=60, batch=16, average=0.9)  # fmt: skip
     assert training_of(made)["rounds"] == [{"step": 0, "actor": "teacher", "yielded": 300, "observations": 300}]
     assert "256 of 300 rows of train.py:batches" in told
     assert error(made, source_bundle) < 0.6 * error(source, source_bundle)
@@ -107,8 +107,8 @@ def test_they_are_raw_observations(policy_dir: Path, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize(("options", "rows"), [
-    ({}, 24 + 30), ({"samples": 5}, 24 + 5), ({"samples": 0}, 24),
-    ({"plays": True, "episodes": 2}, None), ({"plays": True, "episodes": 2, "samples": 6}, 6),
+    ({}, 24 + 30), ({"from_batches": 5}, 24 + 5), ({"from_batches": 0}, 24),
+    ({"plays": True, "episodes": 2}, None), ({"plays": True, "episodes": 2, "from_batches": 6}, 6),
 ])  # fmt: skip
 def test_how_many_rows_are_taken(
     policy_dir: Path, tmp_path: Path, options: dict[str, Any], rows: int | None, monkeypatch: pytest.MonkeyPatch
@@ -121,7 +121,7 @@ def test_how_many_rows_are_taken(
     made = distilled(source, tmp_path / "out", **options, steps=1)
     (first,) = training_of(made)["rounds"]
     if not plays:
-        assert (first["observations"], first.get("yielded")) == (rows, options.get("samples", 30) or None)
+        assert (first["observations"], first.get("yielded")) == (rows, options.get("from_batches", 30) or None)
         return
     assert first["episodes"] == 2
     assert first.get("yielded") == rows
@@ -168,8 +168,8 @@ def test_the_file_runs_only_where_its_folder_is_named(policy_dir: Path, tmp_path
 
 def test_rows_are_asked_for_where_nothing_yields_them(pruned_once: Bundle, tmp_path: Path):
     with pytest.raises(RecipeError, match="that of tiny names none"):
-        distilled(pruned_once, tmp_path / "out", samples=5)
-    assert build_stage("distill.policy", {}).samples is None
+        distilled(pruned_once, tmp_path / "out", from_batches=5)
+    assert build_stage("distill.policy", {}).from_batches is None
 
 
 YIELD = "        yield batch\n"

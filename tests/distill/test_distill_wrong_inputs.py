@@ -186,6 +186,8 @@ ROWS = [
     option("patience = -1", "--patience", -1),
     option("temperature = 0", "--temperature", 0),
     option("delta = 0", "--delta", 0),
+    option("from_batches = -1", "--from-batches", -1),
+    option("add training: train.py:batches to it", "--from-batches", 5),
     option("features = -1", "--features", -1),
     option("attention = nan", "--attention", "nan"),
     option("have no stack of blocks in common", "--features", 1),

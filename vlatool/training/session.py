@@ -52,7 +52,7 @@ class Plan:
         first_seed: Of the first episode of each task; the others follow.
         patience: Pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: Parts of a batch, computed one after the other.
-        samples: Rows that are taken from the function of the policy's that yields batches.
+        yielded: Rows that are taken from the function of the policy's that yields batches.
     """
 
     batch: int
@@ -63,7 +63,7 @@ class Plan:
     first_seed: int
     patience: int = 0
     accumulate: int = 1
-    samples: int = 0
+    yielded: int = 0
 
     def asked(self, number: int) -> int:
         """Return how many episodes a round has."""
@@ -228,10 +228,10 @@ class Session:
 
     def _yield_held_out(self, target: Path) -> bool:
         """Write rows to judge with that the policy's function yields; say whether it does."""
-        if self._plan.samples:
-            self._yield(-(-self._plan.samples // 10), self._settings.seed + 1, target)
+        if self._plan.yielded:
+            self._yield(-(-self._plan.yielded // 10), self._settings.seed + 1, target)
             self._label(target, 0, 1)
-        return bool(self._plan.samples)
+        return bool(self._plan.yielded)
 
     def _yield(self, count: int, seed: int, target: Path) -> None:
         write_yielded(self._source, count, seed, target, self._context)
@@ -241,8 +241,8 @@ class Session:
         recorded = recorded_observations(self._source, RECORDED)
         chosen = self._held_out.others if self._held_out is not None else recorded
         write_recorded(self._encode, chosen, target / "recorded")
-        if self._plan.samples:
-            self._yield(self._plan.samples, self._settings.seed, target / "yielded")
+        if self._plan.yielded:
+            self._yield(self._plan.yielded, self._settings.seed, target / "yielded")
         self._play(target, 0)
 
     def _students(self, number: int, target: Path) -> None:
@@ -266,7 +266,7 @@ class Session:
             ]
             outcomes = run_jobs(self._actor(target / "actor", number), jobs, "", self._context)
             about |= {"episodes": len(outcomes), "successes": sum(outcome.success for outcome in outcomes)}
-        about |= {"yielded": self._plan.samples} if self._plan.samples and not number else {}
+        about |= {"yielded": self._plan.yielded} if self._plan.yielded and not number else {}
         about["observations"] = joined((target / "recorded", target / "yielded", *sorted(folder.glob("*"))), target)
         for part in ("recorded", "yielded", "episodes", "actor"):
             shutil.rmtree(target / part, ignore_errors=True)

@@ -62,7 +62,7 @@ class TrainingStage(ModuleStage):
     student_episodes: int = Field(300, ge=0, description="episodes that the student plays each time")
     every: int = Field(250, ge=1, description="steps between the student's episodes")
     noise: float = Field(0.1, ge=0, le=1, description="disturbs the actions in these episodes: share of their spread")
-    samples: int | None = Field(
+    from_batches: int | None = Field(
         None, ge=0, description="rows from the function that policy.yaml names under training; 8192 where no episodes "
         "are played first, else none",
     )  # fmt: skip
@@ -154,7 +154,7 @@ class TrainingStage(ModuleStage):
 
     def _trained(self, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context) -> Changed:
         plays = self.episodes > 0 and scene_of(source) is not None
-        plan = replace(self.plan(), samples=rows_asked(self.samples, source, plays))
+        plan = replace(self.plan(), yielded=rows_asked(self.from_batches, source, plays))
         teacher, lesson = self.prepared(modules, source)
         with crew_of(self._job(source), self.processes, place, self.runs(source)) as crew:
             session = Session(plan, self.settings(), lesson, source, teacher, place, context, crew)

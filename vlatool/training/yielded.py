@@ -45,9 +45,9 @@ def rows_asked(asked: int | None, source: Bundle, plays: bool) -> int:
     named = origin_of(source).training
     if asked and not named:
         raise RecipeError(
-            f"--samples takes rows from the function that policy.yaml names under 'training'; that of "
+            f"--from-batches takes rows from the function that policy.yaml names under 'training'; that of "
             f"{source.manifest.name} names none.",
-            "add training: train.py:batches to it, or leave --samples out",
+            "add training: train.py:batches to it, or leave --from-batches out",
         )
     return (ROWS if named and not plays else 0) if asked is None else asked
 
@@ -118,7 +118,7 @@ class _Rows:
             raise DataError(f"'{self._function}' yields nothing; wanted {self._count} rows.", f"let it yield; {GUIDE}")
         raise DataError(
             f"'{self._function}' ends after {done} rows; wanted {self._count}.",
-            f"let it go on, or take fewer: --samples {done}",
+            f"let it go on, or take fewer: --from-batches {done}",
         )
 
     def encode(self, observation: Mapping[str, Any]) -> dict[str, Any]:
