@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group
-from vlatool.training.loop import Part
+from vlatool.training.lesson import Lesson
+from vlatool.training.mixture import Draw, Mixture, Part
+from vlatool.training.supervision import Supervision
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,3 +45,24 @@ class Batches:
 
     def _loss(self, rows: NDArray[Any]) -> Tensor:
         return self._of_rows(self._frames.batch(rows))
+
+
+def draw_of(lesson: Lesson, supervision: Supervision, frames: Frames, expert: Frames, size: int, accumulate: int,
+            group: Group) -> Draw:  # fmt: skip
+    """Return what draws the batches of a lesson: of what the teacher labelled, of what an expert did, or of both.
+
+    The rows of the teacher's batches are the same whether there is an expert or not.
+
+    Args:
+        lesson: What is learnt.
+        supervision: How much each of them counts.
+        frames: What the teacher labelled.
+        expert: What the expert did.
+        size, accumulate, group: As of ``Batches``.
+    """
+    taught = Batches(lesson.loss, frames, size, accumulate, group)
+    if lesson.expert is None:
+        return taught
+    shown = Batches(lesson.expert, expert, size, accumulate, group)
+    alpha = supervision.alpha
+    return Mixture([(alpha, taught), (1 - alpha, shown)]) if alpha else shown

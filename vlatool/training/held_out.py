@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Recording, calibration_recording
 from vlatool.errors import DataError, require
+from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
+from vlatool.training.lesson import Lesson
 from vlatool.training.rounds import Counted, next_round
 
 if TYPE_CHECKING:
@@ -34,23 +36,31 @@ class HeldOut:
     """
 
     def __init__(self, place: Path) -> None:
-        self._frames = Frames(place / FOLDER)
-        self._others: Recording | None = None
+        self.frames = Frames(place / FOLDER)
+        self.expert = Expert(place / FOLDER)
+        self._halves: tuple[Recording, Recording] | None = None
 
     @property
-    def others(self) -> Counted:
-        """Return the observations to learn from."""
-        if self._others is None:
-            raise RuntimeError("prepare() comes first")
-        return self._others
+    def recording(self) -> Recording:
+        """Return the observations to judge with."""
+        return self._split()[0]
 
-    def prepare(self, source: Bundle, most: int, write: Callable[[Counted, Path], None]) -> None:
-        """Split the recording, and write what is held out unless an earlier run did.
+    @property
+    def others(self) -> Recording:
+        """Return the observations to learn from."""
+        return self._split()[1]
+
+    def _split(self) -> tuple[Recording, Recording]:
+        if self._halves is None:
+            raise RuntimeError("split() comes first")
+        return self._halves
+
+    def split(self, source: Bundle, most: int) -> None:
+        """Split the recording.
 
         Args:
             source: The student's bundle.
             most: Observations that are used of it.
-            write: Called with observations and the folder for them.
 
         Raises:
             DataError: when there are not two observations to split.
@@ -62,27 +72,55 @@ class HeldOut:
                 f"there are {len(recording) if recording else 0}.",
                 "record some (calibration: FILE.npz in policy.yaml), name an environment there, or omit --patience",
             )
-        used = np.zeros(len(recording), np.bool_)
-        used[recording.spread(most)] = True
-        recording = recording.only(used)
+        recording = at_most(recording, most)
         held = held_out(recording)
-        self._others = recording.only(~held)
-        next_round(self._frames, 0, partial(write, recording.only(held)))
+        self._halves = recording.only(held), recording.only(~held)
 
-    def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
+    def write(self, write: Callable[[Counted, Path], None]) -> None:
+        """Write what is held out unless an earlier run did.
+
+        Args:
+            write: Called with observations and the folder for them.
+        """
+        next_round(self.frames, 0, partial(write, self.recording))
+
+    def loss(self, lesson: Lesson, alpha: float, rows: int, *, bfloat16: bool) -> float:
         """Return the mean loss of what is held out.
 
         Args:
-            loss: Of a batch.
+            lesson: What is learnt.
+            alpha: Share of the teacher in the loss.
             rows: At a time.
             bfloat16: Whether matrix products are computed so, as in training.
         """
-        torch, total = require("torch", "build"), 0.0
-        parts = np.array_split(np.arange(len(self._frames)), -(-len(self._frames) // rows))
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            for part in parts:
-                total += float(loss(self._frames.batch(part))) * len(part)
-        return total / len(self._frames)
+        total = alpha * mean_loss(self.frames, lesson.loss, rows, bfloat16=bfloat16) if alpha else 0.0
+        if lesson.expert is None:
+            return total
+        return total + (1 - alpha) * mean_loss(self.expert.frames, lesson.expert, rows, bfloat16=bfloat16)
+
+
+def at_most(recording: Recording, most: int) -> Recording:
+    """Return so many observations of a recording, spread over it, or all."""
+    used = np.zeros(len(recording), np.bool_)
+    used[recording.spread(most)] = True
+    return recording.only(used)
+
+
+def mean_loss(frames: Frames, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
+    """Return the mean loss of all rows.
+
+    Args:
+        frames: The rows.
+        loss: Of a batch.
+        rows: At a time.
+        bfloat16: Whether matrix products are computed so, as in training.
+    """
+    torch, total = require("torch", "build"), 0.0
+    parts = np.array_split(np.arange(len(frames)), -(-len(frames) // rows))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+        for part in parts:
+            total += float(loss(frames.batch(part))) * len(part)
+    return total / len(frames)
 
 
 def held_out(recording: Recording) -> NDArray[np.bool_]:

@@ -12,11 +12,12 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.base import build_stage
-from vlatool.training.batches import Batches
+from vlatool.training.batches import draw_of
 from vlatool.training.crew import MEETING
+from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group, joined_group
-from vlatool.training.loop import Trainer
+from vlatool.training.loop import Draw, Trainer
 from vlatool.training.stage import TrainingStage
 
 Tell = Callable[[str, float | None], None]
@@ -29,8 +30,9 @@ class Peer:
     meeting: Path
     group: Group
     frames: Frames
+    expert: Expert
     trainer: Trainer
-    batches: Batches
+    batches: Draw
     opened: contextlib.ExitStack
 
 
@@ -44,11 +46,12 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
         raise RecipeError(f"The stage {job['stage']} trains nothing.")
     require("torch", "build").set_num_threads(job["threads"])
     source, place = Bundle.open(Path(job["source"]), verify=False), Path(job["place"])
-    group, frames = Group(job["rank"], job["size"]), Frames(place)
+    group, frames, expert = Group(job["rank"], job["size"]), Frames(place), Expert(place)
     _, lesson = stage.prepared(load_modules(source), source)
     trainer = Trainer(lesson.modules, stage.settings(), place, group)
-    batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
-    _peer[:] = [Peer(place / MEETING, group, frames, trainer, batches, contextlib.ExitStack())]
+    supervision = stage.supervision()
+    batches = draw_of(lesson, supervision, frames, expert.frames, stage.batch, stage.accumulate, group)
+    _peer[:] = [Peer(place / MEETING, group, frames, expert, trainer, batches, contextlib.ExitStack())]
 
 
 def join(_job: Mapping[str, Any], _tell: Tell) -> None:
@@ -62,4 +65,6 @@ def train(job: Mapping[str, Any], _tell: Tell) -> None:
     peer = _peer[0]
     for number in range(peer.frames.count, job["rounds"]):
         peer.frames.read(number)
+    if job["expert"]:
+        peer.expert.read()
     peer.trainer.train(job["until"], peer.batches, lambda _step, _loss: None)

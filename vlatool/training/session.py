@@ -4,32 +4,33 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import recorded_observations
+from vlatool.data import Recording, calibration_recording, recorded_observations
 from vlatool.episodes.play import jobs_for, run_jobs
 from vlatool.errors import require
 from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
-from vlatool.training.batches import Batches
+from vlatool.training.batches import draw_of
+from vlatool.training.control import exchange_labels
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
+from vlatool.training.expert import Expert
 from vlatool.training.forecast import Forecast
 from vlatool.training.frames import Frames, joined
-from vlatool.training.held_out import HeldOut
+from vlatool.training.held_out import HeldOut, at_most
+from vlatool.training.lesson import Lesson as Lesson
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
+from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
 from vlatool.training.teacher import Teacher
-
-if TYPE_CHECKING:
-    from torch import Tensor, nn
 
 ROUND = "round-{:03d}.json"
 """File that says who acted in a round, and how well."""
@@ -50,6 +51,7 @@ class Plan:
         first_seed: Of the first episode of each task; the others follow.
         patience: Pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: Parts of a batch, computed one after the other.
+        supervision: Who says what is right.
     """
 
     batch: int
@@ -60,6 +62,7 @@ class Plan:
     first_seed: int
     patience: int = 0
     accumulate: int = 1
+    supervision: Supervision = TEACHER_ALONE
 
     def asked(self, number: int) -> int:
         """Return how many episodes a round has."""
@@ -68,22 +71,6 @@ class Plan:
     def seed(self, number: int, tasks: int) -> int:
         """Return the seed of the first episode of a round."""
         return self.first_seed + sum(-(-self.asked(before) // tasks) for before in range(number))
-
-
-@dataclass(frozen=True)
-class Lesson:
-    """What a student is trained to make small.
-
-    Args:
-        name: Of the loss.
-        modules: The student's, which are trained in place.
-        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
-            computed in parts.
-    """
-
-    name: str
-    modules: Mapping[str, nn.Module]
-    loss: Callable[[Mapping[str, Any]], Tensor]
 
 
 class Session:
@@ -118,10 +105,11 @@ class Session:
         self._scene = scene_of(source) if plan.episodes or plan.student_episodes else None
         self._plays = self._scene is not None and plan.student_episodes > 0
         self._encode = ObservationEncoder(self._spec, source)
-        self._frames = Frames(place)
+        self._frames, self._expert = Frames(place), Expert(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
         self._trainer = Trainer(lesson.modules, settings, place, self._crew.group)
-        self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
+        supplied = plan.supervision, self._frames, self._expert.frames
+        self._batches = draw_of(lesson, *supplied, plan.batch, plan.accumulate, self._crew.group)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
         self._success = ""
@@ -130,9 +118,7 @@ class Session:
         """Play, label and train until all steps are done; return what there is to know of it."""
         if self._trainer.step:
             self._context.tell(f"going on from step {self._trainer.step}", None)
-        if self._held_out is not None:
-            self._held_out.prepare(self._source, RECORDED, self._write_held_out)
-        next_round(self._frames, 0, self._first)
+        self._prepare()
         pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
         for number, end in enumerate([*pauses, self._settings.steps]):
             if number and self._paused(number):
@@ -145,8 +131,27 @@ class Session:
         self._events.close()
         return self._about()
 
+    def _prepare(self) -> None:
+        """Write what the expert did, what is held out, and what the teacher says; without it where it is not asked."""
+        if self._held_out is not None:
+            self._held_out.split(self._source, RECORDED)
+        if self._lesson.expert is not None:
+            recording = self._held_out.others if self._held_out is not None else calibration_recording(self._source)
+            self._show(self._expert, None if recording is None else at_most(recording, RECORDED))
+            if self._held_out is not None:
+                self._show(self._held_out.expert, self._held_out.recording)
+        if not self._plan.supervision.alpha:
+            return
+        if self._held_out is not None:
+            self._held_out.write(self._write_held_out)
+        next_round(self._frames, 0, self._first)
+
+    def _show(self, expert: Expert, recording: Recording | None) -> None:
+        share = self._plan.supervision.label_share
+        expert.prepare(recording, self._source, share, self._settings.seed, self._encode)
+
     def _train(self, end: int) -> None:
-        with self._crew.training(self._frames.count, end):
+        with self._crew.training(self._frames.count, end, expert=self._lesson.expert is not None):
             self._trainer.train(end, self._batches, self._tell)
         self._trainer.save()
 
@@ -171,7 +176,8 @@ class Session:
             return float(about["successes"] / about["episodes"])
         self._trainer.swap()
         try:
-            loss = self._held_out.loss(self._lesson.loss, self._plan.batch, bfloat16=self._settings.bfloat16)
+            alpha, rows = self._plan.supervision.alpha, self._plan.batch
+            loss = self._held_out.loss(self._lesson, alpha, rows, bfloat16=self._settings.bfloat16)
         finally:
             self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
@@ -180,15 +186,18 @@ class Session:
 
     def _about(self) -> dict[str, Any]:
         best, several = self._trainer.best, self._crew.group.size
+        supervision, teacher = self._plan.supervision, self._teacher.program.modules
         judged = "success" if self._held_out is None else "held-out loss"
         scores = best.scores if self._held_out is None else [-score for score in best.scores]
         return {
-            "loss": self._lesson.name,
+            "loss": supervision.loss_name(self._lesson.name),
             "precision": "bfloat16" if self._settings.bfloat16 else "float32",
             "threads": require("torch", "build").get_num_threads(),
             **({"processes": several} if several > 1 else {}),
             "losses": self._trainer.losses,
-            "rounds": [self._round(number) for number in range(self._frames.count)],
+            "rounds": [self._round(number) for number in range(self._frames.count)] or [self._expert.round()],
+            "parameters": {"student": parameters(self._lesson.modules), "teacher": parameters(teacher)},
+            "teacher": supervision.about(self._trainer.looks, self._expert.counts),
             **({"judged": {"by": judged, "scores": scores, "best_step": best.step}} if scores else {}),
         }
 
@@ -245,6 +254,8 @@ class Session:
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
         label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
+        if self._plan.supervision.control == "noise":
+            exchange_labels(target, outputs, (self._settings.seed, *seed))
 
     def _actor(self, place: Path, number: int) -> Bundle:
         """Write who plays as a bundle, which the processes that play open."""
