@@ -192,6 +192,19 @@ ROWS = [
     option("A batch of 4 cannot be split into 5 parts", "--accumulate", 5),
     option("A batch of 4 cannot be split into 6 parts", "--accumulate", 2, "--processes", 3),
     option("evaluations begin at 5000000", "--first-seed", 4_999_999, "--episodes", 10),
+    option("such as depth=0.5,width=0.75", "--student", "half"),
+    option("knows no 'dept'; did you mean 'depth'", "--student", "dept=0.5"),
+    option("depth=0: what stays is a share above 0, at most 1", "--student", "depth=0"),
+    option("takes nothing away", "--student", "depth=1,width=1"),
+    option("has no stack of blocks", "--student", "depth=0.5"),
+    option("multiply-accumulates can go", "--student", "width=0.01"),
+    option("alpha = 1.5", "--alpha", 1.5),
+    option("alpha = nan", "--alpha", "nan"),
+    option("label_share = 0", "--label-share", 0),
+    option("uses none of them", "--label-share", 0.5),
+    option("'shuffle' is not one of", "--control", "shuffle", code=2),
+    option("it is not asked", "--control", "noise", "--alpha", 0),
+    option("got --episodes 2", "--alpha", 0, "--episodes", 2),
     Row("an output that exists", "exists", 3, Workshop.taken),
     Row("events into a file", "is a file; events are written into a directory", 3,
         lambda at: at.line("--events", at.file())),
@@ -278,6 +291,12 @@ ROWS = [
         lambda at: at.student(drop=("calibration.npz", "evaluation.npz"))),
     Row("nothing to judge with", "--patience needs something to judge with", 3, lambda at: at.student(
         drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--patience", 1])),
+    Row("an expert without a recording", "needs an expert's actions, and .* has no recording", 3, lambda at: at.student(
+        drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--alpha", 0.5])),
+    Row("an expert without actions", "A loss against an expert's actions needs them, and .* has none", 3,
+        lambda at: [*at.recorded(action=None), "--alpha", 0.5]),
+    Row("a control of one observation", "said of another one; there is 1", 3, lambda at: [*at.recorded(
+        **{name: values[:1] for name, values in observations(8, seed=1).items()}), "--control", "noise"]),
     # ---- the environment
     Row("an environment that raises in reset", "failed at seed 1000000: ValueError: no world", 3,
         lambda at: at.world("        self.seed, self.steps = seed, 0\n", "        raise ValueError('no world')\n")),

@@ -113,15 +113,15 @@ def test_discrete_actions_have_a_cross_entropy():
     expert = np.array([[1, 2], [0, 0]])
     chances = torch.softmax(logits[0].double(), -1).numpy()
     wanted = -np.log([chances[0, 1], chances[1, 2], chances[0, 0], chances[1, 0]]).mean()
-    assert float(loss_of(DISCRETE, logits, expert)) == pytest.approx(wanted, rel=1e-6)
+    assert loss_of(DISCRETE, logits, expert).item() == pytest.approx(wanted, rel=1e-6)
     only_first = -np.log([chances[0, 1], chances[0, 0]]).mean()
-    assert float(loss_of(DISCRETE, logits, expert[:, :1])) == pytest.approx(only_first, rel=1e-6)
+    assert loss_of(DISCRETE, logits, expert[:, :1]).item() == pytest.approx(only_first, rel=1e-6)
 
 
 def test_continuous_actions_are_compared_as_far_as_they_were_recorded():
     action = TensorSpec("action", (1, 2, 2), labels=("dx", "dy"), unit=("m", "m"))
     given, expert = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]]), np.zeros((3, 2, 2), np.float32)
-    assert float(loss_of(action, given, expert)) == pytest.approx(2.5)
+    assert loss_of(action, given, expert).item() == pytest.approx(2.5)
     loss = loss_of(action, given, expert[:, :1])
-    assert float(loss) == pytest.approx(1.5)
+    assert loss.item() == pytest.approx(1.5)
     assert loss.requires_grad

@@ -1,4 +1,4 @@
-"""A loss of several terms: their gradients add up, each is measured where it is looked at, and a kill changes nothing."""
+"""A loss of several terms: their gradients add up, each is measured at some steps, and a kill changes nothing."""
 
 from __future__ import annotations
 
