@@ -36,18 +36,17 @@ class Crew:
         self._errors: list[BaseException] = []
 
     @contextlib.contextmanager
-    def training(self, rounds: int, until: int, *, expert: bool = False) -> Iterator[None]:
+    def training(self, rounds: int, until: int) -> Iterator[None]:
         """Let the others train, too, while the block does.
 
         Args:
             rounds: How many rounds of rows there are.
             until: Number of the step to stop before.
-            expert: Whether there are rows of an expert's, too.
 
         Raises:
             VlatoolError: what one of them met, or how it ended.
         """
-        with self.calling("train", {"rounds": rounds, "until": until, "expert": expert}):
+        with self.calling("train", {"rounds": rounds, "until": until}):
             yield
 
     @contextlib.contextmanager

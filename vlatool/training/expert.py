@@ -10,13 +10,13 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import Recording
+from vlatool.data import Recording, calibration_recording
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.training.frames import BLOCK, Array, Frames, new_array
-from vlatool.training.rounds import EXPERT, NOISE, next_round, tensors, write_recorded
+from vlatool.training.rounds import EXPERT, NOISE, Counted, next_round, tensors, write_recorded
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -40,7 +40,7 @@ class Expert:
 
     def prepare(
         self,
-        recording: Recording | None,
+        recording: Counted | None,
         source: Bundle,
         share: float,
         seed: int,
@@ -49,7 +49,7 @@ class Expert:
         """Choose observations, and write them with the expert's actions unless an earlier run did.
 
         Args:
-            recording: Observations to choose from.
+            recording: Recorded observations to choose from.
             source: The student's bundle.
             share: Of them, at least one.
             seed: Of the choice; a smaller share is a part of a larger one.
@@ -58,8 +58,8 @@ class Expert:
         Raises:
             DataError: when there are no actions of an expert.
         """
-        if recording is None or recording.actions is None:
-            where = recording.path if recording is not None else source.path
+        if not isinstance(recording, Recording) or recording.actions is None:
+            where = recording.path if isinstance(recording, Recording) else source.path
             raise DataError(f"A loss against an expert's actions needs them, and {where} has none.", RECORD)
         order = np.random.default_rng((seed, CHOICE)).permutation(len(recording))
         used = np.zeros(len(recording), np.bool_)
@@ -81,9 +81,19 @@ class Expert:
         return {"step": 0, "actor": "expert", "observations": len(self.frames)}
 
     def read(self) -> None:
-        """Use what another process wrote."""
-        if not self.frames.count:
+        """Use what another process wrote, if it did."""
+        if not self.frames.count and self.frames.has(0):
             self.frames.read(0)
+
+
+def at_most(source: Bundle, most: int) -> Recording | None:
+    """Return so many recorded observations of a bundle, spread over its recording; None when it has none."""
+    recording = calibration_recording(source)
+    if recording is None:
+        return None
+    used = np.zeros(len(recording), np.bool_)
+    used[recording.spread(most)] = True
+    return recording.only(used)
 
 
 def encoded_actions(action: TensorSpec, source: Bundle, actions: Any) -> Array:

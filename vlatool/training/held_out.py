@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Recording, calibration_recording
 from vlatool.errors import DataError, require
+from vlatool.training.batches import Loss
 from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
-from vlatool.training.lesson import Lesson
 from vlatool.training.rounds import Counted, next_round
 
 if TYPE_CHECKING:
@@ -36,31 +36,26 @@ class HeldOut:
     """
 
     def __init__(self, place: Path) -> None:
-        self.frames = Frames(place / FOLDER)
+        self._frames = Frames(place / FOLDER)
         self.expert = Expert(place / FOLDER)
-        self._halves: tuple[Recording, Recording] | None = None
+        self.recording: Recording | None = None
+        """What is held out, after ``prepare``."""
+        self._others: Recording | None = None
 
     @property
-    def recording(self) -> Recording:
-        """Return the observations to judge with."""
-        return self._split()[0]
-
-    @property
-    def others(self) -> Recording:
+    def others(self) -> Counted:
         """Return the observations to learn from."""
-        return self._split()[1]
+        if self._others is None:
+            raise RuntimeError("prepare() comes first")
+        return self._others
 
-    def _split(self) -> tuple[Recording, Recording]:
-        if self._halves is None:
-            raise RuntimeError("split() comes first")
-        return self._halves
-
-    def split(self, source: Bundle, most: int) -> None:
-        """Split the recording.
+    def prepare(self, source: Bundle, most: int, write: Callable[[Counted, Path], None]) -> None:
+        """Split the recording, and write what is held out unless an earlier run did.
 
         Args:
             source: The student's bundle.
             most: Observations that are used of it.
+            write: Called with observations and the folder for them.
 
         Raises:
             DataError: when there are not two observations to split.
@@ -72,49 +67,40 @@ class HeldOut:
                 f"there are {len(recording) if recording else 0}.",
                 "record some (calibration: FILE.npz in policy.yaml), name an environment there, or omit --patience",
             )
-        recording = at_most(recording, most)
+        used = np.zeros(len(recording), np.bool_)
+        used[recording.spread(most)] = True
+        recording = recording.only(used)
         held = held_out(recording)
-        self._halves = recording.only(held), recording.only(~held)
+        self._others = recording.only(~held)
+        self.recording = recording.only(held)
+        next_round(self._frames, 0, partial(write, self.recording))
 
-    def write(self, write: Callable[[Counted, Path], None]) -> None:
-        """Write what is held out unless an earlier run did.
-
-        Args:
-            write: Called with observations and the folder for them.
-        """
-        next_round(self.frames, 0, partial(write, self.recording))
-
-    def loss(self, lesson: Lesson, alpha: float, rows: int, *, bfloat16: bool) -> float:
+    def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
         """Return the mean loss of what is held out.
 
         Args:
-            lesson: What is learnt.
-            alpha: Share of the teacher in the loss.
+            loss: Of a batch.
             rows: At a time.
             bfloat16: Whether matrix products are computed so, as in training.
         """
-        total = alpha * mean_loss(self.frames, lesson.loss, rows, bfloat16=bfloat16) if alpha else 0.0
-        if lesson.expert is None:
+        return _mean(self._frames, loss, rows, bfloat16)
+
+    def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, *, bfloat16: bool) -> float:
+        """Return the same as a mixture of both terms.
+
+        Args:
+            alpha: Share of the teacher.
+            loss: Of a batch, against the teacher.
+            expert: Of a batch, against the expert's actions; None where no expert is asked.
+            rows, bfloat16: As of ``loss``.
+        """
+        total = alpha * self.loss(loss, rows, bfloat16=bfloat16) if alpha else 0.0
+        if expert is None:
             return total
-        return total + (1 - alpha) * mean_loss(self.expert.frames, lesson.expert, rows, bfloat16=bfloat16)
+        return total + (1 - alpha) * _mean(self.expert.frames, expert, rows, bfloat16)
 
 
-def at_most(recording: Recording, most: int) -> Recording:
-    """Return so many observations of a recording, spread over it, or all."""
-    used = np.zeros(len(recording), np.bool_)
-    used[recording.spread(most)] = True
-    return recording.only(used)
-
-
-def mean_loss(frames: Frames, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
-    """Return the mean loss of all rows.
-
-    Args:
-        frames: The rows.
-        loss: Of a batch.
-        rows: At a time.
-        bfloat16: Whether matrix products are computed so, as in training.
-    """
+def _mean(frames: Frames, loss: Loss, rows: int, bfloat16: bool) -> float:
     torch, total = require("torch", "build"), 0.0
     parts = np.array_split(np.arange(len(frames)), -(-len(frames) // rows))
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):

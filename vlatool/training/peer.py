@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.base import build_stage
-from vlatool.training.batches import draw_of
+from vlatool.training.batches import Batches, draw_of
 from vlatool.training.crew import MEETING
 from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
@@ -30,10 +30,10 @@ class Peer:
     meeting: Path
     group: Group
     frames: Frames
-    expert: Expert
     trainer: Trainer
     batches: Draw
     opened: contextlib.ExitStack
+    expert: Expert
 
 
 _peer: list[Peer] = []
@@ -46,12 +46,13 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
         raise RecipeError(f"The stage {job['stage']} trains nothing.")
     require("torch", "build").set_num_threads(job["threads"])
     source, place = Bundle.open(Path(job["source"]), verify=False), Path(job["place"])
-    group, frames, expert = Group(job["rank"], job["size"]), Frames(place), Expert(place)
+    group, frames = Group(job["rank"], job["size"]), Frames(place)
     _, lesson = stage.prepared(load_modules(source), source)
     trainer = Trainer(lesson.modules, stage.settings(), place, group)
-    supervision = stage.supervision()
-    batches = draw_of(lesson, supervision, frames, expert.frames, stage.batch, stage.accumulate, group)
-    _peer[:] = [Peer(place / MEETING, group, frames, expert, trainer, batches, contextlib.ExitStack())]
+    batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
+    expert = Expert(place)
+    draw = draw_of(batches, stage.supervision().alpha, lesson.expert, expert.frames)
+    _peer[:] = [Peer(place / MEETING, group, frames, trainer, draw, contextlib.ExitStack(), expert)]
 
 
 def join(_job: Mapping[str, Any], _tell: Tell) -> None:
@@ -65,6 +66,5 @@ def train(job: Mapping[str, Any], _tell: Tell) -> None:
     peer = _peer[0]
     for number in range(peer.frames.count, job["rounds"]):
         peer.frames.read(number)
-    if job["expert"]:
-        peer.expert.read()
+    peer.expert.read()
     peer.trainer.train(job["until"], peer.batches, lambda _step, _loss: None)

@@ -4,33 +4,35 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Recording, calibration_recording, recorded_observations
+from vlatool.data import recorded_observations
 from vlatool.episodes.play import jobs_for, run_jobs
 from vlatool.errors import require
 from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
-from vlatool.training.batches import draw_of
+from vlatool.training.batches import Batches, draw_of
 from vlatool.training.control import exchange_labels
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
-from vlatool.training.expert import Expert
+from vlatool.training.expert import Expert, at_most
 from vlatool.training.forecast import Forecast
 from vlatool.training.frames import Frames, joined
-from vlatool.training.held_out import HeldOut, at_most
-from vlatool.training.lesson import Lesson as Lesson
+from vlatool.training.held_out import HeldOut
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
 from vlatool.training.teacher import Teacher
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 ROUND = "round-{:03d}.json"
 """File that says who acted in a round, and how well."""
@@ -73,6 +75,24 @@ class Plan:
         return self.first_seed + sum(-(-self.asked(before) // tasks) for before in range(number))
 
 
+@dataclass(frozen=True)
+class Lesson:
+    """What a student is trained to make small.
+
+    Args:
+        name: Of the loss.
+        modules: The student's, which are trained in place.
+        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
+            computed in parts.
+        expert: The same for rows as ``Expert`` wrote them; None where no expert is asked.
+    """
+
+    name: str
+    modules: Mapping[str, nn.Module]
+    loss: Callable[[Mapping[str, Any]], Tensor]
+    expert: Callable[[Mapping[str, Any]], Tensor] | None = None
+
+
 class Session:
     """Trains a student; what was done is kept in a folder, from which a run that was killed goes on.
 
@@ -105,11 +125,12 @@ class Session:
         self._scene = scene_of(source) if plan.episodes or plan.student_episodes else None
         self._plays = self._scene is not None and plan.student_episodes > 0
         self._encode = ObservationEncoder(self._spec, source)
-        self._frames, self._expert = Frames(place), Expert(place)
+        self._frames = Frames(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
         self._trainer = Trainer(lesson.modules, settings, place, self._crew.group)
-        supplied = plan.supervision, self._frames, self._expert.frames
-        self._batches = draw_of(lesson, *supplied, plan.batch, plan.accumulate, self._crew.group)
+        self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
+        self._expert = Expert(place)
+        self._draw = draw_of(self._batches, plan.supervision.alpha, lesson.expert, self._expert.frames)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
         self._success = ""
@@ -118,7 +139,11 @@ class Session:
         """Play, label and train until all steps are done; return what there is to know of it."""
         if self._trainer.step:
             self._context.tell(f"going on from step {self._trainer.step}", None)
-        self._prepare()
+        if self._held_out is not None:
+            self._held_out.prepare(self._source, RECORDED, self._write_held_out)
+        self._show()
+        if self._plan.supervision.alpha:
+            next_round(self._frames, 0, self._first)
         pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
         for number, end in enumerate([*pauses, self._settings.steps]):
             if number and self._paused(number):
@@ -131,28 +156,20 @@ class Session:
         self._events.close()
         return self._about()
 
-    def _prepare(self) -> None:
-        """Write what the expert did, what is held out, and what the teacher says; without it where it is not asked."""
-        if self._held_out is not None:
-            self._held_out.split(self._source, RECORDED)
-        if self._lesson.expert is not None:
-            recording = self._held_out.others if self._held_out is not None else calibration_recording(self._source)
-            self._show(self._expert, None if recording is None else at_most(recording, RECORDED))
-            if self._held_out is not None:
-                self._show(self._held_out.expert, self._held_out.recording)
-        if not self._plan.supervision.alpha:
+    def _show(self) -> None:
+        """Write what the expert did, to learn from and to judge with, where the expert is asked."""
+        if self._lesson.expert is None:
             return
-        if self._held_out is not None:
-            self._held_out.write(self._write_held_out)
-        next_round(self._frames, 0, self._first)
-
-    def _show(self, expert: Expert, recording: Recording | None) -> None:
-        share = self._plan.supervision.label_share
-        expert.prepare(recording, self._source, share, self._settings.seed, self._encode)
+        chosen = self._plan.supervision.label_share, self._settings.seed
+        if self._held_out is None:
+            self._expert.prepare(at_most(self._source, RECORDED), self._source, *chosen, self._encode)
+            return
+        self._expert.prepare(self._held_out.others, self._source, *chosen, self._encode)
+        self._held_out.expert.prepare(self._held_out.recording, self._source, *chosen, self._encode)
 
     def _train(self, end: int) -> None:
-        with self._crew.training(self._frames.count, end, expert=self._lesson.expert is not None):
-            self._trainer.train(end, self._batches, self._tell)
+        with self._crew.training(self._frames.count, end):
+            self._trainer.train(end, self._draw, self._tell)
         self._trainer.save()
 
     def _paused(self, number: int) -> bool:
@@ -176,8 +193,8 @@ class Session:
             return float(about["successes"] / about["episodes"])
         self._trainer.swap()
         try:
-            alpha, rows = self._plan.supervision.alpha, self._plan.batch
-            loss = self._held_out.loss(self._lesson, alpha, rows, bfloat16=self._settings.bfloat16)
+            terms = self._plan.supervision.alpha, self._lesson.loss, self._lesson.expert
+            loss = self._held_out.mixed(*terms, self._plan.batch, bfloat16=self._settings.bfloat16)
         finally:
             self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
@@ -251,6 +268,8 @@ class Session:
         self._label(target, number)
 
     def _label(self, target: Path, *seed: int) -> None:
+        if not self._plan.supervision.alpha:
+            return
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
         label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
