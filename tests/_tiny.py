@@ -233,6 +233,21 @@ def write_weights(path: Path) -> None:
     save_file(weights, str(path))
 
 
+def deepen(folder: Path) -> None:
+    """Give the tiny policy in a folder three blocks, each of larger weights than the one before."""
+    from safetensors.torch import load_file, save_file
+
+    description, weights = folder / "policy.yaml", folder / "weights.safetensors"
+    description.write_text(description.read_text().replace("layers: 1", "layers: 3"))
+    stored = load_file(weights)
+    more = {
+        name.replace("blocks.0", f"blocks.{number}"): value * (1 + number)
+        for name, value in stored.items()
+        for number in (1, 2)
+    }
+    save_file({**more, **stored}, weights)
+
+
 def write_policy(folder: Path) -> Path:
     """Write the tiny policy into a new folder."""
     folder.mkdir()

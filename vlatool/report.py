@@ -17,6 +17,8 @@ ON_BOARD = "is_profile"
 """Key of the environment: the profile that the machine is the board of."""
 TRAINED = "training: "
 """What the names of losses (``raw``) and rounds (``details``) of a training begin with; its stage follows."""
+TEACHER = ", and its teacher"
+"""What the name of the details ends with that say how much the teacher of a training counted."""
 TRAINING_TIME = "training_time."
 """The same of measurements of how long it took, in seconds."""
 ORIGINS = ("measured", "predicted")

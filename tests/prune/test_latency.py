@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from _tiny import deepen
 from torch import nn
 
 from vlatool.bundle.bundle import Bundle
@@ -53,17 +54,7 @@ class Counted(Clock):
 @pytest.fixture
 def deep(policy_dir: Path, tmp_path: Path) -> Bundle:
     """The tiny policy with three blocks."""
-    from safetensors.torch import load_file, save_file
-
-    description, weights = policy_dir / "policy.yaml", policy_dir / "weights.safetensors"
-    description.write_text(description.read_text().replace("layers: 1", "layers: 3"))
-    stored = load_file(weights)
-    more = {
-        name.replace("blocks.0", f"blocks.{number}"): value * (1 + number)
-        for name, value in stored.items()
-        for number in (1, 2)
-    }
-    save_file({**more, **stored}, weights)
+    deepen(policy_dir)
     return run_transform(TorchModule(policy=policy_dir), None, tmp_path / "deep", Context())
 
 

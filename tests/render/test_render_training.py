@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from _render_reports import optimize
 
 from vlatool.render import render
 from vlatool.render.charts.losses import Curve, loss_curve
 from vlatool.render.document import Chart, build
-from vlatool.report import TRAINED, TRAINING_TIME, Measurement, Report, Row
+from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
 
 STAGE = "distill.policy"
 ROUNDS = [
@@ -20,6 +22,10 @@ ROUNDS = [
 def trained(name: str, losses: list[float]) -> Row:
     took = Measurement(f"{TRAINING_TIME}{STAGE}", 754.0, "s", samples=len(losses))
     return Row(name, measurements=(took,), raw={f"{TRAINED}{STAGE}": losses}, details={f"{TRAINED}{STAGE}": ROUNDS})
+
+
+def taught(row: Row, **about: str) -> Row:
+    return replace(row, details={**row.details, f"{TRAINED}{STAGE}{TEACHER}": [about]})
 
 
 def report(*rows: Row) -> Report:
@@ -41,6 +47,16 @@ def test_every_format_tells_who_acted_and_how_long_it_took(format: str):
         assert words in text, words
     assert ("<svg" in text) == (format == "html")
     assert text.count("who acted") == 1, "the details do not repeat it"
+
+
+@pytest.mark.parametrize("format", ["terminal", "markdown", "html"])
+def test_every_format_tells_how_much_the_teacher_counted(format: str):
+    about = {"student": "1.9 M of 7.8 M parameters (24 %)", "gradient from the teacher": "62 % in step 1"}
+    rows = (taught(trained("small", [2.0, 1.0]), **about), taught(trained("other", [2.0, 1.0]), **about, control="a"))
+    text = render(report(*rows), format)
+    for words in (*about.values(), "gradient from the teacher"):
+        assert words in text, words
+    assert text.count("62 % in step 1") == 2, "the details do not repeat it"
 
 
 def test_every_training_has_a_drawing_of_its_own():

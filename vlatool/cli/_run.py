@@ -24,7 +24,8 @@ from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.optimize.choice import foretold
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform, build_stage
-from vlatool.stage.run import cache_directory, cached_transform, measured_with, run_transform
+from vlatool.stage.controls import controls
+from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured_with, run_transform
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -104,6 +105,7 @@ def transform(
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         context = replace(context, events=str(events.absolute()) if events else "")
+        stage, bundle = first_steps(stage, bundle, cache_directory(), context)
         for other in then:
             bundle = cached_transform(stage, bundle, cache_directory(), context)
             stage = other
@@ -121,7 +123,7 @@ def transform(
     graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
     sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
     typer.echo(f"{out}: {result.manifest.name} {result.manifest.version}, {sizes}")
-    for line in stage.lines(result):
+    for line in (*stage.lines(result), *(controls(bundle) if bundle else ())):
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         if not shares:

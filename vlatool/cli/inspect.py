@@ -20,6 +20,7 @@ from vlatool.runtime.external_data import OpenFile, external_files
 from vlatool.runtime.graph_files import recorded
 from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
+from vlatool.stage.controls import controls
 
 
 def inspect(
@@ -83,6 +84,7 @@ def describe(bundle: Bundle) -> list[str]:
         lines.append(f"  graph      {name}: {size}, opset {graph.opset}, MACs: {shares}")
     lines += _lineage(manifest)
     lines += [f"  WRONG      {finding['name']}: {finding['message']}" for finding in manifest.findings]
+    lines += [f"  CONTROL    {line}" for line in controls(bundle)]
     return lines
 
 

@@ -2,7 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from vlatool import registry
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import CALIBRATION
+from vlatool.distill._student import student_steps
+from vlatool.errors import DataError, RecipeError
+from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.training.expert import RECORD, expert_loss
 from vlatool.training.imitation import ImitationStage
+from vlatool.training.supervision import Supervision
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from vlatool.hardware.profile import Profile
+    from vlatool.training.session import Lesson
+    from vlatool.training.teacher import Teacher
+
+OF_LABELS = ("l1", "l2", "huber")
+"""Losses that compare continuous actions with those of an expert as they do with a teacher's."""
 
 
 class PolicyDistillation(ImitationStage):
@@ -10,5 +35,94 @@ class PolicyDistillation(ImitationStage):
 
     The teacher is the policy as it was before any edit, so that this recovers what pruning lost; or another bundle. No
     expert is needed: first the teacher acts, then again and again the student, and the teacher says what it would have
-    done wherever they came to (DAgger: Ross et al., arXiv 1011.0686).
+    done wherever they came to (DAgger: Ross et al., arXiv 1011.0686). With ``--student`` the policy is made smaller
+    first, by ``prune depth`` and ``prune structured``.
+
+    ``--alpha 0`` and ``--control noise`` are controls: trainings without what the teacher knows. What they reach, and
+    not what the untrained student does, is what a distillation must beat.
     """
+
+    student: str = Field(
+        "",
+        description="make the student of SOURCE first: the share of the blocks of each stack and of the "
+        "multiply-accumulates that stays, such as depth=0.5,width=0.75",
+    )
+    alpha: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="share of the teacher in the loss; the rest is of the expert's actions in the recording. 0: the "
+        "teacher is not asked, and nobody plays (a control)",
+    )
+    label_share: float = Field(
+        1.0, gt=0, le=1, description="share of the recorded observations whose expert's actions are used"
+    )
+    control: Literal["none", "noise"] = Field(
+        "none",
+        description="noise: each observation gets what the teacher said of another one, so that the student learns "
+        "nothing from it; to prove that the teacher matters",
+    )
+
+    def chain(self) -> tuple[Transform, ...]:
+        """The stages that make the student, then the training."""
+        made = [build_stage(name, options) for name, options in student_steps(self.student)]
+        return *(stage for stage in made if isinstance(stage, Transform)), self.model_copy(update={"student": ""})
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """What the teacher and the expert are asked for fits together, and is there."""
+        super().check(source, profile)
+        if self.alpha == 1 and self.label_share < 1:
+            raise RecipeError(
+                "--label-share is of the expert's actions, and --alpha 1 uses none of them.",
+                "give them a share of the loss, such as --alpha 0.5, or leave --label-share out",
+            )
+        if self.alpha == 0 and self.control != "none":
+            raise RecipeError(
+                f"--control {self.control} changes what the teacher says, and with --alpha 0 it is not asked.",
+                "name one of both controls",
+            )
+        hints = [f"--{name}" for name in registry.names("hints") if getattr(self, name)]
+        if hints and (self.alpha == 0 or self.control != "none"):
+            other = "--alpha 0" if self.alpha == 0 else f"--control {self.control}"
+            raise RecipeError(
+                f"{' and '.join(hints)} would let the teacher say what it knows; {other} is a training without that.",
+                "leave one of them out",
+            )
+        asked = [name for name in ("episodes", "student_episodes", "from_batches")
+                 if getattr(self, name) and name in self.options()]  # fmt: skip
+        if self.alpha == 0 and asked:
+            raise RecipeError(
+                "--alpha 0 learns from recorded actions alone: nobody is there who could say what is right "
+                f"elsewhere; got --{asked[0].replace('_', '-')} {getattr(self, asked[0])}.",
+                "leave it out",
+            )
+        if self.alpha < 1 and source is not None and CALIBRATION not in source.manifest.files:
+            raise DataError(
+                f"--alpha {self.alpha:g} needs an expert's actions, and {source.path} has no recording.", RECORD
+            )
+
+    def supervision(self) -> Supervision:
+        """Return who says what is right."""
+        return Supervision(self.alpha, self.label_share, self.control)
+
+    def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
+        """Return the teacher, and a lesson in which the expert has its share."""
+        teacher, lesson = super().prepared(modules, source)
+        if self.alpha == 1:
+            return teacher, lesson
+        distance = self._distance(self.loss if self.loss in OF_LABELS else "l1")
+        return teacher, replace(lesson, expert=expert_loss(modules, source, distance))
+
+    def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
+        """Train, unless that is only the last of several steps.
+
+        Raises:
+            RecipeError: when ``student`` asks for other stages first.
+        """
+        if self.student:
+            names = ", ".join(stage.name() for stage in self.chain())
+            raise RecipeError(
+                f"{self.name()} with the student {self.student} is several stages: {names}.",
+                "run one after the other what chain() returns, as the command line does",
+            )
+        return super().run(source, out, context)

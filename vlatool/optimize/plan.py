@@ -147,19 +147,19 @@ def _check_pruning(pruning: Pruning, source: Source) -> None:
 
 
 def transforms(stages: StageList) -> tuple[Transform, ...]:
-    """Return the stages of a list of entries.
+    """Return the stages of a list of entries, each as the steps that it stands for.
 
     Raises:
         RecipeError: when one reads a policy or measures; UsageError when there is no such stage or option.
     """
-    built = []
+    built: list[Transform] = []
     for name, options in stage_entries(stages):
         stage = build_stage(name, options or {})
         if stage.kind() == "sources":
             raise RecipeError(f"The stage {name} reads a policy; the policy is named on the command line.")
         if not isinstance(stage, Transform):
             raise RecipeError(f"The stage {name} measures; a recipe lists stages that make a bundle.")
-        built.append(stage)
+        built += stage.chain()
     return tuple(built)
 
 

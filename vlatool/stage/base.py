@@ -167,6 +167,17 @@ class Transform(Stage):
         """
         return ""
 
+    def chain(self) -> tuple[Transform, ...]:
+        """Return the stages that this one stands for: those that its options ask for first, then what is left of it.
+
+        The command line and recipes run them one after the other, so that each is cached, recorded and rebuilt as if it
+        had been named. A stage that stands for several refuses ``run``.
+
+        Raises:
+            RecipeError: when an option cannot be read.
+        """
+        return (self,)
+
     def then(self) -> tuple[tuple[str, dict[str, Any]], ...]:
         """Return the stages that the command line runs after this one, each with its options; a recipe names them."""
         return ()

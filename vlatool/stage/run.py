@@ -9,7 +9,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import BundleError, DataError
+from vlatool.errors import BundleError, DataError, VlatoolError
 from vlatool.files.kept import tag
 from vlatool.files.locks import hold
 from vlatool.files.outputs import BUNDLE, refuse_replacing
@@ -67,6 +67,35 @@ def cached_transform(stage: Transform, source: Bundle | None, cache: Path, conte
     bundle = run_transform(stage, source, path, context, damaged=True)
     hold(path)
     return bundle
+
+
+def first_steps(
+    stage: Transform, source: Bundle | None, cache: Path, context: Context
+) -> tuple[Transform, Bundle | None]:
+    """Run the stages that a stage asks for first, into the cache.
+
+    Returns:
+        What is left of the stage, and the bundle that it starts from.
+
+    Raises:
+        VlatoolError: what a stage raises, and how to run that stage with options of its own.
+    """
+    *first, last = stage.chain()
+    if first:
+        stage.check(source, None)
+    for step in first:
+        try:
+            source = cached_transform(step, source, cache, context)
+        except VlatoolError as error:
+            raise type(error)(error.message, "; ".join(filter(None, (error.fix, _alone(step, stage))))) from error
+    return last, source
+
+
+def _alone(step: Transform, stage: Transform) -> str:
+    """Return in words which stage of several failed, and how to give it other options."""
+    options = ", ".join(f"{name} {value}" for name, value in step.options().items())
+    command = f"vlatool {step.name().replace('.', ' ').replace('_', '-')}"
+    return f"{stage.name()} starts with {step.name()} ({options}); to give it other options, run it first: {command}"
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:

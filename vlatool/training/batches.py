@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +12,14 @@ from numpy.typing import NDArray
 
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group
-from vlatool.training.loop import Part
+from vlatool.training.mixture import Draw, Mixture, Part
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+Loss = Callable[[Mapping[str, Any]], "Tensor"]
+"""Rows of a batch, name -> (B, ...) -> the mean of their losses."""
 
 
 class Batches:
@@ -41,5 +46,26 @@ class Batches:
         for part in np.array_split(rows, self._parts)[self._own]:
             yield len(part) / self._size, partial(self._loss, part)
 
+    def of(self, loss: Loss, frames: Frames) -> Batches:
+        """Return batches of other rows, with another loss, in the same parts."""
+        other = copy(self)
+        other._of_rows, other._frames = loss, frames
+        return other
+
     def _loss(self, rows: NDArray[Any]) -> Tensor:
         return self._of_rows(self._frames.batch(rows))
+
+
+def draw_of(taught: Batches, alpha: float, loss: Loss | None, shown: Frames) -> Draw:
+    """Return what draws the batches of a training; the teacher's are the same whether there is an expert or not.
+
+    Args:
+        taught: Of what the teacher labelled.
+        alpha: Share of the teacher in the loss.
+        loss: Against an expert's actions; None where no expert is asked.
+        shown: Rows with what the expert did.
+    """
+    if loss is None:
+        return taught
+    others = taught.of(loss, shown)
+    return Mixture([(alpha, taught), (1 - alpha, others)]) if alpha else others

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Recording, calibration_recording
 from vlatool.errors import DataError, require
+from vlatool.training.batches import Loss
+from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
 from vlatool.training.rounds import Counted, next_round
 
@@ -35,6 +37,9 @@ class HeldOut:
 
     def __init__(self, place: Path) -> None:
         self._frames = Frames(place / FOLDER)
+        self.expert = Expert(place / FOLDER)
+        self.recording: Recording | None = None
+        """What is held out, after ``prepare``."""
         self._others: Counted | None = None
 
     @property
@@ -68,7 +73,8 @@ class HeldOut:
         recording = recording.only(used)
         held = held_out(recording)
         self._others = recording.only(~held)
-        next_round(self._frames, 0, partial(write, recording.only(held)))
+        self.recording = recording.only(held)
+        next_round(self._frames, 0, partial(write, self.recording))
 
     def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
         """Return the mean loss of what is held out.
@@ -78,12 +84,30 @@ class HeldOut:
             rows: At a time.
             bfloat16: Whether matrix products are computed so, as in training.
         """
-        torch, total = require("torch", "build"), 0.0
-        parts = np.array_split(np.arange(len(self._frames)), -(-len(self._frames) // rows))
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
-            for part in parts:
-                total += float(loss(self._frames.batch(part))) * len(part)
-        return total / len(self._frames)
+        return _mean(self._frames, loss, rows, bfloat16)
+
+    def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, *, bfloat16: bool) -> float:
+        """Return the same as a mixture of both terms.
+
+        Args:
+            alpha: Share of the teacher.
+            loss: Of a batch, against the teacher.
+            expert: Of a batch, against the expert's actions; None where no expert is asked.
+            rows, bfloat16: As of ``loss``.
+        """
+        total = alpha * self.loss(loss, rows, bfloat16=bfloat16) if alpha else 0.0
+        if expert is None:
+            return total
+        return total + (1 - alpha) * _mean(self.expert.frames, expert, rows, bfloat16)
+
+
+def _mean(frames: Frames, loss: Loss, rows: int, bfloat16: bool) -> float:
+    torch, total = require("torch", "build"), 0.0
+    parts = np.array_split(np.arange(len(frames)), -(-len(frames) // rows))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+        for part in parts:
+            total += float(loss(frames.batch(part))) * len(part)
+    return total / len(frames)
 
 
 def _required(instead: Callable[[Path], bool], recorded: int, target: Path) -> None:

@@ -24,6 +24,9 @@ from vlatool.module.edits import save_tensors
 from vlatool.training.best import Best
 from vlatool.training.constraint import Constraint
 from vlatool.training.group import Group
+from vlatool.training.mixture import Draw as Draw
+from vlatool.training.mixture import Mixture
+from vlatool.training.mixture import Part as Part
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -31,14 +34,12 @@ if TYPE_CHECKING:
 CHECKPOINT = "checkpoint.safetensors"
 CLIP = 1.0
 """Largest norm of the gradient."""
+LOOKS = (0.05, 0.5, 0.95)
+"""Shares of the steps after which the gradients of the terms of a loss are measured, where it has several."""
 WARMUP = 0.05
 """Share of the steps in which the learning rate rises."""
 BFLOAT16 = ("amx_bf16", "avx512_bf16", "bf16")
 """Features of processors that multiply bfloat16 natively: twice as fast as float32 here."""
-Part = tuple[float, Callable[[], "Tensor"]]
-"""Share of a batch, and what computes the mean loss of its rows; gradients of parts are added."""
-Draw = Callable[[np.random.Generator], Iterable[Part]]
-"""Random numbers of a step -> the parts of its batch that this process takes."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,8 @@ class Trainer:
         self.best = Best()
         self.step = 0
         self.losses: list[float] = []
+        self.looks: list[list[float]] = []
+        """Number of a step, and the norm of the gradient of each term of its loss."""
         self._start = time.monotonic()
         self._resume()
 
@@ -146,7 +149,11 @@ class Trainer:
 
     def _take_step(self, draw: Draw) -> None:
         self._optimizer.zero_grad()
-        loss = self._group.summed(self._own_loss(draw), list(self._weights.values()))
+        random = np.random.default_rng((self._settings.seed, self.step))
+        if isinstance(draw, Mixture) and self.step in {int(share * self._settings.steps) for share in LOOKS}:
+            loss = self._look(draw, random)
+        else:
+            loss = self._group.summed(self._own_loss(draw(random)), list(self._weights.values()))
         if not math.isfinite(loss):
             raise DataError(
                 f"The loss is {loss} in step {self.step + 1} of {self._settings.steps}.",
@@ -161,10 +168,26 @@ class Trainer:
         self.step += 1
         self.losses.append(loss)
 
-    def _own_loss(self, draw: Draw) -> float:
+    def _look(self, mixture: Mixture, random: np.random.Generator) -> float:
+        """Add the gradients of all terms, and remember the norm of each; return the loss."""
+        weights, total, norms = list(self._weights.values()), 0.0, []
+        sums: list[Tensor | None] = [None] * len(weights)
+        for term in mixture.terms:
+            self._optimizer.zero_grad()
+            total += self._group.summed(self._own_loss(term(random)), weights)
+            norms.append(math.sqrt(sum(float(value.grad.double().square().sum()) for value in weights
+                                       if value.grad is not None)))  # fmt: skip
+            sums = [value.grad if before is None else before if value.grad is None else before + value.grad
+                    for before, value in zip(sums, weights, strict=True)]  # fmt: skip
+        for value, gradient in zip(weights, sums, strict=True):
+            value.grad = gradient
+        self.looks.append([self.step + 1, *norms])
+        return total
+
+    def _own_loss(self, parts: Iterable[Part]) -> float:
         """Add the gradients of this process's parts of the batch; return their share of its loss."""
         torch, total = require("torch", "build"), 0.0
-        for share, compute in draw(np.random.default_rng((self._settings.seed, self.step))):
+        for share, compute in parts:
             with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.bfloat16):
                 loss = compute()
             if not loss.requires_grad:
@@ -213,6 +236,7 @@ class Trainer:
                 tensors[f"{key}.{name}"] = held.contiguous()
         tensors |= {f"best.{name}": value for name, value in self.best.weights.items()}
         about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text()}
+        about["looks"] = json.dumps(self.looks)
         about["seconds"] = f"{self.seconds:.3f}"
         with whole_file(self._file) as draft:
             save_tensors(draft, tensors, about)
@@ -238,6 +262,7 @@ class Trainer:
     def _take(self, opened: Any) -> None:
         about, names = opened.metadata(), set(opened.keys())
         self.step, self.losses = int(about["step"]), json.loads(about["losses"])
+        self.looks = json.loads(about["looks"])
         self._start -= float(about["seconds"])
         best = {name: opened.get_tensor(f"best.{name}") for name in self._weights if f"best.{name}" in names}
         self.best = Best.of(about["best"], best)

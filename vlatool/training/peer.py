@@ -12,11 +12,12 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.base import build_stage
-from vlatool.training.batches import Batches
+from vlatool.training.batches import Batches, draw_of
 from vlatool.training.crew import MEETING
+from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group, joined_group
-from vlatool.training.loop import Trainer
+from vlatool.training.loop import Draw, Trainer
 from vlatool.training.stage import TrainingStage
 
 Tell = Callable[[str, float | None], None]
@@ -30,8 +31,9 @@ class Peer:
     group: Group
     frames: Frames
     trainer: Trainer
-    batches: Batches
+    batches: Draw
     opened: contextlib.ExitStack
+    expert: Expert
 
 
 _peer: list[Peer] = []
@@ -48,7 +50,9 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
     _, lesson = stage.prepared(load_modules(source), source)
     trainer = Trainer(lesson.trained, stage.settings(), place, group, lesson.constraint)
     batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
-    _peer[:] = [Peer(place / MEETING, group, frames, trainer, batches, contextlib.ExitStack())]
+    expert = Expert(place)
+    draw = draw_of(batches, stage.supervision().alpha, lesson.expert, expert.frames)
+    _peer[:] = [Peer(place / MEETING, group, frames, trainer, draw, contextlib.ExitStack(), expert)]
 
 
 def join(_job: Mapping[str, Any], _tell: Tell) -> None:
@@ -62,4 +66,5 @@ def train(job: Mapping[str, Any], _tell: Tell) -> None:
     peer = _peer[0]
     for number in range(peer.frames.count, job["rounds"]):
         peer.frames.read(number)
+    peer.expert.read()
     peer.trainer.train(job["until"], peer.batches, lambda _step, _loss: None)

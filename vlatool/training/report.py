@@ -10,8 +10,9 @@ from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.machine.host import fingerprint
 from vlatool.module.stage import TRAINING
 from vlatool.render import write_reports
-from vlatool.report import TRAINED, TRAINING_TIME, Measurement, Report, Row
+from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
 from vlatool.training.forecast import duration
+from vlatool.training.supervision import teacher_lines, teacher_record
 
 Record = dict[str, Any]
 
@@ -35,13 +36,17 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
         made.manifest.name,
         measurements=(took,),
         raw={f"{TRAINED}{stage}": losses},
-        details={f"{TRAINED}{stage}": [_round(round_) for round_ in training["rounds"]]},
+        details={
+            f"{TRAINED}{stage}": [_round(round_) for round_ in training["rounds"]],
+            f"{TRAINED}{stage}{TEACHER}": [teacher_record(training)],
+        },
     )
     few = max(1, steps // 20)
     first, last = sum(losses[:few]) / few, sum(losses[-few:]) / few
     result = f"{training['loss']} {first:.4g} -> {last:.4g} in {steps} steps and {duration(seconds)}."
     report = Report(
-        "training", f"{made.manifest.name}: {stage}", summary=(result,), rows=(row,), command=command,
+        "training", f"{made.manifest.name}: {stage}", summary=(result, *teacher_lines(training)), rows=(row,),
+        command=command,
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"), environment=fingerprint(),
     )  # fmt: skip
     write_reports(report, made.path / REPORTS)

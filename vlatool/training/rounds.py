@@ -20,8 +20,9 @@ from vlatool.training.frames import Array, Frames, new_array
 if TYPE_CHECKING:
     from torch import Tensor
 
-LABEL, NOISE = "teacher.", "noise."
-"""Prefixes of what is kept beside the inputs: the teacher's outputs, and the noise that they were made from."""
+LABEL, NOISE, EXPERT = "teacher.", "noise.", "expert."
+"""Prefixes of what is kept beside the inputs: the teacher's outputs, the noise that they were made from, and what an
+expert did."""
 ROWS = 32
 """Rows that the teacher labels at a time."""
 
@@ -90,7 +91,7 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
 def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
     """Return the arrays of a batch whose names begin so, without that beginning, as tensors."""
     torch = require("torch", "build")
-    others = (LABEL, NOISE)
+    others = (LABEL, NOISE, EXPERT)
     return {
         name[len(prefix) :]: torch.from_numpy(value)
         for name, value in rows.items()

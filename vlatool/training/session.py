@@ -18,15 +18,18 @@ from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
-from vlatool.training.batches import Batches
+from vlatool.training.batches import Batches, draw_of
 from vlatool.training.constraint import Constraint
+from vlatool.training.control import exchange_labels
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
+from vlatool.training.expert import Expert, at_most
 from vlatool.training.forecast import Forecast
 from vlatool.training.frames import Frames, joined
 from vlatool.training.held_out import HeldOut
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
+from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
 from vlatool.training.teacher import Teacher
 from vlatool.training.yielded import write_yielded
 
@@ -53,6 +56,7 @@ class Plan:
         patience: Pauses in a row without an improvement after which training ends; 0 for never.
         accumulate: Parts of a batch, computed one after the other.
         yielded: Rows that are taken from the function of the policy's that yields batches.
+        supervision: Who says what is right.
     """
 
     batch: int
@@ -64,6 +68,7 @@ class Plan:
     patience: int = 0
     accumulate: int = 1
     yielded: int = 0
+    supervision: Supervision = TEACHER_ALONE
 
     def asked(self, number: int) -> int:
         """Return how many episodes a round has."""
@@ -87,6 +92,7 @@ class Lesson:
         along: Name -> module that is trained along, and no part of the student.
         about: What else is to be known of the training, as JSON values.
         constraint: What holds of the weights after each step.
+        expert: The same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
     """
 
     name: str
@@ -96,6 +102,7 @@ class Lesson:
     along: Mapping[str, nn.Module] = field(default_factory=dict)
     about: Mapping[str, Any] = field(default_factory=dict)
     constraint: Constraint | None = None
+    expert: Callable[[Mapping[str, Any]], Tensor] | None = None
 
     @property
     def trained(self) -> dict[str, nn.Module]:
@@ -139,6 +146,8 @@ class Session:
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
         self._trainer = Trainer(lesson.trained, settings, place, self._crew.group, lesson.constraint)
         self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
+        self._expert = Expert(place)
+        self._draw = draw_of(self._batches, plan.supervision.alpha, lesson.expert, self._expert.frames)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
         self._success = ""
@@ -149,7 +158,9 @@ class Session:
             self._context.tell(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
             self._held_out.prepare(self._source, RECORDED, self._write_held_out, self._yield_held_out)
-        next_round(self._frames, 0, self._first)
+        self._show()
+        if self._plan.supervision.alpha:
+            next_round(self._frames, 0, self._first)
         pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
         for number, end in enumerate([*pauses, self._settings.steps]):
             if number and self._paused(number):
@@ -162,9 +173,20 @@ class Session:
         self._events.close()
         return self._about()
 
+    def _show(self) -> None:
+        """Write what the expert did, to learn from and to judge with, where the expert is asked."""
+        if self._lesson.expert is None:
+            return
+        chosen = self._plan.supervision.label_share, self._settings.seed
+        if self._held_out is None:
+            self._expert.prepare(at_most(self._source, RECORDED), self._source, *chosen, self._encode)
+            return
+        self._expert.prepare(self._held_out.others, self._source, *chosen, self._encode)
+        self._held_out.expert.prepare(self._held_out.recording, self._source, *chosen, self._encode)
+
     def _train(self, end: int) -> None:
         with self._crew.training(self._frames.count, end):
-            self._trainer.train(end, self._batches, self._tell)
+            self._trainer.train(end, self._draw, self._tell)
         self._trainer.save()
 
     def _paused(self, number: int) -> bool:
@@ -189,7 +211,8 @@ class Session:
         self._trainer.swap()
         try:
             judged = self._lesson.judged or self._lesson.loss
-            loss = self._held_out.loss(judged, self._plan.batch, bfloat16=self._settings.bfloat16)
+            terms = self._plan.supervision.alpha, judged, self._lesson.expert
+            loss = self._held_out.mixed(*terms, self._plan.batch, bfloat16=self._settings.bfloat16)
         finally:
             self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
@@ -198,16 +221,19 @@ class Session:
 
     def _about(self) -> dict[str, Any]:
         best, several = self._trainer.best, self._crew.group.size
+        supervision, teacher = self._plan.supervision, self._teacher.program.modules
         judged = "success" if self._held_out is None else "held-out loss"
         scores = best.scores if self._held_out is None else [-score for score in best.scores]
         return {
-            "loss": self._lesson.name,
+            "loss": supervision.loss_name(self._lesson.name),
             **self._lesson.about,
             "precision": "bfloat16" if self._settings.bfloat16 else "float32",
             "threads": require("torch", "build").get_num_threads(),
             **({"processes": several} if several > 1 else {}),
             "losses": self._trainer.losses,
-            "rounds": [self._round(number) for number in range(self._frames.count)],
+            "rounds": [self._round(number) for number in range(self._frames.count)] or [self._expert.round()],
+            "parameters": {"student": parameters(self._lesson.modules), "teacher": parameters(teacher)},
+            "teacher": supervision.about(self._trainer.looks, self._expert.counts),
             **({"judged": {"by": judged, "scores": scores, "best_step": best.step}} if scores else {}),
         }
 
@@ -274,9 +300,13 @@ class Session:
         self._label(target, number)
 
     def _label(self, target: Path, *seed: int) -> None:
+        if not self._plan.supervision.alpha:
+            return
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
         label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
+        if self._plan.supervision.control == "noise":
+            exchange_labels(target, outputs, (self._settings.seed, *seed))
 
     def _actor(self, place: Path, number: int) -> Bundle:
         """Write who plays as a bundle, which the processes that play open."""

@@ -26,6 +26,7 @@ from vlatool.training.loop import Settings, has_bfloat16, seconds_of
 from vlatool.training.report import write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Lesson, Plan, Session
+from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
 from vlatool.training.teacher import Teacher
 from vlatool.training.yielded import rows_asked
 
@@ -100,10 +101,12 @@ class TrainingStage(ModuleStage):
                 f"{EVALUATION_SEEDS}, and would see episodes of the training.",
                 "take a smaller --first-seed, or fewer episodes",
             )
-        if self.changed_first and source is not None and self.teacher is None and not is_changed(source):
+        changes = len(self.chain()) > 1
+        if self.changed_first and not (source is None or self.teacher or changes or is_changed(source)):
             raise RecipeError(
                 f"{source.manifest.name} is as its factory makes it: without --teacher it would be its own teacher.",
-                "prune it first (vlatool prune structured), or name a --teacher",
+                "let a part of it be the student (vlatool distill policy --student depth=0.5,width=0.75), prune it "
+                "first (vlatool prune structured), or name a --teacher",
             )
 
     def pauses(self) -> list[int]:
@@ -129,6 +132,7 @@ class TrainingStage(ModuleStage):
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
             *_compared(training.get("hints", {})),
+            *teacher_lines(training),
             *_judged(training.get("judged")),
             *([f"loss curve: {page}"] if (page := made.path / REPORTS / "report.html").is_file() else []),
             *super().lines(made),
@@ -154,7 +158,8 @@ class TrainingStage(ModuleStage):
 
     def _trained(self, modules: Mapping[str, nn.Module], source: Bundle, place: Path, context: Context) -> Changed:
         plays = self.episodes > 0 and scene_of(source) is not None
-        plan = replace(self.plan(), yielded=rows_asked(self.from_batches, source, plays))
+        asked = rows_asked(self.from_batches, source, plays) if self.supervision().alpha else 0
+        plan = replace(self.plan(), yielded=asked)
         teacher, lesson = self.prepared(modules, source)
         with crew_of(self._job(source), self.processes, place, self.runs(source)) as crew:
             session = Session(plan, self.settings(), lesson, source, teacher, place, context, crew)
@@ -170,10 +175,16 @@ class TrainingStage(ModuleStage):
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_bfloat16(host.isa()))
         return Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, bfloat16)
 
+    def supervision(self) -> Supervision:
+        """Return who says what is right: the teacher, unless a stage asks somebody else, too."""
+        return TEACHER_ALONE
+
     def plan(self) -> Plan:
-        """Return what is played when."""
-        played = (self.batch, self.episodes, self.student_episodes, self.pauses(), self.noise, self.first_seed)
-        return Plan(*played, self.patience, self.accumulate)
+        """Return what is played when; nobody plays where nobody would say what was right."""
+        supervision = self.supervision()
+        episodes = (self.episodes, self.student_episodes) if supervision.alpha else (0, 0)
+        played = (self.batch, *episodes, self.pauses(), self.noise, self.first_seed)
+        return Plan(*played, self.patience, self.accumulate, supervision=supervision)
 
     def _job(self, source: Bundle) -> dict[str, Any]:
         """Return what another process of the training needs to know."""

@@ -11,7 +11,7 @@ from vlatool.render.charts.losses import Curve, loss_curve
 from vlatool.render.charts.samples import finite
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import MISSING, Block, Chart, Column, Line, Section, Table
-from vlatool.report import TRAINED, TRAINING_TIME, Report
+from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Report
 
 CAPTION = (
     "Line: median of consecutive steps; bands: the middle 80 %, and smallest to largest. Vertical lines: rounds of "
@@ -34,7 +34,8 @@ class Training:
         blocks += [
             Chart(partial(loss_curve, curve, str(place)), CAPTION) for place, curve in enumerate(curves.values())
         ]
-        blocks += [table for name in names if (table := records_table(report, name))]
+        titles = (f"{name}{end}" for name in names for end in (TEACHER, ""))
+        blocks += [table for title in titles if (table := records_table(report, title))]
         yield Section("Training", tuple(blocks), 85, "measured", brief=False)
 
 

@@ -1,0 +1,165 @@
+"""A student that is derived from the policy: what a person writes, and the same bundle as from the stages alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from _tiny import deepen, observations, with_expert
+from _trainings import RECORDED, training_of
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.cli import main
+from vlatool.distill._student import student_steps
+from vlatool.distill.policy import PolicyDistillation
+from vlatool.errors import RecipeError
+from vlatool.module.edits import read_edits
+from vlatool.module.torch_policy import load_modules
+from vlatool.optimize.plan import transforms
+from vlatool.prune.neurons import Neurons
+from vlatool.rebuild.rebuild import rebuild
+from vlatool.sources.torch_module import TorchModule
+from vlatool.stage.base import Context, build_stage
+from vlatool.stage.run import first_steps, run_transform
+from vlatool.training.supervision import parameters
+
+STUDENT = "depth=0.5,width=0.75"
+SHORT = {**RECORDED, "steps": 3, "threads": 1}
+STAGES = ["prune.depth", "prune.structured", "distill.policy"]
+
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
+
+@pytest.fixture
+def deep(policy_dir: Path) -> Path:
+    """The folder of the tiny policy with three blocks, which its expert has, too."""
+    deepen(policy_dir)
+    code = policy_dir / "policy.py"
+    code.write_text(code.read_text().replace("def make(layers=1)", "def make(layers=3)"))
+    for number, (name, count) in enumerate((("calibration", 24), ("evaluation", 16)), 1):
+        np.savez(policy_dir / f"{name}.npz", **with_expert(observations(count, seed=number), policy_dir))
+    return policy_dir
+
+
+def ran(*words: object) -> None:
+    with pytest.raises(SystemExit) as left:
+        main([str(word) for word in words])
+    assert not left.value.code
+
+
+def flags(**options: object) -> list[str]:
+    return [
+        word for name, value in {**SHORT, **options}.items() for word in (f"--{name.replace('_', '-')}", str(value))
+    ]
+
+
+@pytest.mark.parametrize(("text", "ratios"), [
+    ("", {}), ("depth=0.5", {"depth": 0.5}), ("width=.75", {"structured": 0.25}), ("depth=1,width=0.9",
+    {"structured": 0.1}), (" width = 0.75 , depth=0.5", {"depth": 0.5, "structured": 0.25}),
+    ("depth=0.9", {"depth": 0.1}), ("depth=1e-3", {"depth": 0.999}),
+])  # fmt: skip
+def test_what_stays_becomes_what_goes_blocks_first(text: str, ratios: dict[str, float]):
+    assert student_steps(text) == tuple((f"prune.{name}", {"ratio": ratio}) for name, ratio in ratios.items())
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("half", "such as depth=0.5,width=0.75"), ("depth", "got 'depth'"), ("=0.5", "got '=0.5'"),
+    ("depth=", "got 'depth='"), (",", "got ','"), ("depth=0.5,", "got 'depth=0.5,'"),
+    ("dept=0.5", "knows no 'dept'; did you mean 'depth'"), ("depth=0.5,depth=0.4", "names depth twice"),
+    ("depth=0", "depth=0: what stays is a share above 0, at most 1"), ("width=1.5", "width=1.5: what stays"),
+    ("width=-1", "width=-1: what stays"), ("width=nan", "width=nan: what stays"),
+    ("width=inf", "width=inf: what stays"), ("width=half", "width=half: what stays"),
+    ("width=1e-9", "above 0, at most 1"), ("width=0.5=0.6", "width=0.5=0.6: what stays"),
+    ("depth=1,width=1", "takes nothing away"), ("depth=1", "takes nothing away"),
+])  # fmt: skip
+def test_what_is_no_student_is_refused(text: str, says: str):
+    with pytest.raises(RecipeError) as caught:
+        PolicyDistillation(student=text).check(None, None)
+    assert says in str(caught.value)
+
+
+def test_it_is_what_the_stages_make_one_by_one_and_is_made_again(deep: Path, tmp_path: Path):
+    """Three blocks: half of them is one and a half, so two stay, and one goes."""
+    ran("distill", "policy", deep, "--student", STUDENT, "-o", tmp_path / "short", *flags())
+    ran("prune", "depth", deep, "--ratio", 0.5, "-o", tmp_path / "d")
+    ran("prune", "structured", tmp_path / "d", "--ratio", 0.25, "-o", tmp_path / "w", "--trust", deep)
+    ran("distill", "policy", tmp_path / "w", "-o", tmp_path / "long", "--trust", deep, *flags())
+    short, long = (Bundle.open(tmp_path / name) for name in ("short", "long"))
+    assert short.hash == long.hash
+    assert [entry["stage"] for entry in short.manifest.build][1:] == STAGES
+    blocks, *units = read_edits(short)
+    assert (blocks.axis, len(blocks.keep)) == ("blocks", 2)
+    assert units
+    assert rebuild(short, Context(), source=str(deep), cache=tmp_path / "none").identical
+
+
+def test_its_size_is_told_beside_that_of_the_teacher(deep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    ran("distill", "policy", deep, "--student", STUDENT, "-o", tmp_path / "out", *flags())
+    made = Bundle.open(tmp_path / "out")
+    whole = run_transform(TorchModule(policy=deep), None, tmp_path / "whole", Context())
+    counted = {"student": parameters(load_modules(made)), "teacher": parameters(load_modules(whole))}
+    assert training_of(made)["parameters"] == counted
+    share = 100 * counted["student"] / counted["teacher"]
+    assert f"  {counted['student']:,} of {counted['teacher']:,} parameters ({share:.0f} %)" in capsys.readouterr().out
+    assert share < 75
+
+
+def test_a_policy_that_was_edited_has_students_too(deep: Path, tmp_path: Path):
+    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context())
+    pruned = run_transform(Neurons(ratio=0.5), source, tmp_path / "pruned", Context())
+    ran("distill", "policy", pruned.path, "--student", "depth=0.5", "--trust", deep, "-o", tmp_path / "out", *flags())
+    made = Bundle.open(tmp_path / "out")
+    assert [entry["stage"] for entry in made.manifest.build][1:] == ["prune.neurons", "prune.depth", "distill.policy"]
+    assert training_of(made)["parameters"]["teacher"] == parameters(load_modules(source))
+
+
+def test_a_candidate_of_a_recipe_is_the_same(deep: Path, tmp_path: Path):
+    entries = ({"distill.policy": {**SHORT, "student": STUDENT, "control": "noise"}},)
+    assert [stage.name() for stage in transforms(entries)] == STAGES
+    recipe = {"schema": 1, "candidates": {"smaller": entries}, "search": False}
+    (tmp_path / "recipe.yaml").write_text(json.dumps(recipe))
+    limits = ["--max-drop", "relative_error=100", "--episodes", 0, "--iterations", 20]
+    ran("optimize", deep, "--recipe", tmp_path / "recipe.yaml", "-o", tmp_path / "out", *limits)
+    made = Bundle.open(tmp_path / "out")
+    report = json.loads((tmp_path / "out/reports/report.json").read_text())
+    (row,) = (row for row in report["rows"] if row["name"] == "smaller")
+    (record,) = row["details"]["training: distill.policy, and its teacher"]
+    assert record["gradient from the teacher"] == "100 % (alpha 1, the loss has no other term)"
+    assert "100 % (alpha 1" in (tmp_path / "out/reports/report.html").read_text()
+    assert any(line.startswith("smaller: a control, not for a robot") for line in report["warnings"])
+    if made.manifest.made_by["candidate"] == "smaller":
+        assert [entry["stage"] for entry in made.manifest.build][1:4] == STAGES
+    assert f"student: {STUDENT}" in (tmp_path / "out/recipe.yaml").read_text()
+
+
+def test_as_one_stage_it_is_refused_with_the_way_to_run_it(deep: Path, tmp_path: Path):
+    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context())
+    stage = build_stage("distill.policy", {**SHORT, "student": STUDENT})
+    with pytest.raises(RecipeError, match=r"is several stages: prune\.depth, prune\.structured, distill\.policy"):
+        run_transform(stage, source, tmp_path / "out", Context())
+    assert not (tmp_path / "out").exists()
+    last, pruned = first_steps(stage, source, tmp_path / "cache", Context())
+    assert run_transform(last, pruned, tmp_path / "out", Context()).manifest.made_by["stage"] == "distill.policy"
+
+
+def test_wrong_options_are_refused_before_anything_is_pruned(deep: Path, tmp_path: Path):
+    source = run_transform(TorchModule(policy=deep), None, tmp_path / "source", Context())
+    stage = build_stage("distill.policy", {**SHORT, "student": STUDENT, "loss": "hubert"})
+    with pytest.raises(RecipeError, match="Unknown loss 'hubert'"):
+        first_steps(stage, source, tmp_path / "cache", Context())
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize(("student", "says"), [
+    ("depth=0.5", "has no stack of blocks"), ("width=0.01", "No more than .* of the multiply-accumulates can go"),
+])  # fmt: skip
+def test_what_cannot_be_pruned_so_is_told_with_the_stage(
+    source_bundle: Bundle, tmp_path: Path, student: str, says: str
+):
+    stage = build_stage("distill.policy", {**SHORT, "student": student})
+    with pytest.raises(RecipeError, match=says) as caught:
+        first_steps(stage, source_bundle, tmp_path / "cache", Context())
+    assert "distill.policy starts with prune." in caught.value.fix
+    assert "run it first: vlatool prune " in caught.value.fix

@@ -1,0 +1,54 @@
+"""A control of a training: labels that look like a teacher's, and say nothing of what they stand beside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vlatool.episodes.frames import file_of
+from vlatool.errors import DataError
+from vlatool.training.frames import BLOCK, Array, new_array
+from vlatool.training.rounds import LABEL
+
+
+def exchange_labels(frames: Path, outputs: Sequence[str], seed: Sequence[int]) -> None:
+    """Give each row of a round what the teacher said of another row; every label is used once.
+
+    Inputs and noise stay where they are, and the labels have the distribution that they had.
+
+    Args:
+        frames: Folder of the round, labelled.
+        outputs: Outputs of the policy.
+        seed: Of the exchange.
+
+    Raises:
+        DataError: when there is no other row.
+    """
+    files = [file_of(frames, LABEL + name) for name in outputs]
+    others = other_rows(len(np.load(files[0], mmap_mode="r")), seed)
+    for file in files:
+        labels: Array = np.load(file, mmap_mode="r")
+        draft = file.with_name(f"exchanged-{file.name}")
+        exchanged = new_array(draft, labels.dtype, labels.shape)
+        for start in range(0, len(labels), BLOCK):
+            exchanged[start : start + BLOCK] = labels[others[start : start + BLOCK]]
+        draft.replace(file)
+
+
+def other_rows(count: int, seed: Sequence[int]) -> Array:
+    """Return for each of so many rows another one, each once: (count,).
+
+    Raises:
+        DataError: when there are fewer than two.
+    """
+    if count < 2:
+        raise DataError(
+            f"--control noise gives an observation what the teacher said of another one; there is {count}.",
+            "record more of them, or play more --episodes",
+        )
+    order = np.random.default_rng(seed).permutation(count)
+    others = np.empty(count, np.int64)
+    others[order] = np.roll(order, 1)
+    return others

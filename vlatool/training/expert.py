@@ -1,0 +1,146 @@
+"""What an expert did, where that was recorded: a second term of the loss, with rows of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import TensorSpec
+from vlatool.data import Recording, calibration_recording
+from vlatool.episodes.frames import file_of
+from vlatool.errors import DataError, require
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.runtime.statistics import load_normaliser
+from vlatool.training.frames import BLOCK, Array, Frames, new_array
+from vlatool.training.rounds import EXPERT, NOISE, Counted, next_round, tensors, write_recorded
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+FOLDER = "expert"
+CHOICE = 1
+"""Distinguishes the random numbers that choose observations from those of noise and batches."""
+RECORD = "record what was done ('action' in the file that calibration: names in policy.yaml), or use --alpha 1"
+
+
+class Expert:
+    """Recorded observations with the expert's actions, encoded, in a folder of their own.
+
+    Args:
+        place: Folder of the training, or of what it holds out.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.frames = Frames(place / FOLDER)
+        self.counts: dict[str, int] = {}
+
+    def prepare(
+        self,
+        recording: Counted | None,
+        source: Bundle,
+        share: float,
+        seed: int,
+        encode: Callable[[Any], Mapping[str, Array]],
+    ) -> None:
+        """Choose observations, and write them with the expert's actions unless an earlier run did.
+
+        Args:
+            recording: Recorded observations to choose from.
+            source: The student's bundle.
+            share: Of them, at least one.
+            seed: Of the choice; a smaller share is a part of a larger one.
+            encode: Observation -> what the policy takes.
+
+        Raises:
+            DataError: when there are no actions of an expert.
+        """
+        if not isinstance(recording, Recording) or recording.actions is None:
+            where = recording.path if isinstance(recording, Recording) else source.path
+            raise DataError(f"A loss against an expert's actions needs them, and {where} has none.", RECORD)
+        order = np.random.default_rng((seed, CHOICE)).permutation(len(recording))
+        used = np.zeros(len(recording), np.bool_)
+        used[order[: max(1, round(share * len(recording)))]] = True
+        chosen = recording.only(used)
+        self.counts = {"used": len(chosen), "recorded": len(recording)}
+
+        def write(target: Path) -> None:
+            action = source.manifest.spec.action
+            write_recorded(encode, chosen, target)
+            np.save(file_of(target, EXPERT + action.name), encoded_actions(action, source, chosen.actions))
+            write_noise(source, len(chosen), (seed, CHOICE), target)
+
+        if not self.frames.count:
+            next_round(self.frames, 0, write)
+
+    def round(self) -> dict[str, Any]:
+        """Return what a training says of these observations where they are all that there is to learn from."""
+        return {"step": 0, "actor": "expert", "observations": len(self.frames)}
+
+    def read(self) -> None:
+        """Use what another process wrote, if it did."""
+        if not self.frames.count and self.frames.has(0):
+            self.frames.read(0)
+
+
+def at_most(source: Bundle, most: int) -> Recording | None:
+    """Return so many recorded observations of a bundle, spread over its recording; None when it has none."""
+    recording = calibration_recording(source)
+    if recording is None:
+        return None
+    used = np.zeros(len(recording), np.bool_)
+    used[recording.spread(most)] = True
+    return recording.only(used)
+
+
+def encoded_actions(action: TensorSpec, source: Bundle, actions: Any) -> Array:
+    """Return recorded actions as a graph gives them: (N, T, A) normalised float32, or (N, T) int64 indices."""
+    if action.kind == "discrete":
+        return np.asarray(actions, np.int64)
+    normaliser = load_normaliser(action, source)
+    physical = np.asarray(actions, np.float32)
+    return physical if normaliser is None else normaliser.forward(physical)
+
+
+def write_noise(source: Bundle, rows: int, seed: Sequence[int], target: Path) -> None:
+    """Write for so many rows what the program draws, if it draws anything."""
+    wanted = {name: noise for step in source.manifest.program for name, noise in step.noise.items()}
+    random, kept = np.random.default_rng(seed), dict[str, Array]()
+    for start in range(0, rows, BLOCK) if wanted else ():
+        for name, value in drawn(wanted, min(BLOCK, rows - start), random).items():
+            if name not in kept:
+                kept[name] = new_array(file_of(target, NOISE + name), value.numpy().dtype, (rows, *value.shape[1:]))
+            kept[name][start : start + len(value)] = value.numpy()
+
+
+def expert_loss(
+    modules: Mapping[str, nn.Module], source: Bundle, distance: Any
+) -> Callable[[Mapping[str, Any]], Tensor]:
+    """Return the loss of the student against the expert's actions: rows, as ``Expert`` wrote them -> their mean.
+
+    Discrete actions: the cross-entropy, at temperature 1 (Hinton, Vinyals and Dean, arXiv 1503.02531, section 2).
+    Continuous ones: ``distance``, over the leading steps that were recorded.
+
+    Args:
+        modules: The student's.
+        source: Its bundle.
+        distance: Student's and expert's actions, (B, T, A) each -> the mean over them.
+    """
+    action = source.manifest.spec.action
+    student = BatchedProgram(source.manifest.program, modules)
+
+    def loss(rows: Mapping[str, Any]) -> Tensor:
+        expert = tensors(rows, EXPERT)[action.name]
+        given = student.run(tensors(rows), tensors(rows, NOISE))[action.name].float()
+        given = given.reshape(len(given), -1, given.shape[-1])[:, : expert.shape[1]]
+        if action.kind != "discrete":
+            far: Tensor = distance(given, expert)
+            return far
+        entropy = require("torch", "build").nn.functional.cross_entropy
+        wrong: Tensor = entropy(given.flatten(0, 1), expert.flatten())
+        return wrong
+
+    return loss
