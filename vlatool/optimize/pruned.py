@@ -17,6 +17,7 @@ from vlatool.machine import host
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
+from vlatool.optimize.search import QUICK
 from vlatool.optimize.space import Shape, Space, quantizations, space_of
 from vlatool.optimize.study import Study, Tried
 from vlatool.optimize.trained import trainings
@@ -31,7 +32,6 @@ SELECTION_SEEDS = 4_000_000
 """Seeds of the episodes that trials play: neither of a training nor of an evaluation."""
 FINALISTS = 3
 TIMED = 60
-QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False}
 
 
 @dataclass(frozen=True)
