@@ -79,7 +79,7 @@ def record(**properties: Schema) -> Schema:
 STAGE = record(stage=TEXT, options=ANYTHING)
 SOURCE = record(policy={"type": ["string", "null"]}, stage=TEXT, options=ANYTHING)
 PLAN = record(
-    source=SOURCE, export=many(STAGE), candidates=by_name(many(STAGE)), search=FLAG,
+    source=SOURCE, export=many(STAGE), candidates=by_name(many(STAGE)), search=FLAG, pruning=ANYTHING,
     benchmark=record(iterations=INTEGER, threads=INTEGER), evaluate=record(recorded=FLAG, episodes=INTEGER),
     limits=ANYTHING, profile={"type": ["string", "null"]}, computes={"type": ["string", "null"]}, cache=TEXT,
 )  # fmt: skip

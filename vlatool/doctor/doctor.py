@@ -31,6 +31,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "sim": ("gymnasium", "minigrid"),
     "metaworld": ("metaworld", "mujoco"),
     "text": ("tokenizers",),
+    "search": ("optuna",),
     "tensorboard": ("tensorboard",),
     "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
 }
