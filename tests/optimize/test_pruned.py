@@ -10,12 +10,14 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
+from vlatool.hardware.profile import Profile, load_profile
+from vlatool.optimize.pipeline import _write_bundle
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.pruned import PrunedSearch, front_of
 from vlatool.optimize.recipe import read_recipe
 from vlatool.optimize.space import FLOAT32, Shape
 from vlatool.optimize.study import Tried
-from vlatool.report import Report, read_report
+from vlatool.report import Report, Row, read_report
 from vlatool.stage.base import Context
 
 RECIPE = """\
@@ -106,8 +108,8 @@ def test_without_episodes_the_error_on_recorded_observations_decides(
         ([], "{episodes: 0}", 3, "pruning.episodes"),
         ([], "{tirals: 3}", 3, "tirals"),
         ([], "7", 3, "pruning"),
-        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "cannot be opened"),
-        (["--trials", "2", "--study", "sqlite:////proc/none/x.db"], "trials: 1", 2, "cannot be opened"),
+        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "cannot be used"),
+        (["--trials", "2", "--study", "sqlite:////proc/none/x.db"], "trials: 1", 2, "cannot be used"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )  # fmt: skip
@@ -140,6 +142,46 @@ def test_the_plan_tells_of_the_trials(
     assert "5 policies, pruned, trained (distill.policy" in capsys.readouterr().out
     assert optimized(*words, "--json") == 0
     assert json.loads(capsys.readouterr().out)["plan"]["pruning"]["trials"] == 5
+
+
+def test_passwords_and_places_of_studies_stay_here(
+    policy_template: Path, float_bundle: Bundle, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = "postgresql://me:secret@host/trials"
+    words = (policy_template, "--recipe", recipe, "--study", url, "--dry-run", "-o", tmp_path / "out")
+    for more in ((), ("--json",)):
+        assert optimized(*words, *more) == 0
+        said = capsys.readouterr().out
+        assert "secret" not in said
+        assert "postgresql://me:***@host/trials" in said
+    asked = read_recipe(recipe)
+    asked = asked.model_copy(update={"pruning": asked.pruning.model_copy(update={"study": url})})
+    plan = make_plan(str(policy_template), None, asked, tmp_path / "cache")
+    (tmp_path / "bundle").mkdir()
+    _write_bundle(plan, Row("float32", "chosen"), float_bundle, tmp_path / "bundle")
+    written = (tmp_path / "bundle" / "recipe.yaml").read_text()
+    assert "trials: 2" in written
+    assert "postgresql" not in written
+
+
+def test_only_trials_that_may_be_compared_share_a_study(
+    policy_template: Path, float_bundle: Bundle, recipe: Path, tmp_path: Path
+) -> None:
+    asked = read_recipe(recipe)
+
+    def named(profile: Profile | None = None, **changes: Any) -> str:
+        plan = make_plan(str(policy_template), profile, asked.model_copy(update=changes), tmp_path / "cache")
+        return PrunedSearch(plan, float_bundle, float_bundle, Context())._name()
+
+    pruning, effort = asked.pruning, asked.effort
+    assert named() == named(pruning=pruning.model_copy(update={"trials": 9, "study": "elsewhere", "seed": 3}))
+    others = {
+        named(load_profile("raspberry-pi-5")),
+        named(effort=effort.model_copy(update={"episodes": 0})),
+        named(pruning=pruning.model_copy(update={"episodes": 5})),
+        named(limits=asked.limits.model_copy(update={"max_drop": 0.5})),
+    }
+    assert len({named(), *others}) == 5
 
 
 def _tried(speedup: float, drop: float, width: float = 0.55) -> Tried:

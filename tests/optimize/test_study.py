@@ -83,10 +83,14 @@ def test_two_machines_share_trials(url: str, monkeypatch: pytest.MonkeyPatch) ->
     assert len(there.tried()) == 5
 
 
-def test_what_a_killed_process_had_under_way_is_tried_again(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    machine, booted, _ = worker().split("/")
+@pytest.mark.parametrize("gone_process", [2**22 + 1, 0], ids=["no process", "another process has its number"])
+def test_what_a_killed_process_had_under_way_is_tried_again(
+    url: str, gone_process: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, process, began = worker().split("/")
     gone = opened(url)
-    monkeypatch.setattr(gone, "_worker", f"{machine}/{booted}/{2**22 + 1}")
+    who = f"{machine}/{gone_process}/{began}" if gone_process else f"{machine}/{process}/1"
+    monkeypatch.setattr(gone, "_worker", who)
     asked = gone.ask(4)
     assert asked is not None
     shapes = drained(opened(url), 4)
@@ -96,7 +100,7 @@ def test_what_a_killed_process_had_under_way_is_tried_again(url: str, monkeypatc
 
 def test_what_another_machine_has_under_way_is_left_to_it(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     other = opened(url)
-    monkeypatch.setattr(other, "_worker", f"0-other/1/{2**22 + 1}")
+    monkeypatch.setattr(other, "_worker", f"0-other/{2**22 + 1}/1")
     asked = other.ask(3)
     assert asked is not None
     shapes = drained(opened(url), 3)
@@ -171,6 +175,23 @@ def test_trials_that_are_not_of_the_policy_are_refused(tmp_path: Path, params: A
         study.tried()
 
 
+def test_a_database_that_is_damaged_meanwhile_is_named(tmp_path: Path) -> None:
+    study = opened(f"sqlite:///{tmp_path / 'trials.db'}")
+    number, shape = study.ask(4) or pytest.fail("no trial")
+    with sqlite3.connect(tmp_path / "trials.db") as connection:
+        connection.execute("drop table trials")
+    connection.close()
+    for use in (lambda: study.ask(4), lambda: study.tell(number, Tried(shape, 1.0, 0.0)), study.under_way):
+        with pytest.raises(UsageError, match=r"The study .*trials\.db cannot be used"):
+            use()
+
+
+def test_no_message_tells_a_password() -> None:
+    with pytest.raises(UsageError, match="cannot be used") as caught:
+        opened("postgresql://me:secret@127.0.0.1:1/none")
+    assert "secret" not in str(caught.value)
+
+
 def test_another_space_under_the_same_name_is_refused(url: str) -> None:
     drained(opened(url), 2)
     other = opened(url, space=Space((1.0, 0.7), 4, 1, {FLOAT32: ()}, SPACE.recover))
@@ -223,5 +244,5 @@ def _other_tables(path: Path) -> str:
 )
 def test_a_study_that_cannot_be_opened_is_named(tmp_path: Path, wrong: Any) -> None:
     url = wrong(tmp_path / "trials")
-    with pytest.raises(UsageError, match=r"The study .* cannot be opened"):
+    with pytest.raises(UsageError, match=r"The study .* cannot be used"):
         opened(url)

@@ -13,6 +13,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.evaluate.recorded import Recorded
 from vlatool.files.kept import FILES
 from vlatool.files.locks import hold, release
+from vlatool.files.work import work_directory
 from vlatool.graph.stored import LAYOUT, write_workload
 from vlatool.graph.workload import workload
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -236,9 +237,20 @@ def test_a_file_that_only_looks_like_a_shared_one_stays(kept: Bundle, cache: Pat
     assert (cache / FILES / ("b" * 64)).read_text() == "mine"
 
 
-def test_unfinished_work_is_an_entry_that_its_lock_protects(cache: Path):
-    from vlatool.files.work import work_directory
+@pytest.mark.parametrize(
+    "name", ["trials.db", "trials.db-journal", "expert/round-000/action.npy", "held-out/expert/draft-000/image.npy"]
+)
+def test_trials_and_what_an_expert_did_are_unfinished_work(cache: Path, name: str):
+    place = cache / "streams" / "optimize.trials-0123456789abcdef"
+    with work_directory(place):
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        (place / name).write_bytes(b"some")
+    assert not contents(cache).unknown
+    prune(cache, older_than_s=0)
+    assert not (place / name).exists()
 
+
+def test_unfinished_work_is_an_entry_that_its_lock_protects(cache: Path):
     place = cache / "streams" / "abc"
     with work_directory(place):
         for name in ("data", "checkpoint.safetensors", "round-000/image.npy", "draft-001/episodes/00001/image.npy"):

@@ -19,7 +19,7 @@ import typer
 from vlatool.cli._document import document, put, report_document
 from vlatool.errors import GateFailed, Inconclusive, OutputError
 from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
-from vlatool.files.printable import one_line, printable
+from vlatool.files.printable import one_line, printable, without_password
 from vlatool.files.writing import writing
 from vlatool.machine.host import cache_directory
 from vlatool.report import REPORT as REPORT_FILE
@@ -31,7 +31,7 @@ PLACES = ("-o", "--output", "--cache", "--junit")
 
 
 def command_line() -> str:
-    """Return the command as a person would type it elsewhere: outputs and caches without folders of this machine."""
+    """Return the command as a person would type it elsewhere: without passwords and folders of this machine."""
     words, shown = sys.argv[1:], ["vlatool"]
     for before, word in zip(["", *words], words, strict=False):
         name, sign, value = word.partition("=")
@@ -43,7 +43,7 @@ def command_line() -> str:
             shown.append(f"-o{_without_folders(word[2:])}" if word[2:] else word)
         else:
             shown.append(word)
-    return shlex.join(shown)
+    return shlex.join(map(without_password, shown))
 
 
 def _without_folders(path: str) -> str:

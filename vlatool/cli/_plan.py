@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from vlatool.files.printable import without_password
+
 if TYPE_CHECKING:
     from vlatool.optimize.plan import Plan
     from vlatool.stage.base import Stage
@@ -12,13 +14,13 @@ if TYPE_CHECKING:
 
 def plan_document(plan: Plan) -> dict[str, Any]:
     """Return what ``plan.lines()`` says, as values that JSON can say."""
-    effort, loop = plan.recipe.effort, plan.closed_loop
+    effort, loop, pruning = plan.recipe.effort, plan.closed_loop, plan.recipe.pruning
     plain = {
         "source": {"policy": str(plan.source.policy) if plan.source.policy else None, **_stage(plan.source)},
         "export": _stages(plan.export),
         "candidates": {name: _stages(stages) for name, stages in plan.candidates.items()},
         "search": plan.recipe.search,
-        "pruning": plan.recipe.pruning.model_dump(mode="json"),
+        "pruning": {**pruning.model_dump(mode="json"), "study": without_password(pruning.study)},
         "benchmark": {"iterations": effort.iterations, "threads": effort.threads},
         "evaluate": {"recorded": True, "episodes": loop.episodes if loop else 0},
         "limits": plan.recipe.limits.model_dump(mode="json", exclude_none=True),

@@ -32,40 +32,44 @@ PolicySource = Annotated[
         help="policy directory, path.py:make or .onnx file", show_default=False, autocompletion=_complete.sources
     ),
 ]
+Board = Annotated[
+    str | None,
+    typer.Option(
+        help="board to optimise for (see: vlatool profiles list); this host if unset",
+        autocompletion=_complete.profiles,
+    ),
+]
+Drop = Annotated[str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")]
+Distance = Annotated[
+    str | None, typer.Option(help="largest distance from float32's own actions, by their spread (25%)")
+]
+Accept = Annotated[
+    list[str] | None, typer.Option(help="overrule a finding of a candidate by its name (see: vlatool inspect)")
+]
+Trials = Annotated[
+    int | None, typer.Option(min=0, help="policies to prune, train, quantize and try (0; needs the extra 'search')")
+]
+StudyPlace = Annotated[
+    str | None, typer.Option(help="file or database URL that keeps the trials, so that several machines share them")
+]
 
 
 def optimize(
     source: PolicySource,
     output: Annotated[Path, typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)],
-    profile: Annotated[
-        str | None,
-        typer.Option(
-            help="board to optimise for (see: vlatool profiles list); this host if unset",
-            autocompletion=_complete.profiles,
-        ),
-    ] = None,
-    max_drop: Annotated[
-        str | None, typer.Option(help="largest drop against float32: 1% (default), METRIC=VALUE, or 0.002m")
-    ] = None,
-    max_distance: Annotated[
-        str | None, typer.Option(help="largest distance from float32's own actions, by their spread (25%)")
-    ] = None,
+    profile: Board = None,
+    max_drop: Drop = None,
+    max_distance: Distance = None,
     hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
     max_latency_ms: Annotated[float | None, typer.Option(min=0.001, help="largest latency of one inference")] = None,
     max_memory_mb: Annotated[float | None, typer.Option(min=1, help="largest memory of the process")] = None,
-    accept: Annotated[
-        list[str] | None, typer.Option(help="overrule a finding of a candidate by its name (see: vlatool inspect)")
-    ] = None,
+    accept: Accept = None,
     search: Annotated[
         bool | None, typer.Option("--search/--no-search", help="search for faster plans (default without --recipe)")
     ] = None,
-    trials: Annotated[
-        int | None, typer.Option(min=0, help="policies to prune, train, quantize and try (0; needs the extra 'search')")
-    ] = None,
+    trials: Trials = None,
     train_steps: Annotated[int | None, typer.Option(min=1, help="updates in the training of each trial (1500)")] = None,
-    study: Annotated[
-        str | None, typer.Option(help="file or database URL that keeps the trials, so that several machines share them")
-    ] = None,
+    study: StudyPlace = None,
     recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
     iterations: Annotated[int | None, typer.Option(min=20, help="timed inferences of each candidate (200)")] = None,

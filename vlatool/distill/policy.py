@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import CALIBRATION
 from vlatool.distill._student import student_steps
@@ -81,7 +80,7 @@ class PolicyDistillation(ImitationStage):
                 f"--control {self.control} changes what the teacher says, and with --alpha 0 it is not asked.",
                 "name one of both controls",
             )
-        hints = [f"--{name}" for name in registry.names("hints") if getattr(self, name)]
+        hints = [f"--{name}" for name, weight in self.hints().items() if weight]
         if hints and (self.alpha == 0 or self.control != "none"):
             other = "--alpha 0" if self.alpha == 0 else f"--control {self.control}"
             raise RecipeError(

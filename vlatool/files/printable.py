@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 
 HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -24,6 +25,16 @@ def printable(text: str) -> str:
 def one_line(text: str, longest: int = 400) -> str:
     """Return a text as one printable line of a bounded length."""
     return " ".join(printable(text[: 4 * longest]).split())[:longest]
+
+
+def without_password(text: str) -> str:
+    """Return a text in which no address of a database tells its password.
+
+    Example:
+        >>> without_password("--study=postgresql://me:secret@host/trials")
+        '--study=postgresql://me:***@host/trials'
+    """
+    return re.sub(r"(\w://[^/@:\s]*):[^/\s]*@", r"\1:***@", text)
 
 
 def message_of(error: BaseException) -> str:

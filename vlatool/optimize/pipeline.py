@@ -27,6 +27,7 @@ from vlatool.optimize.choice import choose, chosen_of
 from vlatool.optimize.choice_apart import choose_apart
 from vlatool.optimize.evidence import is_recorded, unjudged, with_accuracy
 from vlatool.optimize.judge import Judged, judge
+from vlatool.optimize.made import candidate, chain
 from vlatool.optimize.plan import BASELINE, Plan, make_plan, transforms
 from vlatool.optimize.pruned import PrunedSearch
 from vlatool.optimize.recipe import Pruning, Recipe, StageList
@@ -37,8 +38,7 @@ from vlatool.optimize.trained import trainings, with_trainings
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE
-from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context, Tell, Transform
+from vlatool.stage.base import Context, Tell
 from vlatool.stage.controls import controls
 from vlatool.stage.finish import reseal
 from vlatool.stage.run import cached_measure, cached_transform
@@ -115,7 +115,7 @@ def optimize_here(request: Mapping[str, Any], tell: Tell) -> None:
 def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     """Run a plan in this process, and write everything into an empty directory."""
     source = cached_transform(plan.source, None, plan.cache, context)
-    baseline = _chain(plan.export, source, plan, context)[-1]
+    baseline = chain(plan.export, source, plan, context)[-1]
     _check_metric(plan, baseline, context)
     plan, tried = _searched(plan, baseline, context)
     plan, trials = _pruned(plan, source, baseline, context)
@@ -131,17 +131,6 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     _write_bundle(plan, chosen, bundles.get(chosen.name, baseline), draft)
     write_reports(report, draft / "reports")
     return report
-
-
-def _chain(stages: tuple[Transform, ...], source: Bundle, plan: Plan, context: Context) -> list[Bundle]:
-    """Run stages one after the other; return the source and what each made."""
-    made = [source]
-    for stage in stages:
-        context.tell(stage.name(), None)
-        stage.check(made[-1], plan.profile)
-        made.append(cached_transform(stage, made[-1], plan.cache, context))
-    refuse_findings(made[-1], plan.recipe.limits.accept)
-    return made
 
 
 def _check_metric(plan: Plan, baseline: Bundle, context: Context) -> None:
@@ -184,17 +173,12 @@ def _with_candidates(plan: Plan, found: Mapping[str, StageList]) -> Plan:
 def _candidates(
     plan: Plan, source: Bundle, baseline: Bundle, context: Context
 ) -> tuple[dict[str, Bundle], list[Row], dict[str, tuple[Row, ...]]]:
-    """Make every candidate; one that cannot be made becomes a row that says why. Return also how they were trained.
-
-    What changes the policy's modules starts at the source, and is exported after that.
-    """
+    """Make every candidate; one that cannot be made becomes a row that says why. Return also how they were trained."""
     bundles, failures, trained = {}, [], {}
     for name, stages in plan.candidates.items():
         try:
-            changed = stages[: sum(stage.takes_modules for stage in stages)]
-            started = _chain((*changed, *plan.export), source, plan, context) if changed else [baseline]
-            bundles[name] = _chain(stages[len(changed) :], started[-1], plan, context)[-1]
-            trained[name] = trainings(started)
+            made = candidate(stages, source, baseline, plan, context)
+            bundles[name], trained[name] = made[-1], trainings(made)
         except VlatoolError as error:
             if error.exit_code not in (3, 4):
                 raise
@@ -269,7 +253,9 @@ def _write_bundle(plan: Plan, chosen: Row, bundle: Bundle, draft: Path) -> None:
     reseal(bundle, draft, manifest, ROBOT_FOLDERS)
     stages = plan.recipe.candidates.get(chosen.name)
     only = {"candidates": {chosen.name: stages}, "search": False, "pruning": Pruning()}
-    repeat = plan.recipe if stages is None else plan.recipe.model_copy(update=only)
+    nowhere = plan.recipe.pruning.model_copy(update={"study": ""})  # a place of this machine, and may hold a password
+    update = {"pruning": nowhere} if stages is None else only
+    repeat = plan.recipe.model_copy(update=update)
     (draft / "recipe.yaml").write_text(repeat.to_yaml(), encoding="utf-8")
 
 

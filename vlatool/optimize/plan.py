@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vlatool.errors import RecipeError, require_present
 from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.files.printable import without_password
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
@@ -120,8 +121,8 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
             raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
     if recipe.pruning.trials:
         _check_pruning(recipe.pruning, stage)
-    elif recipe.pruning.study:
-        raise RecipeError(f"The study {recipe.pruning.study} keeps trials, and none are asked for.", "add --trials 8")
+    elif study := recipe.pruning.study:
+        raise RecipeError(f"The study {without_password(study)} keeps trials; none are asked for.", "add --trials 8")
     return Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
 
 
@@ -176,7 +177,7 @@ def _limits(limits: Limits) -> list[str]:
 def _trials(pruning: Pruning) -> str:
     """Return the trials in words."""
     trained = ", ".join(f"{stage.name()} {_options(stage)}".rstrip() for stage in transforms(pruning.recover))
-    study = f", shared through {pruning.study}" if pruning.study else ""
+    study = f", shared through {without_password(pruning.study)}" if pruning.study else ""
     return f"{pruning.trials} policies, pruned, trained ({trained}), quantized and tried{study}"
 
 

@@ -11,10 +11,13 @@ from typing import Any
 from vlatool.accuracy.paired import compare_success
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
+from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import VlatoolError
 from vlatool.evaluate.recorded import Recorded, carries_recordings
-from vlatool.machine import host
+from vlatool.files.work import work_directory
+from vlatool.machine.version import VERSION
 from vlatool.optimize.budget import budget_of
+from vlatool.optimize.made import candidate
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
@@ -23,13 +26,12 @@ from vlatool.optimize.study import Study, Tried
 from vlatool.optimize.trained import trainings
 from vlatool.report import TRAINING_TIME
 from vlatool.runtime.engine import DEFAULT_ENGINE
-from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
 from vlatool.stage.cache import STREAMS
-from vlatool.stage.run import cached_measure, cached_transform
+from vlatool.stage.run import cached_measure
 
-SELECTION_SEEDS = 4_000_000
-"""Seeds of the episodes that trials play: neither of a training nor of an evaluation."""
+SELECTION_SEEDS = 2 * EVALUATION_SEEDS
+"""First seed of the episodes that trials play: no training may reach it, and no evaluation is so long."""
 FINALISTS = 3
 TIMED = 60
 
@@ -57,9 +59,15 @@ class PrunedSearch:
             RecipeError: when nothing of the policy can be pruned.
             UsageError: when the study cannot be opened.
         """
+        if study := self.plan.recipe.pruning.study:
+            return self._run(study)
+        place = self.plan.cache / STREAMS / f"optimize.trials-{self._name().rpartition('-')[2]}"
+        with work_directory(place):  # of this machine, so that an interrupted run goes on
+            return self._run(f"sqlite:///{place.absolute() / 'trials.db'}")
+
+    def _run(self, url: str) -> tuple[dict[str, StageList], dict[str, list[dict[str, Any]]]]:
         pruning = self.plan.recipe.pruning
-        name = self._name()
-        study = Study(pruning.study or _own(name), name, self._allowed, pruning.seed)
+        study = Study(url, self._name(), self._allowed, pruning.seed)
         quantized = study.agreed(self._quantizations())
         space = space_of(self.source, pruning, quantized, self.plan.cache, self.context)
         study.begin(space)
@@ -75,10 +83,11 @@ class PrunedSearch:
         )
 
     def _name(self) -> str:
-        """Return what trials share that may be compared: the policy, how it is trained and judged, and the limits."""
+        """Return what trials share that may be compared: the policy, how it is trained and judged, limits and board."""
         recipe = self.plan.recipe
         asked = recipe.pruning.model_dump(mode="json", exclude={"trials", "study", "seed"})
-        said = [self.source.hash, asked, recipe.limits.model_dump(mode="json"), recipe.effort.threads]
+        said = [self.source.hash, asked, recipe.limits.model_dump(mode="json"), recipe.effort.threads,
+                self.plan.closed_loop is not None, self.plan.board, VERSION]  # fmt: skip
         digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
         return f"{self.baseline.manifest.name}-{digest}"
 
@@ -88,12 +97,7 @@ class PrunedSearch:
         found = quantizations(self.plan.recipe.candidates)
         for name, stages in found.items():
             try:
-                bundle = self.baseline
-                for stage in transforms(stages):
-                    stage.check(bundle, self.plan.profile)
-                    bundle = cached_transform(stage, bundle, self.plan.cache, self.context)
-                refuse_findings(bundle, self.plan.recipe.limits.accept)
-                speeds[name] = self._speedup(bundle)
+                speeds[name] = self._speedup(self._made(stages)[-1])
             except VlatoolError as failure:
                 if failure.exit_code not in (3, 4):
                     raise
@@ -102,25 +106,15 @@ class PrunedSearch:
     def _try(self, shape: Shape, space: Space) -> Tried:
         """Make a policy of a shape, time it and see what it loses; failures say why."""
         try:
-            bundle, seconds = self._made(shape, space)
-            return Tried(shape, self._speedup(bundle), self._drop(bundle), seconds)
+            made = self._made(space.stages(shape))
+            return Tried(shape, self._speedup(made[-1]), self._drop(made[-1]), _training_s(made))
         except VlatoolError as failure:
             if failure.exit_code not in (3, 4):
                 raise
             return Tried(shape, note=failure.message)
 
-    def _made(self, shape: Shape, space: Space) -> tuple[Bundle, float]:
-        """Return the bundle of a shape, and the seconds that its training took when it was trained."""
-        stages = transforms(space.stages(shape))
-        changing = [stage for stage in stages if stage.takes_modules]
-        bundle, seconds = self.source, 0.0
-        for stage in (*changing, *self.plan.export, *(stage for stage in stages if not stage.takes_modules)):
-            stage.check(bundle, self.plan.profile)
-            bundle = cached_transform(stage, bundle, self.plan.cache, self.context)
-            for row in trainings([bundle]):
-                seconds += sum(item.value for item in row.measurements if item.name.startswith(TRAINING_TIME))
-        refuse_findings(bundle, self.plan.recipe.limits.accept)
-        return bundle, seconds
+    def _made(self, stages: StageList) -> list[Bundle]:
+        return candidate(transforms(stages), self.source, self.baseline, self.plan, self.context)
 
     def _speedup(self, bundle: Bundle) -> float:
         engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self.plan.board_set.confined else ""
@@ -199,11 +193,10 @@ def _best_of_each(tried: list[Tried]) -> list[Tried]:
     return list({each.shape: each for each in tried}.values())
 
 
-def _own(name: str) -> str:
-    """Return the study of a run that names none: this machine's, so that an interrupted run goes on."""
-    folder = host.cache_directory() / STREAMS / f"optimize.trials-{name.rpartition('-')[2]}"
-    folder.mkdir(parents=True, exist_ok=True)
-    return f"sqlite:///{folder / 'trials.db'}"
+def _training_s(made: list[Bundle]) -> float:
+    """Return the seconds that the trainings of a policy took when it was trained."""
+    taken = (item for row in trainings(made) for item in row.measurements if item.name.startswith(TRAINING_TIME))
+    return sum(item.value for item in taken)
 
 
 def _titled(elsewhere: int) -> str:

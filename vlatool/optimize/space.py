@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, SourceError
+from vlatool.errors import RecipeError, VlatoolError
 from vlatool.module.edits import BLOCKS, read_edits
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Pruning, StageList
@@ -133,7 +133,9 @@ def space_of(
         try:
             stage.check(source, None)
             return cached_transform(stage, source, cache, context)
-        except (RecipeError, SourceError) as error:
+        except VlatoolError as error:
+            if error.exit_code not in (3, 4):
+                raise
             refused.append(f"{name}: {error.message}")
             return None
 

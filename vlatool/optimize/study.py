@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 from vlatool.errors import DataError, UsageError, VlatoolError, require
+from vlatool.files.printable import without_password
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.space import FLOAT32, Shape, Space, quantizations
 
@@ -71,7 +72,8 @@ class Study:
         self._allowed, self._seed = allowed, seed
         self._worker = worker()
         self._space = Space((1.0,), 1, 1, {}, ())
-        with _opened(url):
+        self._url = url
+        with _used(url):
             storage = _storage(self._optuna, url)
             self._study = self._optuna.create_study(
                 storage=storage, study_name=name, directions=["maximize", "minimize"], load_if_exists=True
@@ -86,10 +88,12 @@ class Study:
         Raises:
             DataError: when the study holds something else.
         """
-        if QUANTIZED not in self._study.user_attrs:
-            self._study.set_user_attr(QUANTIZED, [[name, list(stages)] for name, stages in quantized.items()])
+        with _used(self._url):
+            if QUANTIZED not in self._study.user_attrs:
+                self._study.set_user_attr(QUANTIZED, [[name, list(stages)] for name, stages in quantized.items()])
+            held = self._study.user_attrs[QUANTIZED]
         try:
-            agreed = {str(name): tuple(stages) for name, stages in self._study.user_attrs[QUANTIZED]}
+            agreed = {str(name): tuple(stages) for name, stages in held}
             known = quantizations(agreed)
         except (AttributeError, TypeError, ValueError, VlatoolError) as error:
             raise DataError(f"The study says of quantization what vlatool cannot read: {error}.") from error
@@ -100,16 +104,22 @@ class Study:
     def begin(self, space: Space) -> None:
         """Say what may be chosen, and take up what a process of this machine left when it was killed."""
         self._space = space
-        for shape in space.first():
-            self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
-        self._again()
+        with _used(self._url):
+            for shape in space.first():
+                self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
+            self._again()
 
     def ask(self, trials: int) -> tuple[int, Shape] | None:
         """Return the number and shape of the next trial, None when so many are done or under way, or all was tried.
 
         Raises:
             DataError: when the study is of another space.
+            UsageError: when it cannot be read or written any more.
         """
+        with _used(self._url):
+            return self._next(trials)
+
+    def _next(self, trials: int) -> tuple[int, Shape] | None:
         for attempt in range(REPEATS + 1):
             counted = [trial.params for trial in self._trials() if self._counts(trial)]
             if len(counted) >= trials:
@@ -128,7 +138,7 @@ class Study:
     def _asked(self) -> tuple[int, Shape]:
         self._study.sampler = self._optuna.samplers.TPESampler(
             n_startup_trials=STARTUP, seed=self._seed + len(self._trials()), multivariate=True
-        )  # fmt: skip
+        )
         trial, space = self._study.ask(), self._space
         trial.set_user_attr(WORKER, self._worker)
         try:
@@ -145,18 +155,23 @@ class Study:
     def _drop(self, number: int) -> None:
         """End a trial that does not count."""
         self._trial(number).set_user_attr(AGAIN, True)
-        self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
+        self._study.tell(number, state=self._optuna.trial.TrialState.FAIL, skip_if_finished=True)
 
     def tell(self, number: int, tried: Tried) -> None:
-        """Keep what a trial found; one that could not be made is kept with the reason."""
-        trial = self._trial(number)
-        trial.set_user_attr(TRAINING, tried.training_s)
-        if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
-            trial.set_user_attr(NOTE, tried.note[:LONGEST] or "its accuracy could not be measured")
-            self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
-        else:
-            trial.set_constraint("drop", tried.drop - self._allowed)
-            self._study.tell(number, [tried.speedup, tried.drop])
+        """Keep what a trial found; one that could not be made is kept with the reason.
+
+        Raises:
+            UsageError: when the study cannot be written any more.
+        """
+        with _used(self._url):
+            trial = self._trial(number)
+            trial.set_user_attr(TRAINING, tried.training_s)
+            if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
+                trial.set_user_attr(NOTE, tried.note[:LONGEST] or "its accuracy could not be measured")
+                self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
+            else:
+                trial.set_constraint("drop", tried.drop - self._allowed)
+                self._study.tell(number, [tried.speedup, tried.drop])
 
     def tried(self) -> list[Tried]:
         """Return what is known of all trials that ended.
@@ -164,12 +179,14 @@ class Study:
         Raises:
             DataError: when what the study holds is not what a trial finds.
         """
-        return [self._read(trial) for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
+        with _used(self._url):
+            return [self._read(trial) for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
 
     def under_way(self) -> int:
         """Return how many trials other processes have under way."""
         running = self._optuna.trial.TrialState.RUNNING
-        return sum(trial.state == running for trial in self._trials())
+        with _used(self._url):
+            return sum(trial.state == running for trial in self._trials())
 
     def _trials(self) -> list[FrozenTrial]:
         trials: list[FrozenTrial] = self._study.get_trials(deepcopy=False)
@@ -209,16 +226,20 @@ class Study:
 
 
 def worker() -> str:
-    """Return what tells this process from others that share a study: a machine, when it booted, the process."""
-    return f"{uuid.getnode():x}-{platform.node()}/{psutil.boot_time():.0f}/{os.getpid()}"
+    """Return what tells this process from others that share a study: a machine, the process, when it began."""
+    return f"{uuid.getnode():x}-{platform.node()}/{os.getpid()}/{psutil.Process().create_time():.0f}"
 
 
 def _is_dead(other: str) -> bool:
     """Return whether a process of this machine is no more; of other machines nothing is known."""
     ours, theirs = worker().split("/"), other.split("/")
-    if len(theirs) != len(ours) or theirs[0] != ours[0] or not theirs[2].isdigit():
+    if len(theirs) != len(ours) or theirs[0] != ours[0] or not theirs[1].isdecimal():
         return False
-    return theirs[1] != ours[1] or not psutil.pid_exists(int(theirs[2]))
+    try:
+        began = psutil.Process(int(theirs[1])).create_time()
+    except (psutil.NoSuchProcess, OverflowError):
+        return True
+    return f"{began:.0f}" != theirs[2]  # another process has its number now
 
 
 def _storage(optuna: Any, url: str) -> Any:
@@ -229,15 +250,15 @@ def _storage(optuna: Any, url: str) -> Any:
 
 
 @contextlib.contextmanager
-def _opened(url: str) -> Iterator[None]:
-    """Turn what Optuna and its databases raise of an address into a sentence."""
+def _used(url: str) -> Iterator[None]:
+    """Turn what Optuna and its databases raise of a study into a sentence."""
     try:
         yield
-    except (KeyboardInterrupt, MemoryError):
+    except (VlatoolError, MemoryError):
         raise
-    except Exception as error:
+    except Exception as error:  # the seam: each database has errors of its own
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
         raise UsageError(
-            f"The study {url} cannot be opened: {reason[0]}.",
+            f"The study {without_password(url)} cannot be used: {without_password(reason[0])}.",
             "name a file, such as trials.journal, or a database, such as sqlite:///trials.db",
         ) from error

@@ -33,9 +33,9 @@ NAMES = {
 }
 STREAM_FILES = re.compile(
     r"lock|data|journal|checkpoint\.safetensors|\.checkpoint\.safetensors\.\d+\.part|meeting|round-\d{3}\.json"
-    r"|(held-out/)?(round|draft)-\d{3}/.+"
+    r"|(held-out/)?(expert/)?(round|draft)-\d{3}/.+|trials\.db(-journal)?"
 )
-"""What unfinished work is made of: a file that is written part by part, or training."""
+"""What unfinished work is made of: a file that is written part by part, training, or the trials of ``optimize``."""
 DRAFT = re.compile(r"\.(?P<final>.+)\.tmp-\d+-[0-9a-f]{8}")
 PART = re.compile(r"\.[0-9a-f]{64}\.(?P<process>\d+)-[0-9a-f]{8}\.part")
 NEW_S = 60.0

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Recording, calibration_recording
+from vlatool.data import Recording
 from vlatool.errors import DataError, require
 from vlatool.training.batches import Loss
-from vlatool.training.expert import Expert
+from vlatool.training.expert import Expert, at_most
 from vlatool.training.frames import Frames
 from vlatool.training.rounds import Counted, next_round
 
@@ -63,14 +63,11 @@ class HeldOut:
         Raises:
             DataError: when there are not two observations to split.
         """
-        recording = calibration_recording(source)
+        recording = at_most(source, most)
         if recording is None or len(recording) < 2:
             self._others = [] if recording is None else recording
             next_round(self._frames, 0, partial(_required, instead, len(self._others)))
             return
-        used = np.zeros(len(recording), np.bool_)
-        used[recording.spread(most)] = True
-        recording = recording.only(used)
         held = held_out(recording)
         self._others = recording.only(~held)
         self.recording = recording.only(held)

@@ -65,8 +65,11 @@ class ImitationStage(TrainingStage):
             far: Tensor = distance(values[action.name].float(), tensors(rows, LABEL)[action.name])
             return far
 
-        hints = {"features": self.features, "attention": self.attention}
-        return with_hints(Lesson(name, modules, loss), hints, student, source, teacher, self.seed)
+        return with_hints(Lesson(name, modules, loss), self.hints(), student, source, teacher, self.seed)
+
+    def hints(self) -> dict[str, float]:
+        """Return the weight of each hint in the loss."""
+        return {"features": self.features, "attention": self.attention}
 
     def _distance(self, name: str) -> Any:
         """Return the loss with the options that it takes."""
