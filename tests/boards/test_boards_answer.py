@@ -20,7 +20,6 @@ from vlatool.boards.answer import (
     simulated,
     simulation_lines,
 )
-from vlatool.boards.board import Candidate, outcomes
 from vlatool.boards.simulate import Change
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
@@ -28,6 +27,7 @@ from vlatool.errors import DataError, OutputError, UsageError
 from vlatool.graph.stored import LAYOUT, digest, read_workload
 from vlatool.graph.workload import workload
 from vlatool.hardware.profile import load_profile, names
+from vlatool.latency_model.board import Candidate, outcomes
 from vlatool.latency_model.model import shipped
 from vlatool.machine.host import cache_directory
 from vlatool.prune.neurons import Neurons

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from vlatool.boards.board import Candidate, outcomes
 from vlatool.boards.select import Choice, Wants, choose, cost, in_the_cloud, state_of
 from vlatool.errors import ProfileError
 from vlatool.graph.workload import GraphWorkload, Workload
 from vlatool.hardware.profile import Profile, load_profile
+from vlatool.latency_model.board import Candidate, outcomes
 from vlatool.latency_model.model import LatencyModel
 
 Load = Callable[..., Workload]

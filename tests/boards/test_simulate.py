@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from vlatool.boards.board import Candidate, Outcome, outcomes
 from vlatool.boards.simulate import bounds, changes, parts_of, timeline, widest
 from vlatool.graph.workload import GraphWorkload, Workload
 from vlatool.hardware.profile import load_profile
+from vlatool.latency_model.board import Candidate, Outcome, outcomes
 from vlatool.latency_model.model import LatencyModel
 
 Load = Callable[..., Workload]

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from vlatool.boards.board import work_of
 from vlatool.boards.report import work_sentence
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.graph.workload import workload
+from vlatool.latency_model.board import work_of
 from vlatool.samples._write import write_sample
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context

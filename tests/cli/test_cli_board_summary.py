@@ -94,7 +94,7 @@ def test_what_cannot_be_predicted_is_said_when_the_bundle_is_written(
     def fails(profile: object, made: object) -> None:
         raise GraphError("The graph cannot be counted.")
 
-    monkeypatch.setattr("vlatool.boards.predict.predictions", fails)
+    monkeypatch.setattr("vlatool.latency_model.predict.predictions", fails)
     words = ["quantize", "dynamic-int8", str(float_bundle.path), "-o", str(tmp_path / "out"), "--profile", "pi5"]
     told = run(capsys, *words)
     assert "nothing is predicted for raspberry-pi-5: The graph cannot be counted." in told

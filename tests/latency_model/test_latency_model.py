@@ -229,7 +229,7 @@ def test_npus_are_asked_apart() -> None:
 
 
 def test_every_shipped_answer_lies_in_its_interval(load: Callable[..., Workload]) -> None:
-    from vlatool.boards.board import candidates, outcomes
+    from vlatool.latency_model.board import candidates, outcomes
 
     asked = [way for name in names() for way in candidates(load_profile(name), load())]
     found = outcomes(asked, load(), shipped())
@@ -248,7 +248,7 @@ def test_every_shipped_answer_lies_in_its_interval(load: Callable[..., Workload]
 
 
 def test_the_shipped_model_says_nothing_of_a_transformer_on_hailo(load: Callable[..., Workload]) -> None:
-    from vlatool.boards.board import Candidate, outcomes
+    from vlatool.latency_model.board import Candidate, outcomes
 
     way = Candidate(load_profile("raspberry-pi-5-hailo8"), "default", "hailort", "int8")
     latency = outcomes([way], load(traits=frozenset({"attention"})), shipped())[0].latency

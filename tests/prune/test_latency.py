@@ -13,17 +13,20 @@ from _tiny import deepen
 from torch import nn
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, RecipeError
+from vlatool.errors import DataError, ProfileError, RecipeError
 from vlatool.export.onnx import ExportOnnx
+from vlatool.hardware.profile import load_profile
+from vlatool.latency_model.predict import predictions
 from vlatool.module.axes import Member
 from vlatool.module.edits import Edit, apply, read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune import latency
-from vlatool.prune._clock import Clock
+from vlatool.prune._clock import BoardClock, Clock
 from vlatool.prune._prices import Stack, edits_of, is_gone
 from vlatool.prune._units import Group
 from vlatool.prune.latency import LatencyPruning
 from vlatool.rebuild.rebuild import rebuild
+from vlatool.report import Measurement
 from vlatool.runtime import load
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, build_stage
@@ -94,7 +97,7 @@ def test_a_block_goes_where_it_matters_least(counted: None, deep: Bundle, tmp_pa
 
 @pytest.mark.parametrize(("target", "says"), [
     (1e5, r"It takes \d.* ms here already; asked for 100000 ms"),
-    (0.01, r"No less than about .* ms can be reached here; asked for 0\.01"),
+    (0.01, r"No less than about .* ms can be reached; asked for 0\.01"),
 ])  # fmt: skip
 def test_a_target_that_makes_no_sense_is_refused(counted: None, deep: Bundle, tmp_path: Path, target: float, says: str):
     with pytest.raises(RecipeError, match=says):
@@ -123,6 +126,74 @@ def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
     exported = Bundle.open(tmp_path / "2-graphs")
     assert exported.graph_bytes < Bundle.open(tmp_path / "1-graphs").graph_bytes
     assert load(exported.path).spec == torch_policy(deep, 0).spec
+
+
+def test_the_clock_of_a_board_predicts_what_is_exported(deep: Bundle, tmp_path: Path):
+    of = (deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
+    clock = BoardClock(load_profile("raspberry-pi-4"), *of)
+    whole, (shallow,) = clock.times([(Edit("main", "blocks", "blocks", (0,)),)])
+    assert whole > shallow > 0
+    assert whole == predictions(load_profile("raspberry-pi-4"), Bundle.open(tmp_path / "1-graphs"))[0].value
+    assert clock.times([]) == (whole, []), "a prediction does not change from run to run"
+
+
+def test_a_board_without_ground_is_refused(deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    nothing = Measurement("latency_p50", float("nan"), "ms", "predicted", "jetson-thor", 0, note="no published latency")
+    monkeypatch.setattr("vlatool.prune._clock.predictions", lambda *_: [nothing])
+    clock = BoardClock(load_profile("jetson-thor"), deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
+    with pytest.raises(RecipeError, match="The latency on jetson-agx-thor cannot be predicted: no published latency"):
+        clock.times([])
+
+
+def test_a_profile_of_another_machine_is_predicted_and_this_one_measured(monkeypatch: pytest.MonkeyPatch):
+    stage, pi = LatencyPruning(target_ms=1), load_profile("raspberry-pi-5")
+    assert stage.on(pi).board == "raspberry-pi-5"
+    assert LatencyPruning(target_ms=1, board="nuc").on(pi).board == "nuc"
+    with pytest.raises(RecipeError, match="mine is not a known profile"):
+        stage.on(pi.model_copy(update={"name": "mine"}))
+    with pytest.raises(RecipeError, match="raspberry-pi-5 is not a known profile"):
+        stage.on(pi.model_copy(update={"price_usd": None}))
+    monkeypatch.setattr(latency, "fingerprint", lambda: {"board": pi.model_strings[0]})
+    assert stage.on(pi) == stage
+
+
+def test_what_predictions_rest_on_changes_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("VLATOOL_CALIBRATIONS", str(tmp_path))
+    stage = LatencyPruning(target_ms=1, board="pi5")
+    before = stage.key("")
+    (tmp_path / "raspberry-pi-5.json").write_text("{}")
+    assert stage.key("") != before
+    again = LatencyPruning(target_ms=1, board="pi5", chosen="[]")
+    known = again.key("")
+    (tmp_path / "raspberry-pi-5.json").write_text("[]")
+    assert again.key("") == known, "what was chosen needs no prediction"
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"board": "raspberry-pi-55"}, "did you mean 'raspberry-pi-5'"),
+    ({"board": "raspberry-pi-5", "engine": "tensorrt"}, "raspberry-pi-5 has no engine 'tensorrt'"),
+])  # fmt: skip
+def test_unknown_boards_and_engines_are_refused(source_bundle: Bundle, options: dict[str, str], says: str):
+    with pytest.raises(ProfileError, match=says):
+        LatencyPruning(target_ms=1, **options).check(source_bundle, None)
+
+
+def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
+    counted: None, deep: Bundle, policy_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(latency, "BoardClock", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None)
+    monkeypatch.setattr(
+        latency, "load_profile", lambda name: load_profile("raspberry-pi-5").model_copy(update={"name": name})
+    )
+    monkeypatch.setattr(latency, "Clock", None)
+    target = 0.7 * Counted(deep).ms(())
+    stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})
+    pruned = run_transform(stage, deep, tmp_path / "out", Context())
+    assert 0.96 * target <= Counted(deep).ms(read_edits(pruned)) <= target
+    assert "predicted for nuc13, not measured" in stage.lines(pruned)[-1]
+    exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
+    monkeypatch.setattr(latency, "BoardClock", None)
+    assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 
 
 class Streamed(nn.Module):

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vlatool.boards.board import Candidate, outcomes, quantized_as
-from vlatool.boards.measured import measured_questions
 from vlatool.boards.report import boards_report
 from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
 from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
@@ -22,6 +20,8 @@ from vlatool.graph.stored import digest, read_workload, refuse_other, write_work
 from vlatool.graph.workload import PRECISIONS, Workload, workload
 from vlatool.hardware.platforms import load_platform
 from vlatool.hardware.profile import Profile, load_profile, names
+from vlatool.latency_model.board import Candidate, outcomes, quantized_as
+from vlatool.latency_model.measured import measured_questions
 from vlatool.latency_model.model import LatencyModel, shipped
 from vlatool.machine.host import cache_directory
 from vlatool.module.description import read_location

@@ -8,11 +8,10 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from vlatool.boards.board import Outcome
 from vlatool.boards.select import Choice, Wants, cost
 from vlatool.bundle.bundle import MANIFEST
 from vlatool.graph.workload import Workload
-from vlatool.latency_model.model import LEVEL
+from vlatool.latency_model.predict import numbers
 from vlatool.report import Measurement, Report, Row
 
 ROLES = {"fits": "within", "may fit": "subject", "unknown": "subject", "no": "outside"}
@@ -127,36 +126,6 @@ def _row(choice: Choice, wants: Wants, cloud: Choice | None, *, chosen: bool) ->
     tables: Mapping[str, list[dict[str, Any]]] = {WAY: [way]}
     role = "chosen" if chosen else ROLES[choice.state]
     return Row(choice.profile.name, role, choice.reason, tuple(measurements), details=tables)
-
-
-def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
-    """Return latency, memory, power and energy of an inference as predictions, and of each action executed of it."""
-    where, latency = outcome.candidate.profile.name, outcome.latency
-    way = f"{outcome.candidate.engine}, power mode {outcome.candidate.mode}"
-    note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
-    low, high = (latency.low, latency.high) if latency.known else (None, None)
-    memory, power = outcome.memory_mb, outcome.watts
-    measurements = [
-        Measurement("latency_p50", latency.ms, "ms", "predicted", where, 0, low, high, LEVEL, note),
-        Measurement("memory", memory[0], "MB", "predicted", where, 0, memory[1], memory[2], LEVEL, JUDGED),
-        Measurement("usable_memory", 1e3 * outcome.candidate.profile.usable_memory_gb.value, "MB", "predicted", where),
-        Measurement("watts", power[0], "W", "predicted", where, 0, power[1], power[2], LEVEL, JUDGED),
-    ]
-    if latency.known:
-        ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
-        measurements.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
-        per_action = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
-        for name, value, unit in per_action:
-            measurements.append(Measurement(name, value / execute, unit, "predicted", where))
-    return measurements
-
-
-EVIDENCE = {
-    "known": "this runtime and precision were measured on this device",
-    "unseen": "from other devices, runtimes or precisions",
-    "calibrated": "with your own measurement on this device",
-}
-JUDGED = "bounds are a judgement, not a confidence interval"
 
 
 def _number(value: float) -> str:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from vlatool.boards.board import Candidate, Outcome, candidates, outcomes, power_limit, quantized_as
 from vlatool.errors import ProfileError
 from vlatool.graph.workload import Workload
 from vlatool.hardware.profile import Profile
+from vlatool.latency_model.board import Candidate, Outcome, candidates, outcomes, power_limit, quantized_as
 from vlatool.latency_model.model import LatencyModel
 
 STATES = ("fits", "may fit", "unknown", "no")

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from vlatool.boards.board import Candidate, Outcome, Phase, at, outcomes, quantized_as
 from vlatool.graph.workload import GraphWorkload, Workload
+from vlatool.latency_model.board import Candidate, Outcome, Phase, at, outcomes, quantized_as
 from vlatool.latency_model.features import Shares, roofline_parts
 from vlatool.latency_model.model import LatencyModel, part_of
 

@@ -93,7 +93,7 @@ def _noting(missing: list[str], what: str) -> Iterator[None]:
 
 
 def _predicted(bundle: Bundle, profile: Profile) -> tuple[Measurement, ...]:
-    from vlatool.boards.predict import predictions
+    from vlatool.latency_model.predict import predictions
 
     return tuple(number for number in predictions(profile, bundle) if number.name in SHOWN)
 

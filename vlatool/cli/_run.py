@@ -249,7 +249,7 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
 
 def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
     """Add what is predicted for a board; without onnx, the measurement stands, with a warning."""
-    from vlatool.boards.predict import predictions
+    from vlatool.latency_model.predict import predictions
 
     row = report.rows[-1] if report.kind == "evaluate" else report.rows[0]
     try:

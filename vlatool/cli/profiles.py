@@ -144,10 +144,10 @@ def calibrate_profile(
     as_json: AsJson = False,
 ) -> None:
     """Give the latency model a measurement on a board: predictions for it are based on that from now on."""
-    from vlatool.boards.measured import calibrations, elsewhere, measured_in, store
     from vlatool.bundle.bundle import Bundle
     from vlatool.graph.workload import workload
     from vlatool.hardware.profile import load_profile
+    from vlatool.latency_model.measured import calibrations, elsewhere, measured_in, store
 
     load = workload(Bundle.open(bundle)) if bundle else None
     profile = load_profile(name)

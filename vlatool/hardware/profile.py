@@ -268,7 +268,7 @@ def load_profile(name_or_path: str | os.PathLike[str]) -> Profile:
         >>> load_profile("raspberry-pi-5").units["cpu"].cores.value
         4.0
     """
-    path = _file_of(os.fspath(name_or_path))
+    path = profile_file(os.fspath(name_or_path))
     data = read_mapping(path, f"The profile {path}", ProfileError)
     try:
         return Profile.model_validate(data)
@@ -288,7 +288,7 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
         OutputError: when the file exists and ``force`` is not given, was changed by hand, or cannot be written.
     """
     load_profile(like)
-    path = _file_of(like)
+    path = profile_file(like)
     if not re.fullmatch(NAME, name):
         raise ProfileError(f"'{name}' is not a valid profile name; allowed: lower-case letters, digits and hyphens.")
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
@@ -299,7 +299,7 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
         raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
 
 
-def _file_of(wanted: str) -> Path:
+def profile_file(wanted: str) -> Path:
     """Return the file of a profile: a path, a name, or another name that a profile has.
 
     Raises:

@@ -8,9 +8,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from vlatool.benchmark.latency import Latency
-from vlatool.boards.predict import predictions
 from vlatool.bundle.bundle import Bundle
 from vlatool.hardware.profile import Profile
+from vlatool.latency_model.predict import predictions
 from vlatool.machine.instruction_sets import ENGINE, BoardSet
 from vlatool.optimize.recipe import Effort
 from vlatool.report import Measurement, Row

@@ -1,4 +1,4 @@
-"""How long pruned policies take on this machine: each is exported, and all of them take turns in one run."""
+"""How long pruned policies take: each is exported; all take turns in one run here, or are predicted for a board."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import Any, cast
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.errors import RecipeError
+from vlatool.hardware.profile import Profile
+from vlatool.latency_model.predict import predictions
 from vlatool.measurement import agent
 from vlatool.measurement.jobs import LatencyJob
 from vlatool.module.edits import Edit, apply, joined_edits, read_edits
@@ -52,7 +55,7 @@ class Clock:
         return whole, others
 
     def _export(self, edits: Sequence[Edit]) -> Path:
-        """Return a bundle in ONNX of the policy after edits."""
+        """Return the place of a bundle in ONNX of the policy after edits."""
         self._exported += 1
         made, exported = (self._scratch / f"{self._exported}-{what}" for what in ("modules", "graphs"))
         made.mkdir()
@@ -63,3 +66,34 @@ class Clock:
         stage = cast(Transform, build_stage("export.onnx", {}))
         stage.run(bundle, exported, replace(self._context, tell=lambda _what, _share: None))
         return exported
+
+
+class BoardClock(Clock):
+    """Exports what edits leave of a policy, and predicts how long it takes on a board, in float32.
+
+    Args:
+        profile: The board.
+        others: What ``Clock`` takes.
+    """
+
+    def __init__(self, profile: Profile, *others: Any) -> None:
+        self._profile = profile
+        super().__init__(*others)
+
+    def times(self, pruned: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
+        """Return the milliseconds of the whole policy, and of it with each list of edits.
+
+        Raises:
+            RecipeError: when the latency model has no ground for this board and engine.
+        """
+        whole, *others = (self._ms(path) for path in [self._whole, *map(self._export, pruned)])
+        return whole, others
+
+    def _ms(self, path: Path) -> float:
+        number = predictions(self._profile, Bundle.open(path), self._engine)[0]
+        if not number.known:
+            raise RecipeError(
+                f"The latency on {self._profile.name} cannot be predicted: {number.note}.",
+                "name another engine of the board (--engine), or prune by work: vlatool prune structured",
+            )
+        return number.value

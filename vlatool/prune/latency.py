@@ -1,4 +1,4 @@
-"""Pruning to a latency: blocks, heads, neurons and channels go by what they take on this machine, not by their work."""
+"""Pruning to a latency: blocks, heads, neurons and channels go by what they take here or on a board, not by work."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import DataError, RecipeError
+from vlatool.hardware.profile import Profile, load_profile, names, profile_file
+from vlatool.latency_model.board import Candidate
+from vlatool.latency_model.measured import calibrations
+from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
 from vlatool.module.stage import Changed, ModuleStage
-from vlatool.prune._clock import Clock
+from vlatool.prune._clock import BoardClock, Clock
 from vlatool.prune._prices import (
     Stack,
     edits_of,
@@ -35,6 +39,7 @@ from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
     from torch import nn
+    from typing_extensions import Self
 
 AIM, CLOSE = 0.98, 0.04
 """The share of the asked latency that is aimed at, and how far below it a result may stay."""
@@ -43,15 +48,17 @@ ROUNDS = 8
 
 
 class LatencyPruning(ModuleStage):
-    """Remove what matters least for the milliseconds that it takes here, until an inference takes as long as asked.
+    """Remove what matters least for the milliseconds that it takes, until an inference takes as long as asked.
 
     Milliseconds are measured on this machine in float32: without half of the units of each kind of layer, and without
     one block of each stack, all in one run. What is removed is then measured as a whole, and chosen again, until the
-    latency lies within 4 % below the target. ``gate`` ranks blocks and units alike, by how much the action moves when
-    one is scaled. Quantization comes afterwards, and makes it faster still.
+    latency lies within 4 % below the target. With ``--profile`` of another board nothing is measured: the same
+    exports are predicted for that board, with the uncertainty that its predictions have. ``gate`` ranks blocks and
+    units alike, by how much the action moves when one is scaled. Quantization comes afterwards, and makes it faster.
     """
 
-    target_ms: float = Field(gt=0, le=1e6, description="milliseconds that an inference may take here, in float32")
+    target_ms: float = Field(gt=0, le=1e6, description="milliseconds that an inference may take, in float32")
+    board: str = Field("", description="profile to predict for; --profile sets it; measured on this machine when empty")
     engine: str = Field("", description="engine of the runtime; the default one when empty")
     threads: int = Field(1, ge=1, le=1024, description="intra-op threads")
     rank: Rank = Field("gate", description="how units are ranked")
@@ -64,6 +71,44 @@ class LatencyPruning(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
     chosen: str = Field("", description="what an earlier run chose, as its manifest has it: nothing is measured then")
+
+    def on(self, profile: Profile) -> Self:
+        """Return the stage that predicts for a board, or measures where the board is this machine.
+
+        Raises:
+            RecipeError: when its profile cannot be found by its name.
+        """
+        if self.board or matches(profile.model_strings, fingerprint()):
+            return self
+        if profile.name not in names() or load_profile(profile.name) != profile:
+            raise RecipeError(
+                f"The bundle records for which board it was pruned, and {profile.name} is not a known profile.",
+                "name its file: --board FILE, or add its folder to VLATOOL_PROFILES",
+            )
+        return self.model_copy(update={"board": profile.name})
+
+    def check(self, source: Bundle | None, profile: Profile | None) -> None:
+        """Refuse an unknown board, or an engine that it does not have.
+
+        Raises:
+            ProfileError: naming those that there are.
+        """
+        super().check(source, profile)
+        if self.board and not self.chosen:
+            board = load_profile(self.board)
+            _ = Candidate(board, board.default_mode, self.engine or board.engine).figures
+
+    def key(self, source_hash: str) -> str:
+        """Return the cache key, with what predictions rest on besides the model: the profile, and own measurements."""
+        if not self.board or self.chosen:
+            return super().key(source_hash)
+        files = (profile_file(self.board), *sorted(calibrations().glob("*.json")))
+        return super().key(" ".join([source_hash, *map(hash_file, files)]))
+
+    def lines(self, bundle: Bundle) -> tuple[str, ...]:
+        """Return how large the modules are, and what was not measured."""
+        predicted = f"the latency is predicted for {self.board}, not measured; vlatool export --profile shows its range"
+        return (*super().lines(bundle), *([predicted] if self.board else []))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Choose the blocks and units that stay.
@@ -83,7 +128,8 @@ class LatencyPruning(ModuleStage):
         blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
         with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-            clock = Clock(source, Path(scratch), self.engine, self.threads, self.made_by(), context)
+            of = (source, Path(scratch), self.engine, self.threads, self.made_by(), context)
+            clock = BoardClock(load_profile(self.board), *of) if self.board else Clock(*of)
             edits = self._met(groups, blocks, work, clock, context)
         return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits])})
 
@@ -111,10 +157,13 @@ class LatencyPruning(ModuleStage):
         self, groups: Sequence[Group], blocks: Sequence[Stack], work: Work, clock: Clock, context: Context
     ) -> tuple[Edit, ...]:
         """Return edits that meet the target, choosing again as long as what was chosen does not."""
-        context.tell(f"measuring what {len({role_of(group) for group in groups})} kinds of layers take", None)
+        context.tell(f"what {len({role_of(group) for group in groups})} kinds of layers take", None)
         whole, prices = measured_prices(groups, blocks, work, clock)
         if whole <= self.target_ms:
-            raise RecipeError(f"It takes {whole:.3g} ms here already; asked for {self.target_ms:g} ms.", "ask for less")
+            where = f"on {self.board}, as predicted," if self.board else "here"
+            raise RecipeError(
+                f"It takes {whole:.3g} ms {where} already; asked for {self.target_ms:g} ms.", "ask for less"
+            )
         choice = _Choice(groups, blocks, work, prices, self.least)
         goal, tried = AIM * self.target_ms, list[float]()
         for number in range(ROUNDS):
@@ -127,10 +176,11 @@ class LatencyPruning(ModuleStage):
             if self._is_met(ms):
                 return edits
             goal *= AIM * self.target_ms / ms
+        how, quiet = ("predicted", "") if self.board else ("measured", "let nothing else run meanwhile; ")
         raise DataError(
-            f"The latency of {self.target_ms:g} ms was not met within {CLOSE:.0%}; measured: "
+            f"The latency of {self.target_ms:g} ms was not met within {CLOSE:.0%}; {how}: "
             f"{', '.join(f'{ms:.3g}' for ms in tried)} ms.",
-            "let nothing else run meanwhile; let units go one by one: --multiple 1",
+            f"{quiet}let units go one by one: --multiple 1",
         )
 
     def _is_met(self, ms: float) -> bool:
@@ -182,7 +232,7 @@ class _Choice:
             fit = [offer for offer in offers if left - offer.ms >= (1 - CLOSE) * goal]
             if not offers:
                 raise RecipeError(
-                    f"No less than about {left:.3g} of {whole:.3g} ms can be reached here; asked for {goal / AIM:.3g}.",
+                    f"No less than about {left:.3g} of {whole:.3g} ms can be reached; asked for {goal / AIM:.3g}.",
                     "ask for more, or let less stay (--least); quantization makes it faster, too",
                 )
             offer = min(fit) if fit else min(offers, key=lambda offer: offer.ms)

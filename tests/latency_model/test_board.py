@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from vlatool.boards.board import (
+from vlatool.errors import ProfileError
+from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
+from vlatool.hardware.profile import Profile, load_profile, names
+from vlatool.latency_model.board import (
     BUSY,
     Candidate,
     Outcome,
@@ -22,9 +25,6 @@ from vlatool.boards.board import (
     weight_bytes,
     work_of,
 )
-from vlatool.errors import ProfileError
-from vlatool.graph.workload import PRECISIONS, GraphWorkload, Workload, stored_precision
-from vlatool.hardware.profile import Profile, load_profile, names
 from vlatool.latency_model.features import Shares, roofline_parts
 from vlatool.latency_model.model import LatencyModel
 from vlatool.latency_model.published import known_devices

@@ -3,9 +3,9 @@ import math
 
 import pytest
 
-from vlatool.boards.measured import Measured, store
-from vlatool.boards.predict import predictions
 from vlatool.hardware.profile import load_profile, names
+from vlatool.latency_model.measured import Measured, store
+from vlatool.latency_model.predict import predictions
 
 
 @pytest.mark.parametrize("name", names())

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from vlatool.boards.measured import Measured, calibrations, elsewhere, measured_in, measured_questions, store
 from vlatool.errors import DataError, ProfileError
 from vlatool.graph.workload import WORK, GraphWorkload, Workload, whole_work
 from vlatool.hardware.profile import load_profile
+from vlatool.latency_model.measured import Measured, calibrations, elsewhere, measured_in, measured_questions, store
 from vlatool.report import Measurement, Report, Row
 
 Load = Callable[..., Workload]

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlatool.boards.board import Candidate, place_of
 from vlatool.errors import DataError, ProfileError
 from vlatool.files.edited import whole_file
 from vlatool.graph.workload import PRECISIONS, TRAITS, WORK, Workload, whole_work
 from vlatool.hardware.profile import Profile, load_profile, names
+from vlatool.latency_model.board import Candidate, place_of
 from vlatool.latency_model.features import Question, Work
 from vlatool.machine.host import matches
 from vlatool.report import read_report

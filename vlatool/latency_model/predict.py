@@ -1,0 +1,58 @@
+"""What a profile's board would need for a bundle, as predictions that say so."""
+
+from __future__ import annotations
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.graph.workload import workload
+from vlatool.hardware.profile import Profile
+from vlatool.latency_model.board import Candidate, Outcome, outcomes
+from vlatool.latency_model.measured import measured_questions
+from vlatool.latency_model.model import LEVEL, shipped
+from vlatool.report import Measurement
+
+SHOWN = ("latency_p50", "memory", "energy")
+
+
+def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Measurement]:
+    """Return predicted latency, memory and energy of a bundle on a board; NaN with a note where there is no ground.
+
+    Args:
+        profile: The board.
+        bundle: With graphs.
+        engine: Which engine of the board runs it; the bundle's own when empty, and where the board has that.
+    """
+    own = bundle.manifest.engine if bundle.manifest.engine in profile.engines else profile.engine
+    engine = engine or own
+    model = shipped().conditioned(measured_questions())
+    outcome = outcomes([Candidate(profile, profile.default_mode, engine)], workload(bundle), model)[0]
+    return [measurement for measurement in numbers(outcome) if measurement.name in SHOWN]
+
+
+def numbers(outcome: Outcome, execute: int = 1) -> list[Measurement]:
+    """Return latency, memory, power and energy of an inference as predictions, and of each action executed of it."""
+    where, latency = outcome.candidate.profile.name, outcome.latency
+    way = f"{outcome.candidate.engine}, power mode {outcome.candidate.mode}"
+    note = latency.why or f"{way}: {EVIDENCE[latency.regime]}; without pre- and postprocessing"
+    low, high = (latency.low, latency.high) if latency.known else (None, None)
+    memory, power = outcome.memory_mb, outcome.watts
+    measurements = [
+        Measurement("latency_p50", latency.ms, "ms", "predicted", where, 0, low, high, LEVEL, note),
+        Measurement("memory", memory[0], "MB", "predicted", where, 0, memory[1], memory[2], LEVEL, JUDGED),
+        Measurement("usable_memory", 1e3 * outcome.candidate.profile.usable_memory_gb.value, "MB", "predicted", where),
+        Measurement("watts", power[0], "W", "predicted", where, 0, power[1], power[2], LEVEL, JUDGED),
+    ]
+    if latency.known:
+        ends = (power[1] * latency.low / 1e3, power[2] * latency.high / 1e3)
+        measurements.append(Measurement("energy", outcome.joules, "J", "predicted", where, 0, *ends, LEVEL, JUDGED))
+        per_action = (("latency_per_action", latency.ms, "ms"), ("energy_per_action", outcome.joules, "J"))
+        for name, value, unit in per_action:
+            measurements.append(Measurement(name, value / execute, unit, "predicted", where))
+    return measurements
+
+
+EVIDENCE = {
+    "known": "this runtime and precision were measured on this device",
+    "unseen": "from other devices, runtimes or precisions",
+    "calibrated": "with your own measurement on this device",
+}
+JUDGED = "bounds are a judgement, not a confidence interval"
