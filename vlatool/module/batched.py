@@ -173,7 +173,9 @@ def drawn(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.G
     """
     torch = require("torch", "build")
     batches = {name: {**wanted, "shape": (size, *wanted["shape"][1:])} for name, wanted in noise.items()}
-    return {name: torch.from_numpy(draw(wanted, random)) for name, wanted in batches.items()}
+    return {
+        name: torch.from_numpy(draw(wanted, random)).to(torch.get_default_device()) for name, wanted in batches.items()
+    }
 
 
 def no_gradient(fix: str) -> SourceError:

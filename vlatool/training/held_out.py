@@ -14,6 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import Recording
 from vlatool.errors import DataError, require
 from vlatool.training.batches import Loss
+from vlatool.training.device import Device
 from vlatool.training.expert import Expert, at_most
 from vlatool.training.frames import Frames
 from vlatool.training.rounds import Counted, next_round
@@ -73,35 +74,35 @@ class HeldOut:
         self.recording = recording.only(held)
         next_round(self._frames, 0, partial(write, self.recording))
 
-    def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, *, bfloat16: bool) -> float:
+    def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, device: Device) -> float:
         """Return the mean loss of what is held out.
 
         Args:
             loss: Of a batch.
             rows: At a time.
-            bfloat16: Whether matrix products are computed so, as in training.
+            device: As in training.
         """
-        return _mean(self._frames, loss, rows, bfloat16)
+        return _mean(self._frames, loss, rows, device)
 
-    def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, *, bfloat16: bool) -> float:
+    def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
         """Return the same as a mixture of both terms.
 
         Args:
             alpha: Share of the teacher.
             loss: Of a batch, against the teacher.
             expert: Of a batch, against the expert's actions; None where no expert is asked.
-            rows, bfloat16: As of ``loss``.
+            rows, device: As of ``loss``.
         """
-        total = alpha * self.loss(loss, rows, bfloat16=bfloat16) if alpha else 0.0
+        total = alpha * self.loss(loss, rows, device) if alpha else 0.0
         if expert is None:
             return total
-        return total + (1 - alpha) * _mean(self.expert.frames, expert, rows, bfloat16)
+        return total + (1 - alpha) * _mean(self.expert.frames, expert, rows, device)
 
 
-def _mean(frames: Frames, loss: Loss, rows: int, bfloat16: bool) -> float:
+def _mean(frames: Frames, loss: Loss, rows: int, device: Device) -> float:
     torch, total = require("torch", "build"), 0.0
     parts = np.array_split(np.arange(len(frames)), -(-len(frames) // rows))
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+    with torch.no_grad(), device.computing(), device.casting():
         for part in parts:
             total += float(loss(frames.batch(part))) * len(part)
     return total / len(frames)

@@ -13,6 +13,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.feeds import recorded_inputs
+from vlatool.training.device import device_in_use
 from vlatool.training.matching import Pair, Stack, pairs_of
 from vlatool.training.rounds import NOISE, tensors
 from vlatool.training.session import Lesson
@@ -124,14 +125,13 @@ def with_hints(
 
 def _look(rows: Mapping[str, Any], *programs: BatchedProgram) -> None:
     """Let programs find out in float32 whether they take batches, before anything is kept of them."""
-    torch = require("torch", "build")
-    with torch.autocast("cpu", enabled=False):
+    with device_in_use().casting(enabled=False):
         for program in programs:
             program.look(tensors(rows), tensors(rows, NOISE))
 
 
 def _sum(hints: Sequence[Hint], ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Any:
-    with require("torch", "build").autocast("cpu", enabled=False):
+    with device_in_use().casting(enabled=False):
         return sum(hint(ours, theirs) for hint in hints)
 
 

@@ -23,6 +23,7 @@ from vlatool.module.batched import no_gradient
 from vlatool.module.edits import save_tensors
 from vlatool.training.best import Best
 from vlatool.training.constraint import Constraint
+from vlatool.training.device import CPU, Device
 from vlatool.training.group import Group
 from vlatool.training.mixture import Draw as Draw
 from vlatool.training.mixture import Mixture
@@ -38,8 +39,6 @@ LOOKS = (0.05, 0.5, 0.95)
 """Shares of the steps after which the gradients of the terms of a loss are measured, where it has several."""
 WARMUP = 0.05
 """Share of the steps in which the learning rate rises."""
-BFLOAT16 = ("amx_bf16", "avx512_bf16", "bf16")
-"""Features of processors that multiply bfloat16 natively: twice as fast as float32 here."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Settings:
         weight_decay: Of weights with two axes or more, decoupled (AdamW).
         average: Decay of the exponential moving average of the weights, which is the result.
         seed: Of the batches.
-        bfloat16: Whether matrix products are computed in bfloat16 (autocast); weights and their updates are float32.
+        device: On what, and in which precision.
         checkpoint_s: Seconds between checkpoints.
     """
 
@@ -61,7 +60,7 @@ class Settings:
     weight_decay: float = 0.01
     average: float = 0.995
     seed: int = 0
-    bfloat16: bool = False
+    device: Device = CPU
     checkpoint_s: float = 30.0
 
     def rate(self, step: int) -> float:
@@ -71,11 +70,6 @@ class Settings:
             return self.learning_rate * (step + 1) / warmup
         share = (step - warmup) / max(1, self.steps - warmup)
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * share))
-
-
-def has_bfloat16(features: Iterable[str] | None) -> bool:
-    """Say whether a processor with these features multiplies bfloat16 natively."""
-    return bool({*BFLOAT16} & {*(features or ())})
 
 
 class Trainer:
@@ -141,7 +135,8 @@ class Trainer:
         """
         saved = time.monotonic()
         while self.step < until:
-            self._take_step(draw)
+            with self._settings.device.computing():
+                self._take_step(draw)
             tell(self.step, float(np.mean(self.losses[-20:])))
             if self._group.rank == 0 and time.monotonic() - saved > self._settings.checkpoint_s:
                 self.save()
@@ -186,9 +181,9 @@ class Trainer:
 
     def _own_loss(self, parts: Iterable[Part]) -> float:
         """Add the gradients of this process's parts of the batch; return their share of its loss."""
-        torch, total = require("torch", "build"), 0.0
+        total = 0.0
         for share, compute in parts:
-            with torch.autocast("cpu", torch.bfloat16, enabled=self._settings.bfloat16):
+            with self._settings.device.casting():
                 loss = compute()
             if not loss.requires_grad:
                 raise no_gradient("let make() return the module that was trained, as it was trained")
@@ -270,7 +265,7 @@ class Trainer:
             value.copy_(opened.get_tensor(f"weight.{name}"))
             self._average[name].copy_(opened.get_tensor(f"average.{name}"))
             state: dict[str, Any] = {
-                key: opened.get_tensor(f"{key}.{name}")
+                key: opened.get_tensor(f"{key}.{name}").to("cpu" if key == "step" else value.device)
                 for key in ("step", "exp_avg", "exp_avg_sq")
                 if f"{key}.{name}" in names
             }

@@ -15,6 +15,7 @@ from vlatool.errors import DataError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.origin import origin_of
 from vlatool.stage.base import Context
+from vlatool.training.device import on_device
 from vlatool.training.frames import Array, Frames, new_array
 
 if TYPE_CHECKING:
@@ -75,25 +76,24 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
     kept: dict[str, Any] = {}
     with torch.no_grad():
         for start in range(0, count, ROWS):
-            rows = {name: torch.from_numpy(np.array(values[start : start + ROWS])) for name, values in inputs.items()}
+            rows = {name: on_device(np.array(values[start : start + ROWS])) for name, values in inputs.items()}
             noise = drawn(teacher.noise, len(next(iter(rows.values()))), np.random.default_rng((*seed, start)))
             values = teacher.run(rows, noise)
             given = {LABEL + name: values[name] for name in outputs} | {NOISE + name: noise[name] for name in noise}
             for name, value in given.items():
                 if name not in kept:
-                    kept[name] = new_array(file_of(frames, name), value.numpy().dtype, (count, *value.shape[1:]))
+                    kept[name] = new_array(file_of(frames, name), value.cpu().numpy().dtype, (count, *value.shape[1:]))
                 if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
-                kept[name][start : start + len(value)] = value.numpy()
+                kept[name][start : start + len(value)] = value.cpu().numpy()
             context.tell(f"the teacher labels {count} observations", (start + 1) / count)
 
 
 def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
     """Return the arrays of a batch whose names begin so, without that beginning, as tensors."""
-    torch = require("torch", "build")
     others = (LABEL, NOISE, EXPERT)
     return {
-        name[len(prefix) :]: torch.from_numpy(value)
+        name[len(prefix) :]: on_device(value)
         for name, value in rows.items()
         if (name.startswith(prefix) if prefix else not name.startswith(others))
     }

@@ -212,7 +212,7 @@ class Session:
         try:
             judged = self._lesson.judged or self._lesson.loss
             terms = self._plan.supervision.alpha, judged, self._lesson.expert
-            loss = self._held_out.mixed(*terms, self._plan.batch, bfloat16=self._settings.bfloat16)
+            loss = self._held_out.mixed(*terms, self._plan.batch, self._settings.device)
         finally:
             self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
@@ -220,14 +220,15 @@ class Session:
         return -loss
 
     def _about(self) -> dict[str, Any]:
-        best, several = self._trainer.best, self._crew.group.size
+        best, several, device = self._trainer.best, self._crew.group.size, self._settings.device
         supervision, teacher = self._plan.supervision, self._teacher.program.modules
         judged = "success" if self._held_out is None else "held-out loss"
         scores = best.scores if self._held_out is None else [-score for score in best.scores]
         return {
             "loss": supervision.loss_name(self._lesson.name),
             **self._lesson.about,
-            "precision": "bfloat16" if self._settings.bfloat16 else "float32",
+            "precision": device.precision,
+            **({"device": device.name} if device.name != "cpu" else {}),
             "threads": require("torch", "build").get_num_threads(),
             **({"processes": several} if several > 1 else {}),
             "losses": self._trainer.losses,
@@ -304,7 +305,8 @@ class Session:
             return
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
-        label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
+        with self._settings.device.computing():
+            label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
         if self._plan.supervision.control == "noise":
             exchange_labels(target, outputs, (self._settings.seed, *seed))
 

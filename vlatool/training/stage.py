@@ -21,8 +21,9 @@ from vlatool.module.stage import TRAINING, Changed, ModuleStage
 from vlatool.stage.base import Context, source_of
 from vlatool.stage.cache import STREAMS
 from vlatool.training.crew import crew_of
+from vlatool.training.device import Asked, device_of
 from vlatool.training.events import check_events
-from vlatool.training.loop import Settings, has_bfloat16, seconds_of
+from vlatool.training.loop import Settings, seconds_of
 from vlatool.training.report import write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Lesson, Plan, Session
@@ -70,8 +71,9 @@ class TrainingStage(ModuleStage):
     first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode to train on")
     seed: int = Field(0, ge=0, description="of batches and noise")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
-        "auto", description="of matrix products in training; bfloat16 where the processor has it"
+        "auto", description="of matrix products in training; bfloat16 where the device has it"
     )
+    device: Asked = Field("auto", description="what computes: a GPU where torch finds one, else the processor")
     threads: int = Field(0, ge=0, description="of torch, over all processes; all cores of this process when 0")
     processes: int = Field(1, ge=1, le=64, description="that share each batch, and the threads")
     accumulate: int = Field(1, ge=1, description="parts of a batch that follow each other: less memory, the same loss")
@@ -161,8 +163,12 @@ class TrainingStage(ModuleStage):
         asked = rows_asked(self.from_batches, source, plays) if self.supervision().alpha else 0
         plan = replace(self.plan(), yielded=asked)
         teacher, lesson = self.prepared(modules, source)
-        with crew_of(self._job(source), self.processes, place, self.runs(source)) as crew:
-            session = Session(plan, self.settings(), lesson, source, teacher, place, context, crew)
+        settings, programs = self.settings(), (lesson.trained, teacher.program.modules)
+        with (
+            settings.device.holding(*programs),
+            crew_of(self._job(source), self.processes, place, self.runs(source)) as crew,
+        ):
+            session = Session(plan, settings, lesson, source, teacher, place, context, crew)
             return Changed(training=session.run())
 
     def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
@@ -172,8 +178,8 @@ class TrainingStage(ModuleStage):
 
     def settings(self) -> Settings:
         """Return how long and how fast is trained."""
-        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_bfloat16(host.isa()))
-        return Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, bfloat16)
+        device = device_of(self.device, self.precision, self.processes)
+        return Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, device)
 
     def supervision(self) -> Supervision:
         """Return who says what is right: the teacher, unless a stage asks somebody else, too."""
