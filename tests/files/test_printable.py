@@ -1,6 +1,6 @@
 import pytest
 
-from vlatool.files.printable import message_of, one_line, printable
+from vlatool.files.printable import message_of, one_line, printable, without_password
 
 
 @pytest.mark.parametrize(
@@ -30,3 +30,36 @@ def test_an_exception_without_a_text_is_told():
     assert message_of(ValueError("a")) == "a"
     assert message_of(ValueError("\udcff")) == "?"
     assert message_of(_Mute()) == "(its text cannot be told: ValueError)"
+
+
+SECRET = "s3cr3t"
+ADDRESSES = (
+    "postgresql://bob:s3cr3t@h/db",
+    "--study=postgresql://bob:s3cr3t@h/db",
+    "postgresql://bob@127.0.0.1:1/db?password=s3cr3t",
+    "postgresql://h/db?user=x&pwd=s3cr3t&sslpassword=s3cr3t",
+    "postgresql://bob:s3cr3t/pw@127.0.0.1:1/db",
+    "postgresql://bob:s3cr3t pw@h/db",
+    "postgresql://bob:x@s3cr3t@h/db",
+    "postgresql://bob:a?b=s3cr3t@h/db",
+    "postgresql://bob:s3cr3t",
+    "postgresql:/bob:s3cr3t@h/db",
+    "postgresql:bob:s3cr3t@h/db",
+    "redis://:s3cr3t@h",
+    "sqlite://bob:s3cr3t@h",
+    "nothing+known://bob:s3cr3t@h",
+)
+
+
+@pytest.mark.parametrize("address", ADDRESSES)
+def test_no_address_tells_its_password(address: str):
+    assert SECRET not in without_password(address)
+    assert "***" in without_password(address)
+
+
+@pytest.mark.parametrize("text", [
+    "trials.journal", "sqlite:///trials.db", "postgresql://host:5432/db", "policy.py:make", "user@host", "--hz=20",
+    "a sentence: with a colon", "user@host:~/venv/bin/python", "relative_error=0.04",
+])  # fmt: skip
+def test_what_has_no_password_stays(text: str):
+    assert without_password(text) == text

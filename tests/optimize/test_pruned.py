@@ -108,8 +108,9 @@ def test_without_episodes_the_error_on_recorded_observations_decides(
         ([], "{episodes: 0}", 3, "pruning.episodes"),
         ([], "{tirals: 3}", 3, "tirals"),
         ([], "7", 3, "pruning"),
-        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "cannot be used"),
-        (["--trials", "2", "--study", "sqlite:////proc/none/x.db"], "trials: 1", 2, "cannot be used"),
+        (["--trials", "2", "--study", " "], "trials: 1", 2, "--study names no place"),
+        (["--trials", "2", "--study", "nothing://here"], "trials: 1", 2, "no address of a database"),
+        (["--trials", "2", "--study", "sqlite:////proc/none/x.db"], "trials: 1", 2, "a folder that does not exist"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )  # fmt: skip
@@ -147,13 +148,13 @@ def test_the_plan_tells_of_the_trials(
 def test_passwords_and_places_of_studies_stay_here(
     policy_template: Path, float_bundle: Bundle, recipe: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    url = "postgresql://me:secret@host/trials"
+    url = "sqlite://me:secret@host/trials"
     words = (policy_template, "--recipe", recipe, "--study", url, "--dry-run", "-o", tmp_path / "out")
     for more in ((), ("--json",)):
         assert optimized(*words, *more) == 0
         said = capsys.readouterr().out
         assert "secret" not in said
-        assert "postgresql://me:***@host/trials" in said
+        assert "sqlite://me:***@host/trials" in said
     asked = read_recipe(recipe)
     asked = asked.model_copy(update={"pruning": asked.pruning.model_copy(update={"study": url})})
     plan = make_plan(str(policy_template), None, asked, tmp_path / "cache")
@@ -161,7 +162,7 @@ def test_passwords_and_places_of_studies_stay_here(
     _write_bundle(plan, Row("float32", "chosen"), float_bundle, tmp_path / "bundle")
     written = (tmp_path / "bundle" / "recipe.yaml").read_text()
     assert "trials: 2" in written
-    assert "postgresql" not in written
+    assert "sqlite" not in written
 
 
 def test_only_trials_that_may_be_compared_share_a_study(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def test_a_block_goes_where_it_matters_least(counted: None, deep: Bundle, tmp_pa
 
 
 @pytest.mark.parametrize(("target", "says"), [
-    (1e5, r"It takes \d.* ms here already; asked for 100000 ms"),
+    (1e5, r"An inference takes \d.* ms here already; asked for 100000 ms"),
     (0.01, r"No less than about .* ms can be reached; asked for 0\.01"),
 ])  # fmt: skip
 def test_a_target_that_makes_no_sense_is_refused(counted: None, deep: Bundle, tmp_path: Path, target: float, says: str):
@@ -148,7 +149,9 @@ def test_a_board_without_ground_is_refused(deep: Bundle, tmp_path: Path, monkeyp
 def test_a_profile_of_another_machine_is_predicted_and_this_one_measured(monkeypatch: pytest.MonkeyPatch):
     stage, pi = LatencyPruning(target_ms=1), load_profile("raspberry-pi-5")
     assert stage.on(pi).board == "raspberry-pi-5"
-    assert LatencyPruning(target_ms=1, board="nuc").on(pi).board == "nuc"
+    assert LatencyPruning(target_ms=1, board="pi5").on(pi).board == "pi5"
+    with pytest.raises(RecipeError, match="--board nuc and --profile raspberry-pi-5 are two boards"):
+        LatencyPruning(target_ms=1, board="nuc").on(pi)
     with pytest.raises(RecipeError, match="mine is not a known profile"):
         stage.on(pi.model_copy(update={"name": "mine"}))
     with pytest.raises(RecipeError, match="raspberry-pi-5 is not a known profile"):
@@ -173,24 +176,40 @@ def test_what_predictions_rest_on_changes_the_key(tmp_path: Path, monkeypatch: p
     ({"board": "raspberry-pi-55"}, "did you mean 'raspberry-pi-5'"),
     ({"board": "raspberry-pi-5", "engine": "tensorrt"}, "raspberry-pi-5 has no engine 'tensorrt'"),
 ])  # fmt: skip
-def test_unknown_boards_and_engines_are_refused(source_bundle: Bundle, options: dict[str, str], says: str):
+def test_unknown_boards_and_engines_are_refused(options: dict[str, str], says: str):
     with pytest.raises(ProfileError, match=says):
-        LatencyPruning(target_ms=1, **options).check(source_bundle, None)
+        LatencyPruning(target_ms=1, **options)
+    assert LatencyPruning(target_ms=1, chosen="[]", **options), "what was chosen needs no board"
+
+
+def test_threads_are_not_predicted():
+    with pytest.raises(RecipeError, match="--threads is of measurements on this machine"):
+        LatencyPruning(target_ms=1, board="pi5", threads=2)
+
+
+def test_a_target_that_a_board_meets_is_refused_before_the_ranking(
+    counted: None, deep: Bundle, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(latency, "BoardClock", lambda _, *of: Counted(*of))
+    monkeypatch.setattr(latency, "walks_of", None)
+    stage = LatencyPruning(target_ms=1e5, board="pi5", **FINE)
+    with pytest.raises(RecipeError, match=r"is predicted to take \d.* ms on pi5 already; asked for 100000 ms"):
+        stage.change(load_modules(deep), deep, Context())
 
 
 def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     counted: None, deep: Bundle, policy_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(latency, "BoardClock", lambda profile, *of: Counted(*of) if "nuc" in profile.name else None)
-    monkeypatch.setattr(
-        latency, "load_profile", lambda name: load_profile("raspberry-pi-5").model_copy(update={"name": name})
-    )
     monkeypatch.setattr(latency, "Clock", None)
     target = 0.7 * Counted(deep).ms(())
     stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})
     pruned = run_transform(stage, deep, tmp_path / "out", Context())
     assert 0.96 * target <= Counted(deep).ms(read_edits(pruned)) <= target
-    assert "predicted for nuc13, not measured" in stage.lines(pruned)[-1]
+    assert re.match(
+        r"predicted, not measured: .* ms or up to 4% less on nuc13; .* --profile nuc13", stage.lines(pruned)[-1]
+    )
+    assert pruned.manifest.made_by["options"]["board"] == "intel-nuc-13-pro"
     exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
     monkeypatch.setattr(latency, "BoardClock", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical

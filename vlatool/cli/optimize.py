@@ -154,8 +154,10 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
     """Return what a recipe says of trials with the options that were given.
 
     Raises:
-        UsageError: for steps of a training that the recipe does not name.
+        UsageError: for steps of a training that the recipe does not name, or a study without a place.
     """
+    if study is not None and not study.strip():
+        raise UsageError("--study names no place.", "name a file or the address of a database, or leave it out")
     update: dict[str, Any] = {"trials": trials, "study": study}
     if steps is not None:
         recover = [{name: {**(options or {}), "steps": steps} if name == TRAINS else options}

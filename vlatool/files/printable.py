@@ -28,13 +28,32 @@ def one_line(text: str, longest: int = 400) -> str:
 
 
 def without_password(text: str) -> str:
-    """Return a text in which no address of a database tells its password.
+    """Return an address of a database, or an option with one, without its password; other texts as they are.
 
     Example:
-        >>> without_password("--study=postgresql://me:secret@host/trials")
-        '--study=postgresql://me:***@host/trials'
+        >>> without_password("--study=postgresql://me:secret@host/trials?sslpassword=other")
+        '--study=postgresql://me:***@host/trials?sslpassword=***'
     """
-    return re.sub(r"(\w://[^/@:\s]*):[^/\s]*@", r"\1:***@", text)
+    for secret in sorted(secrets_in(text), key=len, reverse=True):
+        text = text.replace(secret, "***")
+    return text
+
+
+def secrets_in(text: str) -> set[str]:
+    """Return what of an address is said to one reader alone: what is between the user and the last ``@``, and queries.
+
+    An address may be malformed: what cannot be a port counts as a password.
+    """
+    found = re.match(r"(?:-+[\w-]+=)?[A-Za-z][\w+.-]*:(?://?)?(?P<rest>.*)", text, re.DOTALL)
+    if found is None or ("://" not in text and "@" not in text):
+        return set()
+    rest, _, query = found["rest"].partition("?")
+    if "@" in query:  # of a password with a question mark
+        rest, query = found["rest"], ""
+    before, at, _ = rest.rpartition("@")
+    _, colon, password = (before if at else rest.partition("/")[0]).partition(":")
+    secrets = {password} if colon and (at or not password.isdecimal()) else set()
+    return {secret for secret in secrets | {item.partition("=")[2] for item in query.split("&")} if secret}
 
 
 def message_of(error: BaseException) -> str:

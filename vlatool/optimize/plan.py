@@ -13,6 +13,7 @@ from vlatool.hardware.profile import Profile
 from vlatool.machine.host import fingerprint, matches
 from vlatool.machine.instruction_sets import BoardSet, board_set
 from vlatool.module.description import read_description
+from vlatool.optimize.place import check_place
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
 from vlatool.sources import Source, source_stage
 from vlatool.stage.base import Stage, Transform, build_stage
@@ -121,6 +122,8 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
             raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
     if recipe.pruning.trials:
         _check_pruning(recipe.pruning, stage)
+        if recipe.pruning.study:
+            check_place(recipe.pruning.study)
     elif study := recipe.pruning.study:
         raise RecipeError(f"The study {without_password(study)} keeps trials; none are asked for.", "add --trials 8")
     return Plan(stage, export, candidates, recipe, profile, cache, fresh, source)

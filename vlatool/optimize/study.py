@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import platform
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import psutil
 
-from vlatool.errors import DataError, UsageError, VlatoolError, require
-from vlatool.files.printable import without_password
+from vlatool.errors import DataError, VlatoolError, require
+from vlatool.optimize.place import storage_of, used
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.space import FLOAT32, Shape, Space, quantizations
 
@@ -73,8 +72,8 @@ class Study:
         self._worker = worker()
         self._space = Space((1.0,), 1, 1, {}, ())
         self._url = url
-        with _used(url):
-            storage = _storage(self._optuna, url)
+        with used(url):
+            storage = storage_of(url)
             self._study = self._optuna.create_study(
                 storage=storage, study_name=name, directions=["maximize", "minimize"], load_if_exists=True
             )
@@ -88,7 +87,7 @@ class Study:
         Raises:
             DataError: when the study holds something else.
         """
-        with _used(self._url):
+        with used(self._url):
             if QUANTIZED not in self._study.user_attrs:
                 self._study.set_user_attr(QUANTIZED, [[name, list(stages)] for name, stages in quantized.items()])
             held = self._study.user_attrs[QUANTIZED]
@@ -104,7 +103,7 @@ class Study:
     def begin(self, space: Space) -> None:
         """Say what may be chosen, and take up what a process of this machine left when it was killed."""
         self._space = space
-        with _used(self._url):
+        with used(self._url):
             for shape in space.first():
                 self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
             self._again()
@@ -116,7 +115,7 @@ class Study:
             DataError: when the study is of another space.
             UsageError: when it cannot be read or written any more.
         """
-        with _used(self._url):
+        with used(self._url):
             return self._next(trials)
 
     def _next(self, trials: int) -> tuple[int, Shape] | None:
@@ -163,7 +162,7 @@ class Study:
         Raises:
             UsageError: when the study cannot be written any more.
         """
-        with _used(self._url):
+        with used(self._url):
             trial = self._trial(number)
             trial.set_user_attr(TRAINING, tried.training_s)
             if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
@@ -179,13 +178,13 @@ class Study:
         Raises:
             DataError: when what the study holds is not what a trial finds.
         """
-        with _used(self._url):
+        with used(self._url):
             return [self._read(trial) for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
 
     def under_way(self) -> int:
         """Return how many trials other processes have under way."""
         running = self._optuna.trial.TrialState.RUNNING
-        with _used(self._url):
+        with used(self._url):
             return sum(trial.state == running for trial in self._trials())
 
     def _trials(self) -> list[FrozenTrial]:
@@ -240,25 +239,3 @@ def _is_dead(other: str) -> bool:
     except (psutil.NoSuchProcess, OverflowError):
         return True
     return f"{began:.0f}" != theirs[2]  # another process has its number now
-
-
-def _storage(optuna: Any, url: str) -> Any:
-    if "://" in url:
-        return url
-    backend = optuna.storages.journal.JournalFileBackend(url)
-    return optuna.storages.JournalStorage(backend)
-
-
-@contextlib.contextmanager
-def _used(url: str) -> Iterator[None]:
-    """Turn what Optuna and its databases raise of a study into a sentence."""
-    try:
-        yield
-    except (VlatoolError, MemoryError):
-        raise
-    except Exception as error:  # the seam: each database has errors of its own
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise UsageError(
-            f"The study {without_password(url)} cannot be used: {without_password(reason[0])}.",
-            "name a file, such as trials.journal, or a database, such as sqlite:///trials.db",
-        ) from error

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import DataError, RecipeError
@@ -76,9 +76,14 @@ class LatencyPruning(ModuleStage):
         """Return the stage that predicts for a board, or measures where the board is this machine.
 
         Raises:
-            RecipeError: when its profile cannot be found by its name.
+            RecipeError: when its profile cannot be found by its name, or another board was named.
         """
-        if self.board or matches(profile.model_strings, fingerprint()):
+        if self.board:
+            if load_profile(self.board) != profile:
+                said = f"--board {self.board} and --profile {profile.name} are two boards."
+                raise RecipeError(said, "name one of them")
+            return self
+        if matches(profile.model_strings, fingerprint()):
             return self
         if profile.name not in names() or load_profile(profile.name) != profile:
             raise RecipeError(
@@ -87,16 +92,20 @@ class LatencyPruning(ModuleStage):
             )
         return self.model_copy(update={"board": profile.name})
 
-    def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Refuse an unknown board, or an engine that it does not have.
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        """Refuse an unknown board, an engine that it does not have, or threads: predictions are of whole boards.
 
         Raises:
             ProfileError: naming those that there are.
+            RecipeError: for threads.
         """
-        super().check(source, profile)
         if self.board and not self.chosen:
             board = load_profile(self.board)
             _ = Candidate(board, board.default_mode, self.engine or board.engine).figures
+            if "threads" in self.model_fields_set:
+                raise RecipeError("--threads is of measurements on this machine; a board is predicted as a whole.")
+        return self
 
     def key(self, source_hash: str) -> str:
         """Return the cache key, with what predictions rest on besides the model: the profile, and own measurements."""
@@ -107,8 +116,11 @@ class LatencyPruning(ModuleStage):
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return how large the modules are, and what was not measured."""
-        predicted = f"the latency is predicted for {self.board}, not measured; vlatool export --profile shows its range"
-        return (*super().lines(bundle), *([predicted] if self.board else []))
+        predicted = (
+            f"predicted, not measured: {self.target_ms:g} ms or up to {CLOSE:.0%} less on {self.board}; for the range: "
+            f"vlatool export --profile {self.board}"
+        )
+        return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Choose the blocks and units that stay.
@@ -120,6 +132,8 @@ class LatencyPruning(ModuleStage):
         """
         if self.chosen:
             return Changed(edits_from(self.chosen, "--chosen"))
+        if self.board:
+            self._predict_whole(source, context)
         context.tell("tracing the policy", None)
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
@@ -128,10 +142,27 @@ class LatencyPruning(ModuleStage):
         blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
         with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-            of = (source, Path(scratch), self.engine, self.threads, self.made_by(), context)
-            clock = BoardClock(load_profile(self.board), *of) if self.board else Clock(*of)
+            clock = self._clock(source, Path(scratch), context)
             edits = self._met(groups, blocks, work, clock, context)
-        return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits])})
+        board = {"board": load_profile(self.board).name} if self.board else {}
+        return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
+
+    def _predict_whole(self, source: Bundle, context: Context) -> None:
+        """Say at once, and not after the ranking, that there is nothing to do."""
+        context.tell(f"predicting for {self.board}", None)
+        with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
+            whole, _ = self._clock(source, Path(scratch), context).times([])
+        self._refuse_met(whole)
+
+    def _clock(self, source: Bundle, scratch: Path, context: Context) -> Clock:
+        of = (source, scratch, self.engine, self.threads, self.made_by(), context)
+        return BoardClock(load_profile(self.board), *of) if self.board else Clock(*of)
+
+    def _refuse_met(self, whole: float) -> None:
+        if whole <= self.target_ms:
+            here = f"takes {whole:.3g} ms here"
+            takes = f"is predicted to take {whole:.3g} ms on {self.board}" if self.board else here
+            raise RecipeError(f"An inference {takes} already; asked for {self.target_ms:g} ms.", "ask for less")
 
     def stacks(self, modules: Mapping[str, nn.Module], source: Bundle) -> list[Stack]:
         """Return the stacks that may lose blocks, with the importance of these; none for a policy without blocks."""
@@ -159,11 +190,7 @@ class LatencyPruning(ModuleStage):
         """Return edits that meet the target, choosing again as long as what was chosen does not."""
         context.tell(f"what {len({role_of(group) for group in groups})} kinds of layers take", None)
         whole, prices = measured_prices(groups, blocks, work, clock)
-        if whole <= self.target_ms:
-            where = f"on {self.board}, as predicted," if self.board else "here"
-            raise RecipeError(
-                f"It takes {whole:.3g} ms {where} already; asked for {self.target_ms:g} ms.", "ask for less"
-            )
+        self._refuse_met(whole)
         choice = _Choice(groups, blocks, work, prices, self.least)
         goal, tried = AIM * self.target_ms, list[float]()
         for number in range(ROUNDS):

@@ -1,0 +1,84 @@
+"""Where trials are kept: what cannot keep them is refused before anything is written, and no password is told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from vlatool.errors import DataError, UsageError
+from vlatool.optimize.place import check_place, storage_of
+
+RECORD = json.dumps({"op_code": 0, "worker_id": "x", "study_name": "s", "directions": [1]}) + "\n"
+
+
+def journal(path: Path, text: str) -> str:
+    path.write_text(text)
+    return str(path)
+
+
+@pytest.mark.parametrize(("url", "says", "fix"), [
+    ("  ", "--study names no place", "name a file"),
+    ("{tmp}", "is a folder", "name a file in it"),
+    ("{tmp}/none/x.journal", "in a folder that does not exist", "mkdir -p"),
+    ("sqlite:///{tmp}/none/x.db", "in a folder that does not exist", "mkdir -p"),
+    ("sqlite:///{tmp}", "is a folder", "name a file in it"),
+    ("sqlite://", "would be in memory", "sqlite:///trials.db"),
+    ("sqlite:///:memory:", "would be in memory", "sqlite:///trials.db"),
+    ("redis://host/0", "no address of a database that is known here", "sqlite:///trials.db"),
+    ("postgresql://me:secret@host:x/db", "no address of a database", "sqlite:///trials.db"),
+    ("postgresql+none://me:secret@host/db", "no address of a database", "sqlite:///trials.db"),
+    ("postgresql:/me:secret@host/db", "neither a file nor an address", "name a file"),
+])  # fmt: skip
+def test_what_keeps_no_trials_is_refused_with_what_helps(tmp_path: Path, url: str, says: str, fix: str):
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(UsageError, match=says) as caught:
+        check_place(url.format(tmp=tmp_path))
+    assert fix in str(caught.value.fix)
+    assert "secret" not in f"{caught.value} {caught.value.fix}"
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch):
+    from sqlalchemy.dialects.postgresql.psycopg2 import PGDialect_psycopg2
+
+    def missing() -> None:
+        raise ModuleNotFoundError("No module named 'psycopg2'", name="psycopg2")
+
+    monkeypatch.setattr(PGDialect_psycopg2, "import_dbapi", missing)
+    with pytest.raises(UsageError, match=r"me:\*\*\*@host/db needs the Python package psycopg2-binary"):
+        check_place("postgresql+psycopg2://me:secret@host/db")
+
+
+@pytest.mark.parametrize("text", ["keep me", "garbage {\n", "[1]\n", "{}\n", "\n", "two\nlines\n"])
+def test_a_file_that_is_no_study_stays_as_it_is(tmp_path: Path, text: str):
+    url = journal(tmp_path / "mine.txt", text)
+    for use in (check_place, storage_of):
+        with pytest.raises(DataError, match="is not a study: its first line is no record"):
+            use(url)
+        assert Path(url).read_text() == text
+
+
+def test_a_damaged_line_is_named(tmp_path: Path):
+    url = journal(tmp_path / "trials.journal", RECORD + "{broken\n" + RECORD)
+    with pytest.raises(DataError, match="is damaged: line 2 is no record") as caught:
+        check_place(url)
+    assert "head -n 1" in str(caught.value.fix)
+
+
+@pytest.mark.parametrize("torn", ["", RECORD[:-1], RECORD[:9], "{"])
+def test_a_torn_last_line_is_cut_off_before_anything_follows_it(tmp_path: Path, torn: str):
+    url = journal(tmp_path / "trials.journal", 2 * RECORD + torn)
+    check_place(url)
+    assert Path(url).read_text() == 2 * RECORD + torn, "looking changes nothing"
+    storage_of(url)
+    assert Path(url).read_text() == 2 * RECORD
+
+
+@pytest.mark.parametrize("name", ["new.journal", "empty.journal"])
+def test_new_and_empty_files_are_places(tmp_path: Path, name: str):
+    (tmp_path / "empty.journal").touch()
+    check_place(str(tmp_path / name))
+    check_place(f"sqlite:///{tmp_path / 'trials.db'}")
+    assert [path.name for path in tmp_path.iterdir()] == ["empty.journal"]
