@@ -84,7 +84,7 @@ def test_without_recordings_or_a_source_nothing_is_compared(float_bundle: Bundle
 
 def test_a_policy_that_is_not_exported_yet_is_not_predicted(policy_dir: Path, tmp_path: Path, capsys) -> None:
     told = run(capsys, "prune", "magnitude", str(policy_dir), "-o", str(tmp_path / "out"), "--profile", "pi5")
-    assert "nothing is predicted for raspberry-pi-5 before the export" in told
+    assert "predicted for raspberry-pi-5 once it is exported: vlatool export --profile raspberry-pi-5" in told
     assert "graphs " not in told
 
 

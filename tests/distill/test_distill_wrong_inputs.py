@@ -94,6 +94,14 @@ class Workshop:
         policy = TorchModule(policy=self.policy(*swaps, drop=drop))
         return run_transform(policy, None, self.root / "source", Context()).path
 
+    def unmade(self) -> Path:
+        """A description that names no code."""
+        folder = self.root / "unmade"
+        folder.mkdir()
+        lines = (self.template / "policy.yaml").read_text().splitlines(keepends=True)
+        (folder / "policy.yaml").write_text("".join(line for line in lines if not line.startswith("source:")))
+        return folder
+
     def teacher(self, *swaps: tuple[str, str, str]) -> Line:
         return self.line("--teacher", self.source(*swaps), "--trust", self.root / "changed")
 
@@ -232,7 +240,10 @@ ROWS = [
         lambda at: at.unwritable("vlatool.training.report.write_reports")),
     # ---- the teacher
     Row("no such teacher", "No bundle at", 3, lambda at: at.line("--teacher", at.root / "none")),
-    Row("a teacher that is no bundle", "is not a bundle", 3, lambda at: at.line("--teacher", at.template)),
+    Row("a teacher that is no bundle", "is not a bundle", 3, lambda at: at.line("--teacher", at.place)),
+    Row("a teacher that is a policy without a factory", "names no factory", 3,
+        lambda at: at.line("--teacher", at.unmade())),
+    Row("a processor asked to be a GPU", "this torch finds no GPU", 3, lambda at: at.line("--device", "cuda")),
     Row("the student as its teacher", "is the student itself", 3, lambda at: at.line("--teacher", at.pruned.path)),
     Row("a damaged teacher", "has 1 bytes; the manifest says", 3,
         lambda at: at.line("--teacher", at.copied("module/main.safetensors", b"0"))),

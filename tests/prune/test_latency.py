@@ -31,6 +31,7 @@ from vlatool.report import Measurement
 from vlatool.runtime import load
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, build_stage
+from vlatool.stage.controls import predicted_for
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}
@@ -182,6 +183,11 @@ def test_unknown_boards_and_engines_are_refused(options: dict[str, str], says: s
     assert LatencyPruning(target_ms=1, chosen="[]", **options), "what was chosen needs no board"
 
 
+def test_an_empty_choice_is_refused(deep: Bundle):
+    with pytest.raises(RecipeError, match="--chosen is an empty list: nothing would be pruned"):
+        LatencyPruning(target_ms=1, chosen="[]").change(load_modules(deep), deep, Context())
+
+
 def test_threads_are_not_predicted():
     with pytest.raises(RecipeError, match="--threads is of measurements on this machine"):
         LatencyPruning(target_ms=1, board="pi5", threads=2)
@@ -206,11 +212,12 @@ def test_a_target_on_a_board_is_met_by_predictions_and_made_again_without(
     stage = build_stage("prune.latency", {"target_ms": target, "board": "nuc13", **FINE})
     pruned = run_transform(stage, deep, tmp_path / "out", Context())
     assert 0.96 * target <= Counted(deep).ms(read_edits(pruned)) <= target
-    assert re.match(
-        r"predicted, not measured: .* ms or up to 4% less on nuc13; .* --profile nuc13", stage.lines(pruned)[-1]
-    )
+    assert re.fullmatch(r"predicted, not measured: .* ms or up to 4% less on nuc13", stage.lines(pruned)[-1])
     assert pruned.manifest.made_by["options"]["board"] == "intel-nuc-13-pro"
     exported = run_transform(ExportOnnx(), pruned, tmp_path / "onnx", Context())
+    (told,) = predicted_for(exported)
+    assert told.startswith("prune.latency chose what stays by predictions for intel-nuc-13-pro (target ")
+    assert predicted_for(deep) == ()
     monkeypatch.setattr(latency, "BoardClock", None)
     assert rebuild(exported, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
 

@@ -79,7 +79,7 @@ def board_summary(bundle: Bundle, source: Bundle | None, profile: Profile, conte
         with _noting(missing, "the actions were not compared with the source's"):
             error = _error(bundle, source, context)
     else:
-        missing.append(f"nothing is predicted for {profile.name} before the export")
+        missing.append(f"predicted for {profile.name} once it is exported: vlatool export --profile {profile.name}")
     before = source.graph_bytes if source is not None and source.manifest.graphs else None
     return BoardSummary(profile.name, before, bundle.graph_bytes, numbers, error, tuple(missing))
 

@@ -86,6 +86,7 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         options = {name: arguments.pop(name) for name in own}
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
         built = validated(stage, chosen, f"vlatool {stage.kind()} {registry_name(stage)}")
+        built = built.named()
         if measures:
             _run.measure(typing.cast(Measure, built), **arguments)
         else:

@@ -22,6 +22,9 @@ from vlatool.runtime.policy import FIRST_RUN_S
 from vlatool.runtime.probe import probe as try_once
 from vlatool.stage.controls import controls
 
+LONG = 120
+"""Characters of an option of a build record that are shown."""
+
 
 def inspect(
     bundle: BundlePath,
@@ -110,9 +113,14 @@ def _tensor(tensor: TensorSpec) -> str:
     return f"{tensor.name}: {kind}{tensor.dtype} {shape}{labels} {rest}".rstrip()
 
 
+def _short(value: str) -> str:
+    """Return a value, of a long one its beginning: what a stage chose may be a list of thousands of units."""
+    return value if len(value) <= LONG else f"{value[: LONG - 20]}… ({len(value)} characters)"
+
+
 def _lineage(manifest: Manifest) -> list[str]:
     made_by: dict[str, Any] = manifest.made_by
-    options = " ".join(f"{key}={value}" for key, value in made_by.get("options", {}).items())
+    options = " ".join(f"{key}={_short(str(value))}" for key, value in made_by.get("options", {}).items())
     versions = ", ".join(f"{key} {value}" for key, value in made_by.get("versions", {}).items())
     lines = [f"  made by    {made_by.get('stage', '?')} {options}".rstrip()]
     lines += [f"  with       vlatool {made_by.get('vlatool', '?')}{', ' + versions if versions else ''}"]

@@ -125,7 +125,8 @@ def _contended(measured: Measured, job: LatencyJob) -> Iterator[Finding]:
         yield Finding(
             "suspect",
             f"other work took the processor from the measurement {switches:.0f} times in a second",
-            "stop it, or keep processors free for the run: --pin; ratios within the run still compare",
+            "stop it, or keep processors free for the run (taskset, or benchmark --pin); ratios within the "
+            "run still compare",
         )
     stolen = measured.telemetry.counters.get("process.machine_steal") if measured.telemetry else None
     seconds = stolen.seconds * (measured.host.get("cores") or 1) if stolen else 0.0

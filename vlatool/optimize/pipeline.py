@@ -39,7 +39,7 @@ from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context, Tell
-from vlatool.stage.controls import controls
+from vlatool.stage.controls import controls, predicted_for
 from vlatool.stage.finish import reseal
 from vlatool.stage.run import cached_measure, cached_transform
 from vlatool.user_code import children
@@ -125,7 +125,8 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     judged, trust = judged_rows(plan, rows, {name: engine_of(bundle) for name, bundle in bundles.items()})
     tables = {**trials, **tried, **_explained(judged, bundles, baseline, context)}
     judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
-    notes = (*notes, *(f"{name}: {line}" for name, bundle in bundles.items() for line in controls(bundle)))
+    told = ((name, (*controls(bundle), *predicted_for(bundle))) for name, bundle in bundles.items())
+    notes = (*notes, *(f"{name}: {line}" for name, lines in told for line in lines))
     report = report_of(plan, baseline, bundles, judged, failures, notes, trust, context.command)
     chosen = chosen_of(judged).row
     _write_bundle(plan, chosen, bundles.get(chosen.name, baseline), draft)

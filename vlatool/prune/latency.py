@@ -116,10 +116,7 @@ class LatencyPruning(ModuleStage):
 
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return how large the modules are, and what was not measured."""
-        predicted = (
-            f"predicted, not measured: {self.target_ms:g} ms or up to {CLOSE:.0%} less on {self.board}; for the range: "
-            f"vlatool export --profile {self.board}"
-        )
+        predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {CLOSE:.0%} less on {self.board}"
         return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
@@ -131,7 +128,7 @@ class LatencyPruning(ModuleStage):
             DataError: when the latency is not met: it changes from run to run.
         """
         if self.chosen:
-            return Changed(edits_from(self.chosen, "--chosen"))
+            return Changed(_edits_chosen(self.chosen))
         if self.board:
             self._predict_whole(source, context)
         context.tell("tracing the policy", None)
@@ -212,6 +209,19 @@ class LatencyPruning(ModuleStage):
 
     def _is_met(self, ms: float) -> bool:
         return (1 - CLOSE) * self.target_ms <= ms <= self.target_ms
+
+
+def _edits_chosen(text: str) -> tuple[Edit, ...]:
+    """Return the edits that an earlier run chose; there are some.
+
+    Raises:
+        SourceError: when the text is no list of edits.
+        RecipeError: when it is an empty one.
+    """
+    edits = edits_from(text, "--chosen")
+    if not edits:
+        raise RecipeError("--chosen is an empty list: nothing would be pruned.", "leave it out: it is chosen anew")
+    return edits
 
 
 @dataclass(frozen=True, order=True)

@@ -125,6 +125,10 @@ class Stage(Numeric):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Raise a user error when this stage cannot run on that source; cheap."""
 
+    def named(self) -> Self:
+        """Allow the code of policies that the options name to run: the user typed them. Not of a file's options."""
+        return self
+
     def inputs(self) -> tuple[Path, ...]:
         """Files outside the source whose content changes the result; part of the cache key."""
         return ()

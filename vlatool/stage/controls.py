@@ -1,10 +1,12 @@
-"""Bundles that were made to show what something is worth, not to be used."""
+"""What a reader of a bundle's numbers should know of how it was made: as a control, or by predictions."""
 
 from __future__ import annotations
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.stage.finish import history
 
+BOARD = "board"
+"""Option of a stage that predicts instead of measuring."""
 OPTION = "control"
 """Option of a stage that says so, whatever it is but ``none``, its default."""
 
@@ -15,3 +17,13 @@ def controls(bundle: Bundle) -> tuple[str, ...]:
     return tuple(
         f"a control, not for a robot: {stage} was run with --{OPTION} {value}" for stage, value in named if value
     )
+
+
+def predicted_for(bundle: Bundle) -> tuple[str, ...]:
+    """Return a sentence for each stage of a bundle's build record that chose by what is predicted for a board."""
+    named = ((entry["stage"], entry.get("options", {})) for entry in history(bundle))
+    return tuple(
+        f"{stage} chose what stays by predictions for {options[BOARD]} (target {options['target_ms']:g} ms), not by "
+        "measurements"
+        for stage, options in named if options.get(BOARD) and "target_ms" in options
+    )  # fmt: skip

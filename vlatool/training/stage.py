@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from vlatool.bundle.bundle import REPORTS, Bundle
+from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.work import forget, work_directory
 from vlatool.machine import host
+from vlatool.module.description import description_file
 from vlatool.module.edits import is_changed
 from vlatool.module.stage import TRAINING, Changed, ModuleStage
 from vlatool.stage.base import Context, source_of
@@ -28,11 +29,13 @@ from vlatool.training.report import write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Lesson, Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
-from vlatool.training.teacher import Teacher
+from vlatool.training.teacher import Teacher, check_teacher, teacher_source
 from vlatool.training.yielded import rows_asked
+from vlatool.user_code import trust
 
 if TYPE_CHECKING:
     from torch import nn
+    from typing_extensions import Self
 
     from vlatool.hardware.profile import Profile
 
@@ -53,7 +56,7 @@ class TrainingStage(ModuleStage):
     """Whether a policy that is as its factory makes it has nothing to learn."""
     trains: ClassVar[bool] = True
     teacher: Path | None = Field(
-        None, description="source bundle of the teacher; the policy before any edit when empty"
+        None, description="the teacher: a policy, or its source bundle; the policy before any edit when empty"
     )
     steps: int = Field(1500, ge=1, description="updates of the weights")
     batch: int = Field(256, ge=1, description="observations in an update")
@@ -82,12 +85,30 @@ class TrainingStage(ModuleStage):
     )
 
     def inputs(self) -> tuple[Path, ...]:
-        """The teacher's manifest."""
-        return (self.teacher / "manifest.json",) if self.teacher else ()
+        """The teacher's manifest, or all that it is made of where it is a policy."""
+        if self.teacher is None:
+            return ()
+        source = teacher_source(self.teacher)
+        return (self.teacher / MANIFEST,) if source is None else source.inputs()
+
+    def key(self, source_hash: str) -> str:
+        """Return the cache key, with that of a teacher that is a policy: it knows its large weights."""
+        teacher = teacher_source(self.teacher) if self.teacher else None
+        return super().key(f"{source_hash} {teacher.key('')}" if teacher else source_hash)
+
+    def named(self) -> Self:
+        """Allow the code of a teacher that is a policy to run in this process: the user named its folder."""
+        if self.teacher and teacher_source(self.teacher):
+            trust.name(description_file(self.teacher).parent, None if self.teacher.is_dir() else self.teacher)
+        return self
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """No episode of the training is one of the evaluation's, and the teacher is another policy."""
         super().check(source, profile)
+        if self.device == "cuda":
+            device_of(self.device, self.precision, self.processes)
+        if self.teacher:
+            check_teacher(self.teacher)
         parts = self.processes * self.accumulate
         if self.batch < parts:
             raise RecipeError(

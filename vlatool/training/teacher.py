@@ -7,17 +7,66 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vlatool.bundle.bundle import ASSETS, Bundle
+from vlatool.bundle.bundle import ASSETS, MANIFEST, Bundle
 from vlatool.bundle.spec import TensorSpec
-from vlatool.errors import RecipeError, SourceError
+from vlatool.errors import BundleError, RecipeError, SourceError
+from vlatool.machine import host
 from vlatool.module.batched import BatchedProgram
+from vlatool.module.description import description_file
 from vlatool.module.edits import Edit, read_edits
 from vlatool.module.origin import origin_of
 from vlatool.module.torch_policy import load_modules, unedited_modules
 from vlatool.runtime.statistics import load_normaliser
+from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.run import cached_transform
+from vlatool.user_code import trust
 
 if TYPE_CHECKING:
     from torch import nn
+
+SOURCE = "sources.torch_module"
+TEACHES = "name a policy (a folder with a policy.yaml), or a bundle that vlatool prune or distill wrote"
+
+
+def teacher_source(path: Path) -> Transform | None:
+    """Return the stage that reads a teacher which is a policy, with a ``policy.yaml``; None where it is a bundle."""
+    if (path / MANIFEST).is_file() or not description_file(path).is_file():
+        return None
+    stage = build_stage(SOURCE, {"policy": path})
+    return stage if isinstance(stage, Transform) else None
+
+
+def teacher_bundle(path: Path) -> Bundle:
+    """Return the source bundle of a teacher; that of a policy is made in the cache.
+
+    Raises:
+        BundleError: when there is none.
+        SourceError: when it is a policy whose folder was neither named nor trusted.
+    """
+    stage = teacher_source(path)
+    if stage is None:
+        return Bundle.open(path)
+    trust.require(description_file(path).parent, "the code of the teacher")
+    stage.check(None, None)
+    return cached_transform(stage, None, host.cache_directory(), Context())
+
+
+def check_teacher(path: Path) -> None:
+    """Refuse a teacher that is not there, before anything is made for it to teach.
+
+    Raises:
+        BundleError: when it is neither a bundle nor a policy.
+        SourceError: as ``teacher_bundle``, and for a policy that is wrong.
+    """
+    stage = teacher_source(path)
+    if stage is not None:
+        trust.require(description_file(path).parent, "the code of the teacher")
+        stage.check(None, None)
+        return
+    try:
+        Bundle.described(path)
+    except BundleError as error:
+        raise BundleError(f"The teacher cannot be opened: {error.message}", TEACHES) from error
 
 
 @dataclass(frozen=True)
@@ -40,7 +89,7 @@ class Teacher:
 
         Args:
             student: The student's bundle.
-            path: The teacher's bundle; what the student was before any edit when None.
+            path: The teacher's bundle, or its policy; what the student was before any edit when None.
             modules: The student's, which the teacher's must not share weights with.
 
         Raises:
@@ -49,7 +98,7 @@ class Teacher:
         """
         bundle, edits = student, tuple[Edit, ...]()
         if path is not None:
-            bundle = Bundle.open(path)
+            bundle = teacher_bundle(path)
             if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
                 raise RecipeError(
                     f"{path} has no torch modules that could teach: it is exported, or an ONNX file.",
