@@ -48,5 +48,27 @@ def test_candidates_are_pruned_trained_exported_and_quantized(policy_dir: Path, 
     assert page.count("Loss of smaller: distill.policy") == 2, "for a screen and a phone"
 
 
+@pytest.mark.parametrize("listens", [True, False])
+def test_what_was_trained_is_told_the_wrong_instruction(listens: bool, policy_dir: Path, tmp_path: Path):
+    """Beside float32, on the first of the same seeds; nothing is said where the environment knows no wrong one."""
+    if not listens:
+        code = policy_dir / "environment.py"
+        code.write_text(code.read_text().replace('make(task="reach", instruction="right")', 'make(task="reach")')
+                        .replace("Environment(task, instruction)", 'Environment(task, "right")'))  # fmt: skip
+    (tmp_path / "recipe.yaml").write_text(json.dumps({"schema": 1, "candidates": STAGES, "search": False}))
+    limits = ["--max-drop", "90%", "--episodes", "30", "--iterations", "20"]
+    run("optimize", str(policy_dir), "--recipe", str(tmp_path / "recipe.yaml"), "-o", str(tmp_path / "out"), *limits)
+    rows = {row["name"]: row for row in json.loads((tmp_path / "out/reports/report.json").read_text())["rows"]}
+    (teacher,) = rows["smaller"]["details"]["training: distill.policy, and its teacher"]
+    if not listens:
+        assert "with the wrong instruction" not in teacher
+        return
+    assert teacher["with the wrong instruction"] == "30.0% of 20 episodes succeed (float32: 30.0%)"
+    told = next(item for item in rows["smaller"]["measurements"] if item["name"] == "success_wrong_instruction")
+    assert (told["samples"], told["low"] < 0.3 < told["high"]) == (20, True)
+    assert [name for name, row in rows.items() if "success_wrong_instruction" in str(row)] == ["smaller"]
+    assert teacher["with the wrong instruction"] in (tmp_path / "out/reports/report.html").read_text()
+
+
 def number(row: dict[str, Any], name: str) -> float:
     return next(item["value"] for item in row["measurements"] if item["name"] == name)

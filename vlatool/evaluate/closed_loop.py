@@ -96,10 +96,15 @@ class ClosedLoop(Measure):
 
     def controls(self) -> list[ClosedLoop]:
         """Return the evaluations that show what succeeds by chance, on the first of the same seeds."""
-        episodes = min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))
-        return [
-            self.model_copy(update={"control": control, "episodes": episodes, "baseline": None}) for control in CONTROLS
-        ]
+        less = {"episodes": self._few(), "baseline": None}
+        return [self.model_copy(update={"control": control, **less}) for control in CONTROLS]
+
+    def told_wrong(self) -> ClosedLoop:
+        """Return the evaluation of as many episodes in which the policy is told the wrong instruction."""
+        return self.model_copy(update={"instruction": "wrong", "episodes": self._few(), "baseline": None})
+
+    def _few(self) -> int:
+        return min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))
 
     def _may_run(self, job: EpisodesJob) -> None:
         """Let the environment's code run where it was named in the options; what a bundle names must be trusted.

@@ -9,6 +9,7 @@ from pathlib import Path
 from vlatool.accuracy.paired import compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import EVALUATION
+from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded, carries_recordings
 from vlatool.report import Measurement, Row
@@ -69,6 +70,21 @@ def unjudged(baseline: Bundle, loop: ClosedLoop | None, cache: Path, context: Co
     if not is_recorded(baseline, loop):
         return ()
     return cached_measure(Recorded(), baseline, cache, context).warnings
+
+
+def told_wrong(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Context) -> Measurement | None:
+    """Return how often a policy succeeds that is told the wrong instruction: one that listens hardly does.
+
+    None without episodes, for a policy that takes no text, and in an environment that knows no wrong instruction.
+    """
+    if loop is None or not any(tensor.kind == "text" for tensor in bundle.manifest.spec.inputs):
+        return None
+    context.tell("episodes with the wrong instruction", None)
+    try:
+        rate = cached_measure(loop.told_wrong(), bundle, cache, context).rows[-1].get("success")
+    except (DataError, SourceError):  # it played the right one: what it cannot do is another
+        return None
+    return rate and replace(rate, name="success_wrong_instruction")
 
 
 def _joined(row: Row, played: Row) -> Row:

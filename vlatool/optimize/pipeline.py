@@ -8,7 +8,7 @@ asked), ``budget``, ``plan`` (checked before anything runs), ``search`` (further
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.choice import choose, chosen_of
 from vlatool.optimize.choice_apart import choose_apart
-from vlatool.optimize.evidence import is_recorded, unjudged, with_accuracy
+from vlatool.optimize.evidence import is_recorded, told_wrong, unjudged, with_accuracy
 from vlatool.optimize.judge import Judged, judge
 from vlatool.optimize.made import candidate, chain
 from vlatool.optimize.plan import BASELINE, Plan, make_plan, transforms
@@ -34,7 +34,7 @@ from vlatool.optimize.recipe import Pruning, Recipe, StageList
 from vlatool.optimize.search import Search
 from vlatool.optimize.summary import report_of
 from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, placed
-from vlatool.optimize.trained import trainings, with_trainings
+from vlatool.optimize.trained import trainings, with_trainings, with_wrong_instruction
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -122,6 +122,8 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     bundles, failures, trained = _candidates(plan, source, baseline, context)
     rows, notes = _measured(plan, source, {BASELINE: baseline, **bundles}, context)
     rows = {name: with_trainings(row, trained.get(name, ())) for name, row in rows.items()}
+    taught = [name for name in trained if trained[name]]
+    rows = _told_wrong(plan, rows, {BASELINE: baseline, **bundles}, taught, context)
     judged, trust = judged_rows(plan, rows, {name: engine_of(bundle) for name, bundle in bundles.items()})
     tables = {**trials, **tried, **_explained(judged, bundles, baseline, context)}
     judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
@@ -187,6 +189,18 @@ def _candidates(
     if not bundles:
         raise RecipeError("No candidate could be made: " + "; ".join(f"{row.name}: {row.reason}" for row in failures))
     return bundles, failures, trained
+
+
+def _told_wrong(
+    plan: Plan, rows: dict[str, Row], bundles: Mapping[str, Bundle], trained: Sequence[str], context: Context
+) -> dict[str, Row]:
+    """Add what candidates that were trained do when they are told the wrong instruction, and float32 beside them."""
+    played = {
+        name: told_wrong(bundles[name], plan.closed_loop, plan.cache, context)
+        for name in ((BASELINE, *trained) if trained else ())
+    }
+    added = {name: with_wrong_instruction(rows[name], played[name], played[BASELINE]) for name in trained}
+    return {**rows, **added}
 
 
 def _measured(

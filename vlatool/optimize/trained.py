@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.errors import DataError
-from vlatool.report import TRAINED, TRAINING_TIME, Row, read_report
+from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Row, read_report
 
 
 def trainings(stages: Iterable[Bundle]) -> tuple[Row, ...]:
@@ -19,6 +19,24 @@ def trainings(stages: Iterable[Bundle]) -> tuple[Row, ...]:
         except DataError:  # beside the bundle, not of it: nothing else depends on it
             continue
     return tuple(rows)
+
+
+def with_wrong_instruction(row: Row, told: Measurement | None, reference: Measurement | None) -> Row:
+    """Return the row of a trained candidate with how often it succeeds when it is told the wrong instruction.
+
+    Args:
+        row: With what ``with_trainings`` adds.
+        told: The candidate's success; None where it is not known.
+        reference: That of float32.
+    """
+    if told is None or reference is None:
+        return row
+    said = f"{told.value:.1%} of {told.samples} episodes succeed (float32: {reference.value:.1%})"
+    teachers = {
+        name: [{**record, "with the wrong instruction": said} for record in records]
+        for name, records in row.details.items() if name.startswith(TRAINED) and name.endswith(TEACHER)
+    }  # fmt: skip
+    return replace(row, measurements=(*row.measurements, told), details={**row.details, **teachers})
 
 
 def with_trainings(row: Row, trained: Iterable[Row]) -> Row:

@@ -31,6 +31,7 @@ LABELS = {
     "mcnemar_p": "McNemar p",
     "success_drop": "success drop",
     "success_chance": "success by chance",
+    "success_wrong_instruction": "success with the wrong instruction",
     "skill_expert": "skill against a constant action",
     "variation": "variation of the actions",
     "relative_error": "relative error (L2)",
