@@ -43,6 +43,18 @@ def test_elements_that_do_not_vary_do_not_count() -> None:
     assert correlation(-still, still) == 0
 
 
+def test_the_rounding_of_an_element_that_happens_to_stand_still_counts_little() -> None:
+    """Otherwise it would outweigh seven that follow exactly."""
+    one, usual = random(24, 4, 2), np.ones((4, 2))
+    one[:, 3, 1] *= 1e-3
+    mine = one + 0.02 * random(24, 4, 2, seed=2)
+    assert correlation(mine, one) < 0.5
+    assert correlation(mine, one, usual) > 0.99
+    assert correlation(-mine, one, usual) < -0.99
+    assert correlation(np.zeros_like(one), one, usual) == 0
+    assert abs(correlation(random(24, 4, 2, seed=3), one, usual)) < 0.3
+
+
 def test_a_fresh_process_says_how_int8_follows_float32(job: PairJob) -> None:
     found = measure_agreement(job)
     assert [(each.kind, each.output) for each in found.followed] == [("drawn", "action")]

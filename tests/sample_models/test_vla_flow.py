@@ -46,6 +46,9 @@ def observations(exported: Bundle) -> list[dict[str, Any]]:
 @pytest.fixture
 def imported(monkeypatch: pytest.MonkeyPatch) -> Iterator[Imported]:
     """The sample's own modules, as its scripts import them; gone afterwards, for other folders have the same names."""
+    for folder in (FLOW, METAWORLD):
+        for file in folder.glob("*.py"):  # another policy's, left behind by whatever ran before
+            monkeypatch.delitem(sys.modules, file.stem, raising=False)
     before = set(sys.modules)
     monkeypatch.setattr(sys, "path", [str(FLOW), *sys.path])
     import flow_learning

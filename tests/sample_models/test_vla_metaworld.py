@@ -17,6 +17,9 @@ METAWORLD = Path(__file__).parents[2] / "sample_models/vla-metaworld"
 @pytest.fixture
 def imported(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
     """The sample's own modules, as its scripts import them; gone afterwards, for other folders have the same names."""
+    for folder in (METAWORLD,):
+        for file in folder.glob("*.py"):  # another policy's, left behind by whatever ran before
+            monkeypatch.delitem(sys.modules, file.stem, raising=False)
     before = set(sys.modules)
     monkeypatch.setattr(sys, "path", [str(METAWORLD), *sys.path])
     from batches import Batches, Budget

@@ -27,6 +27,9 @@ STILL = 1e-6
 """Spread of an element, as a share of its size, up to which it is said not to vary."""
 SEQUENCE = "consecutive"
 """Kind of the observations that policies which keep values answer in a row."""
+NEARLY_STILL = 0.1
+"""Share of an element's usual spread (over observations of all kinds, or of its statistics) that it counts by at least
+where it varies less: else the rounding of an element that happens to stand still would count as much as all motion."""
 CLOSE = 0.25
 """Largest relative difference of outputs that do not vary (as of the golden action)."""
 
@@ -97,7 +100,9 @@ def run_agreement(job: PairJob) -> Agreement:
         calls += _asked(policies, [replace(drawn, kind=SEQUENCE) for drawn in pool], job, afresh=False)[0]
     strays = [_strays(policy, calls, which, job.seed) for which, policy in enumerate(policies)]
     kinds = dict.fromkeys(call.kind for call in calls)
-    followed = [one for kind in kinds for one in _followed(policies, [call for call in calls if call.kind == kind])]
+    usual = {tensor.name: _usual(policies[0], tensor, calls) for tensor in policies[0].spec.outputs} if calls else {}
+    by_kind = ([call for call in calls if call.kind == kind] for kind in kinds)
+    followed = [one for alike in by_kind for one in _followed(policies, alike, usual)]
     return Agreement(tuple(followed), len(calls), strays[1], strays[0], skipped,
                      tuple(policy.golden_error for policy in policies),
                      tuple(policy.engine for policy in policies))  # fmt: skip
@@ -158,7 +163,17 @@ def _strays(policy: Any, calls: Sequence[_Asked], which: int, seed: int) -> int:
     return answers.strays
 
 
-def _followed(policies: Sequence[Any], calls: Sequence[_Asked]) -> list[Followed]:
+def _usual(policy: Any, tensor: Any, calls: Sequence[_Asked]) -> Array:
+    """Return how much each element of an output varies: over all observations, or by its statistics if that is more."""
+    from vlatool.runtime.statistics import load_normaliser
+
+    values = _physical(policy, tensor.name, [call.outputs[0][tensor.name] for call in calls])
+    spread = values.std(axis=0)
+    normaliser = None if tensor.kind == "discrete" else load_normaliser(tensor, policy.bundle.path / "assets")
+    return np.asarray(spread if normaliser is None else np.maximum(spread, np.abs(normaliser.scale)))
+
+
+def _followed(policies: Sequence[Any], calls: Sequence[_Asked], usual: Mapping[str, Array]) -> list[Followed]:
     kind, count = calls[0].kind, len(calls)
     followed = []
     for tensor in policies[0].spec.outputs:
@@ -166,7 +181,7 @@ def _followed(policies: Sequence[Any], calls: Sequence[_Asked]) -> list[Followed
             _physical(policy, tensor.name, [call.outputs[which][tensor.name] for call in calls])
             for which, policy in enumerate(policies)
         )
-        followed.append(Followed(kind, tensor.name, correlation(mine, theirs), count))
+        followed.append(Followed(kind, tensor.name, correlation(mine, theirs, usual[tensor.name]), count))
     return followed
 
 
@@ -182,10 +197,15 @@ def _physical(policy: Any, name: str, values: Sequence[Array]) -> Array:
     return wide if normaliser is None else np.asarray(normaliser.inverse(wide.astype(np.float32)))
 
 
-def correlation(mine: Array, theirs: Array) -> float:
+def correlation(mine: Array, theirs: Array, usual: Array | None = None) -> float:
     """Return how (N, ...) answers follow others, see ``Followed``; elements that do not vary do not count.
 
     Where none varies, 1 says that they are near each other and 0 that they are not.
+
+    Args:
+        mine: Answers that should follow.
+        theirs: Those that they should follow.
+        usual: (...), how much each element varies elsewhere: one that stands still here counts by its share of that.
     """
     if mine.shape != theirs.shape:
         return 0.0
@@ -196,7 +216,9 @@ def correlation(mine: Array, theirs: Array) -> float:
     if not varied.any():
         near = float(np.linalg.norm(mine - theirs)) <= CLOSE * (float(np.linalg.norm(theirs)) or 1.0)
         return float(near)
-    one, two = ((values - values.mean(axis=0))[:, varied] / spread[varied] for values in (mine, theirs))
+    floor = np.zeros(spread.shape) if usual is None else NEARLY_STILL * usual.reshape(-1)
+    by = np.maximum(spread, floor)[varied]
+    one, two = ((values - values.mean(axis=0))[:, varied] / by for values in (mine, theirs))
     size = float(np.linalg.norm(one) * np.linalg.norm(two))
     return float((one * two).sum() / size) if size > 0 else 0.0
 
