@@ -79,7 +79,8 @@ class Row:
         raw: Series name -> raw samples in the order in which they were taken: ``latency_ms``, and ``at_s`` (the start
             of each call, seconds since the start of the run); ``telemetry.NAME`` and ``telemetry.NAME.at_s`` (a reading
             of the machine and its times); ``throttled_at_s`` (moments at which throttling was seen);
-            ``training: STAGE`` (the loss of each step).
+            ``training: STAGE`` (the loss of each step); of episodes ``success``, ``seed``, ``steps``, ``task`` and
+            ``instruction`` (places in the tables of details), ``motion.METRIC`` (NaN where it is not known).
         details: Tables that belong to the row: title -> list of {column: cell}.
     """
 
@@ -216,7 +217,15 @@ def _row(data: Mapping[str, Any]) -> Row:
         Measurement(**{**item, "value": math.nan if item["value"] is None else item["value"]})
         for item in data.get("measurements", ())
     ]
-    return Row(**{**data, "measurements": tuple(measurements)})
+    raw = {name: _series(values) for name, values in (data.get("raw") or {}).items()}
+    return Row(**{**data, "measurements": tuple(measurements), "raw": raw})
+
+
+def _series(values: Any) -> Any:
+    """Return samples with NaN where JSON has null."""
+    if not isinstance(values, list) or None not in values:
+        return values
+    return [math.nan if value is None else value for value in values]
 
 
 def without_nan(value: Any) -> Any:

@@ -88,7 +88,7 @@ class Box:
 
 def test_a_bare_observation_is_that_of_the_only_input():
     world = World(Box(), "any", ONE)
-    np.testing.assert_array_equal(world.reset(3)["state"], np.arange(4.0))
+    np.testing.assert_array_equal(world.reset(3)[0]["state"], np.arange(4.0))
     observation, over, _ = world.step(0)
     assert list(observation) == ["state"]
     assert over is True
@@ -97,9 +97,9 @@ def test_a_bare_observation_is_that_of_the_only_input():
 def test_a_plain_gymnasium_environment_is_played_by_a_policy_with_one_input():
     gymnasium = pytest.importorskip("gymnasium")
     world = World(gymnasium.make("CartPole-v1"), "CartPole-v1", ONE)
-    first = world.reset(3)["state"]
+    first = world.reset(3)[0]["state"]
     assert first.shape == (4,)
-    np.testing.assert_array_equal(world.reset(3)["state"], first)
+    np.testing.assert_array_equal(world.reset(3)[0]["state"], first)
     assert world.step(1)[1] is False
 
 
@@ -108,4 +108,4 @@ def test_a_reset_that_hides_its_parameters_is_believed():
         def reset(self, *given, **named):
             return Box.reset(self, **named)
 
-    assert list(World(Hidden(), "any", ONE).reset(1)) == ["state"]
+    assert list(World(Hidden(), "any", ONE).reset(1)[0]) == ["state"]

@@ -2,47 +2,105 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from vlatool.accuracy.moved import BY_INSTRUCTION, BY_TASK, MOTION, compare_motion
 from vlatool.errors import DataError
+from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import mcnemar_exact, paired_drop, wilson
+
+ABSENT = "unmeasured"
+"""The table of a row that says what could not be had."""
+MOST_INSTRUCTIONS = 64
+"""Wordings up to which each has a line in a table."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one episode ended: after ``steps`` control steps."""
+    """How one episode ended.
+
+    Args:
+        task: Of the environment.
+        seed: Of the reset.
+        success: Whether it succeeded.
+        steps: Control steps that it took.
+        instruction: What the policy was told; empty for one that takes no text.
+        motion: Metric of motion -> its number.
+        refused: What the environment told of the robot's body and could not be used -> why.
+    """
 
     task: str
     seed: int
     success: bool
     steps: int
+    instruction: str = ""
+    motion: Mapping[str, float] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
-    """Return the success rate with its Wilson interval, a row for each task, and every outcome."""
+    """Return the success rate with its Wilson interval, how it moves, tables by task and instruction, all outcomes."""
     wins = sum(outcome.success for outcome in outcomes)
     low, high = wilson(wins, len(outcomes))
     note = "closed loop, Wilson interval"
     rate = Measurement("success", wins / len(outcomes), "1", samples=len(outcomes), low=low, high=high, note=note)
+    tasks = _table("task", outcomes, lambda outcome: outcome.task)
+    told = sorted({outcome.instruction for outcome in outcomes})
     raw = {
         "success": [float(outcome.success) for outcome in outcomes],
         "seed": [float(outcome.seed) for outcome in outcomes],
         "steps": [float(outcome.steps) for outcome in outcomes],
+        "task": _places(tasks, "task", [outcome.task for outcome in outcomes]),
     }
-    return Row(name, role, measurements=(rate,), raw=raw, details={"success by task": _by_task(outcomes)})
+    raw |= {f"{MOTION}{name}": [outcome.motion.get(name, math.nan) for outcome in outcomes]
+            for name in metrics() if any(name in outcome.motion for outcome in outcomes)}  # fmt: skip
+    details = {BY_TASK: tasks}
+    if 1 < len(told) <= MOST_INSTRUCTIONS:
+        details[BY_INSTRUCTION] = _table("instruction", outcomes, lambda outcome: outcome.instruction)
+        asked = [outcome.instruction for outcome in outcomes]
+        raw["instruction"] = _places(details[BY_INSTRUCTION], "instruction", asked)
+    if refused := list(_refused(outcomes)):
+        details[ABSENT] = refused
+    return Row(name, role, measurements=(rate, *_moved(outcomes)), raw=raw, details=details)
 
 
-def _by_task(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+def _moved(outcomes: Sequence[Outcome]) -> Iterator[Measurement]:
+    """Yield the mean of each metric over the episodes that succeed."""
+    for name, metric in metrics().items():
+        values = [outcome.motion[name] for outcome in outcomes if outcome.success and name in outcome.motion]
+        if values and any(values):
+            mean = math.fsum(values) / len(values)
+            yield Measurement(name, mean, metric.unit, samples=len(values), note="mean of the episodes that succeed")
+
+
+def _refused(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
+    """Yield what environments told of the body and could not be used, with the most frequent reason."""
+    reasons = Counter((name, why) for outcome in outcomes for name, why in outcome.refused.items())
+    for name in dict.fromkeys(name for name, _ in reasons):
+        episodes = sum(name in outcome.refused for outcome in outcomes)
+        why = max((reason for reason in reasons if reason[0] == name), key=reasons.__getitem__)[1]
+        yield {"what": f"motion from info['{name}']", "why": f"{why} ({episodes} of {len(outcomes)} episodes)"}
+
+
+def _places(table: list[dict[str, Any]], column: str, values: Sequence[str]) -> list[float]:
+    """Return the place of each value in a table."""
+    places = {record[column]: float(place) for place, record in enumerate(table)}
+    return [places[value] for value in values]
+
+
+def _table(column: str, outcomes: Sequence[Outcome], key: Callable[[Outcome], str]) -> list[dict[str, Any]]:
     table = []
-    for task in dict.fromkeys(outcome.task for outcome in outcomes):
-        own = [outcome for outcome in outcomes if outcome.task == task]
+    for value in dict.fromkeys(map(key, outcomes)):
+        own = [outcome for outcome in outcomes if key(outcome) == value]
         wins = sum(outcome.success for outcome in own)
         low, high = wilson(wins, len(own))
         steps = sum(outcome.steps for outcome in own) / len(own)
-        cells = {"task": task, "success": round(wins / len(own), 4), "low": round(low, 4), "high": round(high, 4)}
+        cells = {column: value, "success": round(wins / len(own), 4), "low": round(low, 4), "high": round(high, 4)}
         table.append({**cells, "episodes": len(own), "mean steps": round(steps, 1)})
     return table
 
@@ -74,4 +132,5 @@ def compare_success(baseline: Row, row: Row) -> Row:
     difference = Measurement("success_drop", drop, "1", samples=len(pairs), low=low, high=high, note=note)
     table = [{"episodes": len(pairs), "lost": lost, "won": won, "drop": round(drop, 4), "McNemar exact p": round(p, 4)}]
     details = {**row.details, "paired with the baseline": table}
-    return replace(row, measurements=(*row.measurements, difference, test), details=details)
+    row = replace(row, measurements=(*row.measurements, difference, test), details=details)
+    return compare_motion(baseline, row)

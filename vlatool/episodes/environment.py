@@ -42,8 +42,8 @@ class World:
                 f"write reset(self, *, seed=None, options=None), as gymnasium has it; {GUIDE}",
             )
 
-    def reset(self, seed: int) -> Mapping[str, Any]:
-        """Begin an episode and return its first observation.
+    def reset(self, seed: int) -> tuple[Mapping[str, Any], Any]:
+        """Begin an episode and return its first observation, and its info.
 
         Raises:
             DataError: when it does not give an observation and an info.
@@ -54,7 +54,7 @@ class World:
                 f"reset() of {self._name} gives {_told(answer)}; it must give (observation, info).",
                 f"return observation, {{}}: that is gymnasium's interface, and no longer gym's; {GUIDE}",
             )
-        return self._observation(answer[0])
+        return self._observation(answer[0]), answer[1]
 
     def step(self, action: Any) -> tuple[Mapping[str, Any], bool, Any]:
         """Take an action; return the next observation, whether the episode is over, and the info.

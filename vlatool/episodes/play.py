@@ -12,16 +12,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from vlatool.accuracy.paired import Outcome
 from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import PolicySpec
+from vlatool.episodes.body import Body
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.environment import GUIDE, World
 from vlatool.episodes.frames import KeepingEncoder, Noisy
 from vlatool.errors import DataError, VlatoolError, require
 from vlatool.files.messages import from_json, to_json
-from vlatool.files.printable import message_of
+from vlatool.files.printable import message_of, one_line
 from vlatool.module.factory import call_factory, exits_caught
+from vlatool.motion.measure import measured
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context
@@ -30,6 +35,8 @@ from vlatool.user_code.children import spread
 SLICE = 10
 """Episodes of one task that a worker plays at a time."""
 STEP_LIMIT = 100_000
+LONGEST = 200
+"""Characters of an instruction that are kept."""
 EVALUATION_SEEDS = 5_000_000
 """First seed of the episodes that policies are judged by; those that they are trained on have smaller ones."""
 PRELOAD = ("numpy", "onnxruntime", __name__)
@@ -147,12 +154,16 @@ class Actor(Protocol):
 class BoundedQueue(ChunkQueue):
     """A queue whose policy is stopped when an inference takes longer than any that a robot could use."""
 
+    fresh = True
+    """Whether the last action was the first of a chunk."""
+
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step.
 
         Raises:
             UsageError, DataError, GraphError: as ``ChunkQueue.act`` does, and when an inference takes too long.
         """
+        self.fresh = not self._pending
         with self.policy.stopped_after(FIRST_RUN_S):
             return super().act(observation)
 
@@ -181,12 +192,13 @@ class Worker:
 
     def play(self, job: EpisodesJob, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
-        world = World(self.environment(job), job.task, self.queue.policy.spec)
+        spec = self.queue.policy.spec
+        world = World(self.environment(job), job.task, spec)
         actors = ((seed, self._actor(job, seed)) for seed in job.seeds)
         if not job.record:
-            return [_episode(world, actor, job.task, seed, limit) for seed, actor in actors]
+            return [_episode(world, actor, spec, job.task, seed, limit) for seed, actor in actors]
         with self._frames.kept(Path(job.record)):
-            return [_episode(world, actor, job.task, seed, limit) for seed, actor in actors]
+            return [_episode(world, actor, spec, job.task, seed, limit) for seed, actor in actors]
 
     def _actor(self, job: EpisodesJob, seed: int) -> Actor:
         """Return who acts: the policy, the policy with noise, or a control that does not look."""
@@ -239,18 +251,23 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
     _worker = None
 
 
-def _episode(world: World, queue: Actor, task: str, seed: int, limit: int) -> Outcome:
+def _episode(world: World, queue: Actor, spec: PolicySpec, task: str, seed: int, limit: int) -> Outcome:
     try:
         with exits_caught(f"the environment of task '{task}', at seed {seed},"):
-            observation = world.reset(seed)
+            observation, info = world.reset(seed)
             queue.reset()
-            success = Success()
+            success, body = Success(), Body(spec)
+            body.look(info)
+            told = told_to(observation, spec)
             for step in range(1, limit):
                 action = _acted(queue, observation, f"task '{task}' at seed {seed}, step {step},")
                 observation, over, info = world.step(action.item() if action.ndim == 0 else action)
                 success.look(info)
+                body.acted(action, getattr(queue, "fresh", True))
+                body.look(info)
                 if over:
-                    return Outcome(task, seed, success.at_the_end(task, seed), step)
+                    motion = measured(body.track())
+                    return Outcome(task, seed, success.at_the_end(task, seed), step, told, motion, body.refused)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: a user's environment may raise anything
@@ -258,6 +275,14 @@ def _episode(world: World, queue: Actor, task: str, seed: int, limit: int) -> Ou
             f"The environment of task '{task}' failed at seed {seed}: {type(error).__name__}: {message_of(error)}."
         ) from error
     raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.")
+
+
+def told_to(observation: Mapping[str, Any], spec: PolicySpec) -> str:
+    """Return the instruction of an observation; empty for a policy that takes no text, or several."""
+    texts = [tensor.name for tensor in spec.inputs if tensor.kind == "text"]
+    value = observation[texts[0]] if len(texts) == 1 and texts[0] in observation else ""
+    value = value[0] if isinstance(value, list | tuple | np.ndarray) and len(value) == 1 else value
+    return one_line(value, LONGEST) if isinstance(value, str) else ""
 
 
 def _acted(queue: Actor, observation: Mapping[str, Any], where: str) -> Array:

@@ -1,0 +1,159 @@
+"""How a variant moves, beside what it is held against: in the episodes in which both succeed, and by task."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.motion.measure import FEWEST, ratio_of
+from vlatool.report import Measurement, Row
+from vlatool.stats.intervals import paired_drop
+
+Array = NDArray[np.float64]
+MOTION = "motion."
+"""What the names of raw samples begin with that a metric of motion gave."""
+RATIO = "_ratio"
+STEPS = "steps_ratio"
+WORST = "worst_task_drop"
+SPEEDUP = "task_speedup"
+BY_TASK, BY_INSTRUCTION = "success by task", "success by instruction"
+AGAINST = {"task": "against the baseline, by task", "instruction": "against the baseline, by instruction"}
+CONFIDENCE = 0.95
+
+
+def compare_motion(baseline: Row, row: Row) -> Row:
+    """Return the row with how it moves as a multiple of the baseline, its worst task, and both by task.
+
+    Args:
+        baseline, row: Of ``success_row``, of the same episodes.
+    """
+    pairs = _Pairs(baseline, row)
+    tables = {title: table for key, title in AGAINST.items() if (table := pairs.table(key))}
+    found = (*pairs.ratios(), *pairs.steps(), *pairs.worst())
+    return replace(row, measurements=(*row.measurements, *found), details={**row.details, **tables})
+
+
+def with_task_speedup(row: Row) -> Row:
+    """Return the row with how many times as fast it does its task: its speed-up by the ratio of its steps.
+
+    A policy that answers in half of the time and needs twice as many steps is done no sooner, where the control loop
+    waits for its answers.
+    """
+    speed, steps = row.get("speedup"), row.get(STEPS)
+    if speed is None or steps is None or not steps.value or None in (speed.low, speed.high, steps.low, steps.high):
+        return row
+    low, high = (speed.low or 0.0) / max(steps.high or 0.0, 1e-9), (speed.high or 0.0) / max(steps.low or 0.0, 1e-9)
+    note = "speed-up of an inference / ratio of steps, failures at full length"
+    task = Measurement(SPEEDUP, speed.value / steps.value, "x", samples=steps.samples, low=low, high=high, note=note)
+    return replace(row, measurements=(*row.measurements, task))
+
+
+def ratio_names(row: Row) -> list[str]:
+    """Return the metrics of motion that a row has a ratio of, by name."""
+    ends = (item.name for item in row.measurements if item.name.endswith(RATIO) and item.name != STEPS)
+    return [name.removesuffix(RATIO) for name in ends]
+
+
+def _ratio(name: str, ratio: tuple[float, float, float], count: int, note: str) -> Measurement:
+    value, low, high = ratio
+    known = np.isfinite(high)
+    return Measurement(
+        name, value, "x", samples=count, low=low if known else None, high=high if known else None, note=note
+    )
+
+
+class _Pairs:
+    """Two rows, episode by episode."""
+
+    def __init__(self, baseline: Row, row: Row) -> None:
+        self._rows = baseline, row
+        self._wins = tuple(self._of(one, "success") > 0 for one in self._rows)
+        self._both = self._wins[0] & self._wins[1]
+        self._places = {key: self._of(row, key).astype(int) for key in AGAINST if key in row.raw}
+        titles = {"task": BY_TASK, "instruction": BY_INSTRUCTION}
+        self._names = {key: [str(record[key]) for record in row.details[titles[key]]] for key in self._places}
+        self._metrics = sorted(
+            name.removeprefix(MOTION) for name in row.raw if name.startswith(MOTION) and name in baseline.raw
+        )
+
+    def ratios(self) -> Iterator[Measurement]:
+        """Yield the ratio of each metric in the episodes in which both succeed, the worst task named."""
+        for name in self._metrics:
+            own, base, known = self._values(name)
+            if not known.any() or not (own[known].any() or base[known].any()):
+                continue
+            if (ratio := ratio_of(own[known], base[known])) is None:
+                continue
+            note = f"of the means of {known.sum()} episodes in which both succeed{self._worst_of(own, base, known)}"
+            yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note)
+
+    def steps(self) -> Iterator[Measurement]:
+        """Yield the ratio of the steps of all episodes; one that fails counts as long as the longest of its task."""
+        steps = [self._of(one, "steps") for one in self._rows]
+        if "task" not in self._places:
+            return
+        longest = np.zeros(len(steps[0]))
+        for place in range(len(self._names["task"])):
+            own = self._places["task"] == place
+            longest[own] = max(one[own].max() for one in steps)
+        base, own = (np.where(won, one, longest) for won, one in zip(self._wins, steps, strict=True))
+        if ratio := ratio_of(own, base):
+            yield _ratio(STEPS, ratio, len(own), "steps of all episodes, failures at full length")
+
+    def worst(self) -> Iterator[Measurement]:
+        """Yield the drop of the task that loses most, with an interval that allows for the choice (Bonferroni)."""
+        if len(self._names.get("task", ())) < 2:
+            return
+        drops = [(self._drop(self._places["task"] == place, len(self._names["task"])), name)
+                 for place, name in enumerate(self._names["task"])]  # fmt: skip
+        ((value, low, high), count), name = max(drops, key=lambda item: item[0][0][0])
+        note = f"{name}, the worst of {len(drops)} tasks"
+        yield Measurement(WORST, value, "1", samples=count, low=low, high=high, note=note)
+
+    def table(self, key: str) -> list[dict[str, Any]]:
+        """Return how each task, or instruction, does and moves, that which loses most first."""
+        records = []
+        for place, name in enumerate(self._names.get(key, ())):
+            own = self._places[key] == place
+            (value, low, high), count = self._drop(own)
+            before, after = (float(won[own].mean()) for won in self._wins)
+            record = {key: name, "episodes": count, "baseline": round(before, 4), "success": round(after, 4)}
+            record |= {"drop": round(value, 4), "low": round(low, 4), "high": round(high, 4)}
+            records.append(record | self._ratios_of(own))
+        return sorted(records, key=lambda record: -record["drop"]) if len(records) > 1 else []
+
+    def _ratios_of(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return metric -> ratio among some episodes."""
+        ratios: dict[str, Any] = {}
+        for name in self._metrics:
+            own, base, known = self._values(name)
+            known = known & chosen
+            if (own[known].any() or base[known].any()) and (ratio := ratio_of(own[known], base[known])):
+                ratios[f"{name.replace('_', ' ')}, x"] = round(ratio[0], 3)
+        return ratios
+
+    def _worst_of(self, own: Array, base: Array, known: NDArray[np.bool_]) -> str:
+        """Return the task whose ratio is the largest, as a part of a note; empty where there is one task alone."""
+        ratios = []
+        for place, name in enumerate(self._names.get("task", ())):
+            chosen = known & (self._places["task"] == place)
+            if chosen.sum() >= FEWEST and base[chosen].mean() > 0:
+                ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
+        return f"; most in {max(ratios)[1]}: {max(ratios)[0]:.3g}x" if len(ratios) > 1 else ""
+
+    def _drop(self, chosen: NDArray[np.bool_], of: int = 1) -> tuple[tuple[float, float, float], int]:
+        before, after = (won[chosen] for won in self._wins)
+        lost, won = int((before & ~after).sum()), int((after & ~before).sum())
+        return paired_drop(lost, won, len(before), 1 - (1 - CONFIDENCE) / of), len(before)
+
+    def _values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:
+        base, own = (self._of(one, f"{MOTION}{name}") for one in self._rows)
+        return own, base, self._both & np.isfinite(own) & np.isfinite(base)
+
+    @staticmethod
+    def _of(row: Row, name: str) -> Array:
+        return np.asarray(row.raw[name], np.float64)
