@@ -121,6 +121,37 @@ def test_a_latency_that_jumps_is_not_called_met(
         run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "out", Context())
 
 
+def test_other_programs_that_slow_all_down_do_not_move_the_target(
+    counted: None, deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    class Disturbed(Counted):
+        def times(self, pruned: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
+            whole, others = super().times(pruned)
+            slower = (1.0, 3.0, 1.4, 2.2, 1.8)[(self.runs - 1) % 5]
+            return slower * whole, [slower * ms for ms in others]
+
+    monkeypatch.setattr(latency, "Clock", Disturbed)
+    clock = Counted(deep)
+    target = 0.7 * clock.ms(())
+    pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
+    assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
+
+
+def test_one_round_that_was_held_up_is_corrected_by_the_next(
+    counted: None, deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    class HeldUp(Counted):
+        def times(self, pruned: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
+            whole, others = super().times(pruned)
+            return whole, [ms * (10.0 if self.runs == 2 else 1.0) for ms in others]
+
+    monkeypatch.setattr(latency, "Clock", HeldUp)
+    clock = Counted(deep)
+    target = 0.7 * clock.ms(())
+    pruned = run_transform(build_stage("prune.latency", {"target_ms": target, **FINE}), deep, tmp_path / "o", Context())
+    assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
+
+
 def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
     clock = Clock(deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
     whole, (shallow,) = clock.times([(Edit("main", "blocks", "blocks", (0,)),)])

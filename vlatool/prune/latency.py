@@ -45,6 +45,10 @@ AIM, CLOSE = 0.98, 0.04
 """The share of the asked latency that is aimed at, and how far below it a result may stay."""
 ROUNDS = 8
 """Of choosing and measuring, at most."""
+LEAST_GONE = 0.999
+"""Share of the latency of the whole policy that is left at most: something goes."""
+MOST_AT_ONCE = 1.5
+"""Factor by which a result may change what is aimed at: one that was disturbed is corrected by the next."""
 
 
 class LatencyPruning(ModuleStage):
@@ -189,17 +193,19 @@ class LatencyPruning(ModuleStage):
         whole, prices = measured_prices(groups, blocks, work, clock)
         self._refuse_met(whole)
         choice = _Choice(groups, blocks, work, prices, self.least)
-        goal, tried = AIM * self.target_ms, list[float]()
+        undisturbed, wanted, tried = whole, 1.0, list[float]()
         for number in range(ROUNDS):
-            edits = choice.until(whole, goal)
-            _, (ms,) = clock.times([edits])
+            goal = min(wanted * AIM * self.target_ms / undisturbed, LEAST_GONE) * whole
+            edits = choice.until(whole, goal, self.target_ms)
+            ms, undisturbed = _undisturbed(clock, edits, undisturbed)
             if self._is_met(ms):  # once may be luck
-                ms = (ms + clock.times([edits])[1][0]) / 2
+                again, undisturbed = _undisturbed(clock, edits, undisturbed)
+                ms = (ms + again) / 2
             tried.append(ms)
             context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
             if self._is_met(ms):
                 return edits
-            goal *= AIM * self.target_ms / ms
+            wanted *= min(MOST_AT_ONCE, max(1 / MOST_AT_ONCE, AIM * self.target_ms / ms))
         how, quiet = ("predicted", "") if self.board else ("measured", "let nothing else run meanwhile; ")
         raise DataError(
             f"The latency of {self.target_ms:g} ms was not met within {CLOSE:.0%}; {how}: "
@@ -209,6 +215,16 @@ class LatencyPruning(ModuleStage):
 
     def _is_met(self, ms: float) -> bool:
         return (1 - CLOSE) * self.target_ms <= ms <= self.target_ms
+
+
+def _undisturbed(clock: Clock, edits: Sequence[Edit], undisturbed: float) -> tuple[float, float]:
+    """Return what edits leave of the latency, and the least that the whole policy ever took, in ms.
+
+    Both take turns in one run, so that other programs slow both down: their ratio says what it is without them.
+    """
+    whole, (ms,) = clock.times([edits])
+    undisturbed = min(undisturbed, whole)
+    return ms / whole * undisturbed, undisturbed
 
 
 def _edits_chosen(text: str) -> tuple[Edit, ...]:
@@ -252,8 +268,13 @@ class _Choice:
         self._prices = [prices[role_of(group)] for group in groups]
         self._saved = [0.0] * len(groups)
 
-    def until(self, whole: float, goal: float) -> tuple[Edit, ...]:
+    def until(self, whole: float, goal: float, asked: float) -> tuple[Edit, ...]:
         """Take away what matters least for the milliseconds that it saves, from all of it, until so many are left.
+
+        Args:
+            whole: Milliseconds of the whole policy, when the prices were measured.
+            goal: Those that are to be left.
+            asked: What the user asked for, which ``goal`` is a correction of.
 
         Raises:
             RecipeError: when no more may go before.
@@ -269,7 +290,7 @@ class _Choice:
             fit = [offer for offer in offers if left - offer.ms >= (1 - CLOSE) * goal]
             if not offers:
                 raise RecipeError(
-                    f"No less than about {left:.3g} of {whole:.3g} ms can be reached; asked for {goal / AIM:.3g}.",
+                    f"No less than about {left * AIM * asked / goal:.3g} ms can be reached; asked for {asked:g}.",
                     "ask for more, or let less stay (--least); quantization makes it faster, too",
                 )
             offer = min(fit) if fit else min(offers, key=lambda offer: offer.ms)
