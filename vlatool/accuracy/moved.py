@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -37,6 +37,23 @@ def compare_motion(baseline: Row, row: Row) -> Row:
     return replace(row, measurements=(*row.measurements, *found), details={**row.details, **tables})
 
 
+def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = CONFIDENCE) -> dict[str, Measurement]:
+    """Return ``METRIC_ratio`` -> how a variant moves as a multiple of the baseline, in episodes in which both succeed.
+
+    Args:
+        baseline, row: Of ``success_row``, of the same episodes.
+        names: Metrics; those that the episodes do not have are left out.
+        confidence: Coverage of each interval.
+    """
+    found = _Pairs(baseline, row, confidence).ratios()
+    return {item.name: item for item in found if item.name.removesuffix(RATIO) in names}
+
+
+def drops_by_task(baseline: Row, row: Row, confidence: float = CONFIDENCE) -> dict[str, Measurement]:
+    """Return task -> how many more of its episodes fail, a share, each with an interval of that coverage."""
+    return _Pairs(baseline, row, confidence).drops()
+
+
 def with_task_speedup(row: Row) -> Row:
     """Return the row with how many times as fast it does its task: its speed-up by the ratio of its steps.
 
@@ -58,19 +75,17 @@ def ratio_names(row: Row) -> list[str]:
     return [name.removesuffix(RATIO) for name in ends]
 
 
-def _ratio(name: str, ratio: tuple[float, float, float], count: int, note: str) -> Measurement:
+def _ratio(name: str, ratio: tuple[float, float, float], count: int, note: str, confidence: float) -> Measurement:
     value, low, high = ratio
-    known = np.isfinite(high)
-    return Measurement(
-        name, value, "x", samples=count, low=low if known else None, high=high if known else None, note=note
-    )
+    ends = (low, high) if np.isfinite(high) else (None, None)
+    return Measurement(name, value, "x", samples=count, low=ends[0], high=ends[1], confidence=confidence, note=note)
 
 
 class _Pairs:
     """Two rows, episode by episode."""
 
-    def __init__(self, baseline: Row, row: Row) -> None:
-        self._rows = baseline, row
+    def __init__(self, baseline: Row, row: Row, confidence: float = CONFIDENCE) -> None:
+        self._rows, self._confidence = (baseline, row), confidence
         self._wins = tuple(self._of(one, "success") > 0 for one in self._rows)
         self._both = self._wins[0] & self._wins[1]
         self._places = {key: self._of(row, key).astype(int) for key in AGAINST if key in row.raw}
@@ -86,10 +101,10 @@ class _Pairs:
             own, base, known = self._values(name)
             if not known.any() or not (own[known].any() or base[known].any()):
                 continue
-            if (ratio := ratio_of(own[known], base[known])) is None:
+            if (ratio := ratio_of(own[known], base[known], self._confidence)) is None:
                 continue
             note = f"of the means of {known.sum()} episodes in which both succeed{self._worst_of(own, base, known)}"
-            yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note)
+            yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note, self._confidence)
 
     def steps(self) -> Iterator[Measurement]:
         """Yield the ratio of the steps of all episodes; one that fails counts as long as the longest of its task."""
@@ -102,24 +117,32 @@ class _Pairs:
             longest[own] = max(one[own].max() for one in steps)
         base, own = (np.where(won, one, longest) for won, one in zip(self._wins, steps, strict=True))
         if ratio := ratio_of(own, base):
-            yield _ratio(STEPS, ratio, len(own), "steps of all episodes, failures at full length")
+            yield _ratio(STEPS, ratio, len(own), "steps of all episodes, failures at full length", CONFIDENCE)
 
     def worst(self) -> Iterator[Measurement]:
         """Yield the drop of the task that loses most, with an interval that allows for the choice (Bonferroni)."""
-        if len(self._names.get("task", ())) < 2:
+        tasks = len(self._names.get("task", ()))
+        if tasks < 2:
             return
-        drops = [(self._drop(self._places["task"] == place, len(self._names["task"])), name)
-                 for place, name in enumerate(self._names["task"])]  # fmt: skip
-        ((value, low, high), count), name = max(drops, key=lambda item: item[0][0][0])
-        note = f"{name}, the worst of {len(drops)} tasks"
-        yield Measurement(WORST, value, "1", samples=count, low=low, high=high, note=note)
+        drops = self.drops(1 - (1 - self._confidence) / tasks)
+        name = max(drops, key=lambda task: drops[task].value)
+        yield replace(drops[name], name=WORST, note=f"{name}, the worst of {tasks} tasks")
+
+    def drops(self, confidence: float = 0.0) -> dict[str, Measurement]:
+        """Return task -> its drop, with an interval of a coverage; that of the pairs when 0."""
+        drops = {}
+        for place, name in enumerate(self._names.get("task", ())):
+            (value, low, high), count = self._drop(self._places["task"] == place, confidence or self._confidence)
+            drops[name] = Measurement(WORST, value, "1", samples=count, low=low, high=high,
+                                      confidence=confidence or self._confidence, note=name)  # fmt: skip
+        return drops
 
     def table(self, key: str) -> list[dict[str, Any]]:
         """Return how each task, or instruction, does and moves, that which loses most first."""
         records = []
         for place, name in enumerate(self._names.get(key, ())):
             own = self._places[key] == place
-            (value, low, high), count = self._drop(own)
+            (value, low, high), count = self._drop(own, self._confidence)
             before, after = (float(won[own].mean()) for won in self._wins)
             record = {key: name, "episodes": count, "baseline": round(before, 4), "success": round(after, 4)}
             record |= {"drop": round(value, 4), "low": round(low, 4), "high": round(high, 4)}
@@ -145,10 +168,10 @@ class _Pairs:
                 ratios.append((float(own[chosen].mean() / base[chosen].mean()), name))
         return f"; most in {max(ratios)[1]}: {max(ratios)[0]:.3g}x" if len(ratios) > 1 else ""
 
-    def _drop(self, chosen: NDArray[np.bool_], of: int = 1) -> tuple[tuple[float, float, float], int]:
+    def _drop(self, chosen: NDArray[np.bool_], confidence: float) -> tuple[tuple[float, float, float], int]:
         before, after = (won[chosen] for won in self._wins)
         lost, won = int((before & ~after).sum()), int((after & ~before).sum())
-        return paired_drop(lost, won, len(before), 1 - (1 - CONFIDENCE) / of), len(before)
+        return paired_drop(lost, won, len(before), confidence), len(before)
 
     def _values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:
         base, own = (self._of(one, f"{MOTION}{name}") for one in self._rows)

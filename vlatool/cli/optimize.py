@@ -43,6 +43,10 @@ Drop = Annotated[str | None, typer.Option(help="largest drop against float32: 1%
 Distance = Annotated[
     str | None, typer.Option(help="largest distance from float32's own actions, by their spread (25%)")
 ]
+Motion = Annotated[
+    str | None, typer.Option(help="largest growth of jerk, path and task time where both succeed, such as 5%")
+]
+WorstTask = Annotated[str | None, typer.Option(help="largest drop of the task that loses most, such as 3%")]
 Accept = Annotated[
     list[str] | None, typer.Option(help="overrule a finding of a candidate by its name (see: vlatool inspect)")
 ]
@@ -60,6 +64,8 @@ def optimize(
     profile: Board = None,
     max_drop: Drop = None,
     max_distance: Distance = None,
+    max_motion: Motion = None,
+    worst_task: WorstTask = None,
     hz: Annotated[float | None, typer.Option(min=0.001, help="inferences per second that the board must reach")] = None,
     max_latency_ms: Annotated[float | None, typer.Option(min=0.001, help="largest latency of one inference")] = None,
     max_memory_mb: Annotated[float | None, typer.Option(min=1, help="largest memory of the process")] = None,
@@ -98,7 +104,8 @@ def optimize(
         refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
     board = load_profile(profile) if profile else None
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
-    asked = _limits(max_drop, max_distance, accept, limits)
+    shares = {"max_distance": max_distance, "max_motion": max_motion, "worst_task": worst_task}
+    asked = _limits(max_drop, shares, accept, limits)
     effort = {"episodes": episodes, "iterations": iterations, "threads": threads}
     chosen = _recipe(recipe, source, board, asked, {name: value for name, value in effort.items() if value is not None})
     chosen = chosen.model_copy(update={"pruning": _pruning(chosen.pruning, trials, train_steps, study)})
@@ -119,7 +126,7 @@ def optimize(
 
 
 def _limits(
-    max_drop: str | None, max_distance: str | None, accept: list[str] | None, numbers: dict[str, float | None]
+    max_drop: str | None, shares: dict[str, str | None], accept: list[str] | None, numbers: dict[str, float | None]
 ) -> dict[str, Any]:
     """Return the limits that were given: field of ``Limits`` -> value.
 
@@ -127,7 +134,7 @@ def _limits(
         UsageError: for one that is not a number above 0, or not a drop or a share.
     """
     limits: dict[str, Any] = {} if max_drop is None else budget(max_drop)
-    limits |= {} if max_distance is None else {"max_distance": share(max_distance, "--max-distance")}
+    limits |= {name: share(text, f"--{name.replace('_', '-')}") for name, text in shares.items() if text is not None}
     for name, value in numbers.items():
         if value is not None and not math.isfinite(value):
             raise UsageError(f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.")

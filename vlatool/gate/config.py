@@ -7,12 +7,16 @@ from typing import Annotated
 
 from pydantic import AliasChoices, ConfigDict, Field, ValidationError, model_validator
 
+from vlatool import registry
 from vlatool.errors import RecipeError, require
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
 from vlatool.stats.percentiles import PERCENTILES
 from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES
 from vlatool.stats.signed_rank import fewest
+
+OF_EPISODES = ("motion", "task_time", "worst_task")
+"""Claims about the closed-loop episodes that the claim of accuracy names."""
 
 
 class _Claim(Numeric):
@@ -55,6 +59,34 @@ class AccuracyClaim(_Claim):
     data: Path | None = Field(None, description="recorded observations and actions; the baseline's own when not given")
     episodes: int = Field(0, ge=0, description="closed-loop episodes over all tasks; 0 for recorded observations alone")
     policy: Path | None = Field(None, description="directory of the policy.yaml that names environment and tasks")
+
+
+class MotionClaim(_Claim):
+    """The candidate moves no more roughly, and no farther, where both succeed (needs ``accuracy: episodes``)."""
+
+    margin: float = Field(0.1, ge=0, le=10, description="largest growth of each metric, a share (0.1 = 10 %)")
+    metrics: tuple[str, ...] = Field(
+        (), description="metrics of motion; paths and jerk of what the environment tells when empty, or action rate"
+    )
+
+    @model_validator(mode="after")
+    def _metrics_are_known(self) -> MotionClaim:
+        known = registry.names("motion")
+        if unknown := [name for name in self.metrics if name not in known]:
+            raise ValueError(f"there is no metric of motion {', '.join(unknown)}; allowed: {', '.join(known)}")
+        return self
+
+
+class TaskTimeClaim(_Claim):
+    """The candidate needs no more time for a task where both succeed (needs ``accuracy: episodes``)."""
+
+    margin: float = Field(0.05, ge=0, le=10, description="largest growth, a share (0.05 = 5 %)")
+
+
+class WorstTaskClaim(_Claim):
+    """No task loses more successes than a drop, however well others do (needs ``accuracy: episodes``)."""
+
+    max_drop: float = Field(0.03, ge=0, le=1, description="largest drop of any task, a share (0.03 = 3 points)")
 
 
 class AnswersClaim(_Claim):
@@ -101,12 +133,22 @@ class Gate(Numeric):
     memory: GrowthClaim | None = GrowthClaim(margin=0.1)
     size: GrowthClaim | None = GrowthClaim(margin=0.1)
     deadline: DeadlineClaim | None = None
+    motion: MotionClaim | None = None
+    task_time: TaskTimeClaim | None = None
+    worst_task: WorstTaskClaim | None = None
     accept: tuple[str, ...] = Field((), description="findings of the bundles that are overruled, by name")
 
     @model_validator(mode="after")
     def _something_is_claimed(self) -> Gate:
         if not any((self.latency, self.accuracy, self.answers, self.memory, self.size, self.deadline)):
             raise ValueError("every claim is null, so there is nothing to examine")
+        return self
+
+    @model_validator(mode="after")
+    def _episodes_are_played(self) -> Gate:
+        named = [name for name in OF_EPISODES if getattr(self, name) is not None]
+        if named and not (self.accuracy and self.accuracy.episodes):
+            raise ValueError(f"{', '.join(named)} is claimed of closed-loop episodes; name them (accuracy: episodes)")
         return self
 
     def to_yaml(self) -> str:

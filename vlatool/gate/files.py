@@ -36,6 +36,17 @@ memory:
 size:
   margin: 0.10         # graphs and assets on disk
 
+# These are about the episodes that accuracy names, where it names any:
+motion: null           # where both succeed, neither path nor jerk grows by more than the margin
+# motion:
+#   margin: 0.10
+task_time: null        # where both succeed, the task takes no longer
+# task_time:
+#   margin: 0.05
+worst_task: null       # no task loses more than so many points, however well the others do
+# worst_task:
+#   max_drop: 0.03
+
 deadline: null
 # deadline:            # a percentile below a deadline, with 99 % confidence, on the machine that runs the gate
 #   ms: 50

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from statistics import median
 from typing import Any
 
 from vlatool.accuracy.credibility import FAILS
 from vlatool.bundle.bundle import Bundle, hash_file
-from vlatool.gate.claims import accuracy, answers, deadline, growth, latency
+from vlatool.gate.claims import accuracy, answers, deadline, growth, latency, motion, task_time, worst_task
 from vlatool.gate.config import Gate, LatencyClaim
+from vlatool.gate.episodes import Episodes
 from vlatool.gate.inputs import AGREEMENT, Inputs
 from vlatool.gate.result import ClaimResult, worst
 from vlatool.gate.same import check
@@ -62,7 +63,9 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     if gate.memory:
         results.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
     if gate.accuracy:
-        results.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine))
+        episodes = Episodes(candidate, baseline, gate.accuracy, context, how.engine)
+        results.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine, episodes))
+        results += _of_episodes(episodes, gate)
     with Recorder(open_all(), PERIOD_S) as board:
         if gate.latency:
             results += latency.examine_all(timed, gate.latency)
@@ -78,6 +81,16 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     return Report(KIND, f"Gate of {name}", worst(result.verdict for result in results),
                   (*_summary(name, results), f"{inputs.told()}."), rows,
                   command=context.command, environment=host, validity=validity(seen), findings=seen)  # fmt: skip
+
+
+def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:
+    """Yield what the claims say that are about the closed-loop episodes."""
+    if gate.motion:
+        yield motion.examine(episodes, gate.motion)
+    if gate.task_time:
+        yield task_time.examine(episodes, gate.task_time)
+    if gate.worst_task:
+        yield worst_task.examine(episodes, gate.worst_task)
 
 
 def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:

@@ -31,14 +31,17 @@ def measured(track: Track) -> dict[str, float]:
     return {name: float(value) for name, value in values.items() if value is not None and abs(value) < LARGEST}
 
 
-def ratio_of(own: NDArray[np.float64], base: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """Return the ratio of the means of paired episodes, and its 95 % interval.
+def ratio_of(
+    own: NDArray[np.float64], base: NDArray[np.float64], confidence: float = CONFIDENCE
+) -> tuple[float, float, float] | None:
+    """Return the ratio of the means of paired episodes, and its interval.
 
     The interval is the basic percentile bootstrap of pairs (Efron and Tibshirani 1993, 13.3), with a fixed seed.
 
     Args:
         own: (N,) of the variant.
         base: (N,) of what it is held against, in the same episodes.
+        confidence: Coverage of the interval.
 
     Returns:
         Ratio, low, high; the ends are infinite apart for fewer than ``FEWEST`` pairs. 1 where both are 0 throughout;
@@ -57,5 +60,5 @@ def ratio_of(own: NDArray[np.float64], base: NDArray[np.float64]) -> tuple[float
     weights = random.multinomial(len(base), np.full(len(base), 1 / len(base)), RESAMPLES)
     over, under = weights @ own, weights @ base
     ratios = np.divide(over, under, out=np.full(RESAMPLES, np.inf), where=under > 0)
-    low, high = np.quantile(ratios, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="nearest")
+    low, high = np.quantile(ratios, [(1 - confidence) / 2, (1 + confidence) / 2], method="nearest")
     return value, float(low), float(high)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from vlatool.optimize.budget import Budget, distance_of
+from vlatool.optimize.moves import judge_moves
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
 
@@ -65,6 +66,8 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
         reason = "; ".join(rate.reasons) or "the reference"
         return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
     accuracy = _both(_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits))
+    moves = judge_moves(row, limits)
+    accuracy = _both(accuracy, _Verdict(moves.reasons, moves.miss, moves.warnings))
     reasons = (*accuracy.reasons, *rate.reasons)
     kept = f"{_drop_words(decisive)}, within {_allowed(limits, decisive)}" if decisive else ""
     row = replace(row, role="outside" if reasons else "within", reason="; ".join(reasons) or kept)

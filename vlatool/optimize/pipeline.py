@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.accuracy.credibility import Credibility, credibility
+from vlatool.accuracy.moved import with_task_speedup
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
@@ -210,6 +211,7 @@ def _measured(
     where = plan.board_set
     rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
     rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
+    rows = {name: with_task_speedup(row) for name, row in rows.items()}
     rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
     if plan.profile:

@@ -126,7 +126,14 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
             check_place(recipe.pruning.study)
     elif study := recipe.pruning.study:
         raise RecipeError(f"The study {without_password(study)} keeps trials; none are asked for.", "add --trials 8")
-    return Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
+    plan = Plan(stage, export, candidates, recipe, profile, cache, fresh, source)
+    asked = {"--max-motion": recipe.limits.max_motion, "--worst-task": recipe.limits.worst_task}
+    if plan.closed_loop is None and (named := [name for name, limit in asked.items() if limit is not None]):
+        raise RecipeError(
+            f"{' and '.join(named)} {'is' if len(named) == 1 else 'are'} of closed-loop episodes, and none are played.",
+            "name an environment in policy.yaml (docs/guides/environment.md), and ask for --episodes",
+        )
+    return plan
 
 
 def _check_pruning(pruning: Pruning, source: Source) -> None:
@@ -174,6 +181,8 @@ def _limits(limits: Limits) -> list[str]:
     words += [f"{limits.hz:g} Hz"] if limits.hz else []
     words += [f"latency <= {limits.max_latency_ms:g} ms"] if limits.max_latency_ms else []
     words += [f"memory <= {limits.max_memory_mb:g} MB"] if limits.max_memory_mb else []
+    words += [] if limits.max_motion is None else [f"jerk, path and task time <= {1 + limits.max_motion:g}x"]
+    words += [] if limits.worst_task is None else [f"drop of the worst task <= {100 * limits.worst_task:g} points"]
     return words + ([] if limits.metric else [f"distance from float32 <= {100 * limits.max_distance:g} %"])
 
 

@@ -28,6 +28,15 @@ class Limits(Numeric):
         description="largest distance from float32's own actions: mean |difference| / standard deviation, "
         "or the share of other answers",
     )
+    max_motion: float | None = Field(
+        None, ge=0, description="largest growth of jerk, path and task time where both succeed, a share (0.05 = 5 %)"
+    )
+    worst_task: float | None = Field(
+        None, ge=0, le=1, description="largest drop of the task that loses most, a share (0.03 = 3 points)"
+    )
+    min_task_share: float = Field(
+        0.95, ge=0, le=1, description="least share of an inference's speed-up that is left when steps are counted"
+    )
     metric: str = Field("", description="a measurement that decides instead, such as relative_error, or unit:m")
     max_metric: float | None = Field(None, ge=0, description="largest value of that measurement")
     hz: float | None = Field(None, gt=0, description="inferences per second")

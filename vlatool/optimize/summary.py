@@ -11,6 +11,7 @@ from vlatool.machine.host import fingerprint
 from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
 from vlatool.optimize.choice import chosen_of
 from vlatool.optimize.judge import Judged
+from vlatool.optimize.moves import slower_task
 from vlatool.optimize.plan import Plan
 from vlatool.optimize.timings import IN_OPENVINO, engine_of, now
 from vlatool.report import ON_BOARD, Report, Row
@@ -48,7 +49,7 @@ def report_of(
         f"{baseline.manifest.name} for {plan.board}",
         verdict_of(judged, trust),
         summary=(
-            *trust.sentences, *chosen.sentences, *filter(None, [trust.floor]),
+            *trust.sentences, *chosen.sentences, *filter(None, [slower_task(chosen.row)]), *filter(None, [trust.floor]),
             *about_int8(rows, in_int8(bundles), where), *about_onnx_runtime(plan.profile), *where.sentences(),
             *_needs(engine),
         ),
@@ -76,6 +77,8 @@ def _limits(plan: Plan) -> dict[str, float | str]:
     named = {
         **accuracy, "hz": limits.hz, "profile": plan.board, "max_latency_ms": limits.max_latency_ms,
         "max_memory_mb": limits.max_memory_mb, **distance,
+        "max_motion_percent": None if limits.max_motion is None else 100 * limits.max_motion,
+        "worst_task_drop_points": None if limits.worst_task is None else 100 * limits.worst_task,
     }  # fmt: skip
     return {name: value for name, value in named.items() if value is not None}
 

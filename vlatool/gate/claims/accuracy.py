@@ -13,9 +13,9 @@ from vlatool.accuracy.losses import drop, losses
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import EVALUATION, read_recording
 from vlatool.errors import DataError
-from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import alone, run_recorded
 from vlatool.gate.config import AccuracyClaim
+from vlatool.gate.episodes import Episodes
 from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
@@ -53,7 +53,12 @@ class _Drop:
 
 
 def examine(
-    candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = ""
+    candidate: Bundle,
+    baseline: Bundle,
+    claim: AccuracyClaim,
+    context: Context,
+    engine: str = "",
+    episodes: Episodes | None = None,
 ) -> ClaimResult:
     """Examine the drop on recorded observations, and in the closed loop where episodes are asked for.
 
@@ -62,6 +67,7 @@ def examine(
         claim: What is claimed.
         context: Progress and workers.
         engine: Of the runtime, that of the other claims; the one that each bundle was made for when empty.
+        episodes: Those that other claims look at, too; its own when None.
 
     Raises:
         DataError: when there is neither.
@@ -70,7 +76,7 @@ def examine(
     if (data := data_of(baseline, claim)) is not None:
         drops.append(_recorded(candidate, baseline, data, context, engine))
     if claim.episodes:
-        drops.append(_closed_loop(candidate, baseline, claim, context, engine))
+        drops.append(_closed_loop(episodes or Episodes(candidate, baseline, claim, context, engine)))
     words = [lost.told(claim.max_drop) for lost in drops]
     measured = tuple(
         Measurement(lost.name, lost.value, "1", samples=lost.samples, low=finite(lost.low), high=finite(lost.high),
@@ -110,10 +116,8 @@ def data_of(baseline: Bundle, claim: AccuracyClaim) -> Path | None:
     return data
 
 
-def _closed_loop(candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str) -> _Drop:
-    stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine)
-    stage.check(candidate, None)
-    rows = stage.run(candidate, context).rows
+def _closed_loop(episodes: Episodes) -> _Drop:
+    rows = episodes.rows
     before, after = (row.raw["success"] for row in rows)
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))

@@ -1,0 +1,22 @@
+"""The candidate takes no longer for a task than the baseline, where both succeed."""
+
+from __future__ import annotations
+
+from vlatool.accuracy.moved import RATIO, ratios
+from vlatool.gate.claims._ratio import confidence_of, judged
+from vlatool.gate.config import TaskTimeClaim
+from vlatool.gate.episodes import Episodes
+from vlatool.gate.result import ClaimResult
+
+METRIC = "task_time"
+NOTHING = "there is no episode in which both succeed"
+
+
+def examine(episodes: Episodes, claim: TaskTimeClaim) -> ClaimResult:
+    """Examine the control steps of the episodes in which both succeed.
+
+    Raises:
+        DataError: when no environment is named, or it fails.
+    """
+    found = ratios(*episodes.rows, (METRIC,), confidence_of(1)).get(f"{METRIC}{RATIO}")
+    return judged(METRIC, {"task time": found} if found else {}, claim.margin, NOTHING)

@@ -1,0 +1,41 @@
+"""The closed-loop episodes of a gate: played once, for every claim that is about them."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.gate.config import AccuracyClaim
+from vlatool.report import Row
+from vlatool.stage.base import Context
+
+
+class Episodes:
+    """The same episodes of both bundles.
+
+    Args:
+        candidate, baseline: Bundles.
+        claim: Which episodes.
+        context: Progress and workers.
+        engine: Of the runtime; the one that each bundle was made for when empty.
+    """
+
+    def __init__(
+        self, candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = ""
+    ) -> None:
+        self._candidate, self._context = candidate, context
+        self._stage = ClosedLoop(
+            episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine
+        )  # fmt: skip
+
+    @cached_property
+    def rows(self) -> tuple[Row, Row]:
+        """The baseline's row, with what succeeds by chance, and the candidate's; played when first asked for.
+
+        Raises:
+            DataError: when no environment is named, or it fails.
+        """
+        self._stage.check(self._candidate, None)
+        baseline, candidate = self._stage.run(self._candidate, self._context).rows
+        return baseline, candidate

@@ -1,0 +1,100 @@
+"""Whether a candidate moves as float32 does, and keeps to the limit on its worst task: in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from vlatool.accuracy.moved import RATIO, SPEEDUP, STEPS, WORST
+from vlatool.optimize.recipe import Limits
+from vlatool.report import Measurement, Row
+
+LIMITED = {"task_time": "task time", "path_length": "path", "joint_path": "path of the joints", "jerk": "jerk",
+           "joint_jerk": "jerk of the joints"}  # fmt: skip
+"""Metrics that ``max_motion`` is about -> their names in sentences."""
+OF_ACTIONS = {"task_time": "task time", "action_rate": "action rate"}
+"""The same where the environment tells nothing of the robot's body."""
+LEAST_LOSS = 1e-4
+
+
+@dataclass(frozen=True)
+class Moves:
+    """What the limits on motion and on the worst task say of a row.
+
+    Args:
+        reasons: Against it.
+        miss: By how much it misses the limits, as a multiple of them.
+        warnings: What the episodes cannot exclude.
+    """
+
+    reasons: tuple[str, ...] = ()
+    miss: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+
+def limited(row: Row) -> dict[str, str]:
+    """Return the metrics that a limit on motion is about, for what is known of a row -> their names in sentences."""
+    of_body = any(row.get(f"{name}{RATIO}") for name in LIMITED if name != "task_time")
+    return LIMITED if of_body else OF_ACTIONS
+
+
+def judge_moves(row: Row, limits: Limits) -> Moves:
+    """Hold a candidate's motion, its steps and its worst task against the limits."""
+    found = (*_motion(row, limits), *_steps(row, limits), *_worst(row, limits))
+    reasons = tuple(reason for one in found for reason in one.reasons)
+    return Moves(reasons, sum(one.miss for one in found), tuple(text for one in found for text in one.warnings))
+
+
+def _motion(row: Row, limits: Limits) -> Iterator[Moves]:
+    if limits.max_motion is None or row.get("success_drop") is None:
+        return
+    known = {words: ratio for name, words in limited(row).items() if (ratio := row.get(f"{name}{RATIO}")) is not None}
+    if not known:
+        yield Moves(("its motion is unknown: it shares no success with float32",), 1.0)
+    for words, ratio in known.items():
+        growth = ratio.value - 1
+        if growth > limits.max_motion:
+            reason = f"{words} {_grows(ratio)}, allowed {100 * limits.max_motion:.3g} % (--max-motion)"
+            yield Moves((reason,), growth / max(limits.max_motion, 1e-3) - 1)
+        elif (ratio.high or ratio.value) - 1 > limits.max_motion:
+            yield Moves(warnings=(f"{row.name}: {words} {_grows(ratio)}; {ratio.samples} pairs of episodes cannot "
+                                  f"exclude more than {100 * limits.max_motion:.3g} %",))  # fmt: skip
+
+
+def _steps(row: Row, limits: Limits) -> Iterator[Moves]:
+    """Yield a reason against a candidate that needs so many more steps that little of its speed-up is left."""
+    steps = row.get(STEPS)
+    if steps is None or steps.low is None or steps.low <= 1 or 1 / steps.value >= limits.min_task_share:
+        return
+    span = f" ({steps.low:.2f} to {steps.high or steps.value:.2f})"
+    reason = f"it needs {steps.value:.2f}x the steps of float32{span}, so that {100 / steps.value:.0f} % of its "
+    reason += f"speed-up is left for the whole task, required {100 * limits.min_task_share:.3g} % (min_task_share)"
+    yield Moves((reason,), steps.value * limits.min_task_share - 1)
+
+
+def _worst(row: Row, limits: Limits) -> Iterator[Moves]:
+    worst = row.get(WORST) or row.get("success_drop")  # of one task there is none worse
+    if limits.worst_task is None or worst is None:
+        return
+    where = f"in {worst.note.partition(',')[0]}" if worst.name == WORST else "in its only task"
+    span = "" if worst.low is None else f" ({100 * worst.low:.3g} to {100 * (worst.high or worst.value):.3g})"
+    drop = f"success {where} drops by {100 * worst.value:.3g} points{span}"
+    allowed = f"allowed {100 * limits.worst_task:.3g} (--worst-task)"
+    if worst.value > limits.worst_task + LEAST_LOSS:
+        yield Moves((f"{drop}, {allowed}",), worst.value / max(limits.worst_task, 1e-3) - 1)
+    elif (worst.high or 0.0) > limits.worst_task:
+        yield Moves(warnings=(f"{row.name}: {drop}, {allowed}: {worst.samples} episodes cannot decide it",))
+
+
+def _grows(ratio: Measurement) -> str:
+    span = "" if ratio.low is None else f" ({ratio.low:.3g}x to {ratio.high or ratio.value:.3g}x)"
+    return f"is {ratio.value:.3g}x that of float32{span}"
+
+
+def slower_task(row: Row) -> str:
+    """Return what is said of a candidate whose task gains less than its inferences; empty where it gains as much."""
+    task, speed, steps = row.get(SPEEDUP), row.get("speedup"), row.get(STEPS)
+    if task is None or speed is None or steps is None:
+        return ""
+    words = f"{row.name} does its task {task.value:.2f}x as fast as float32, where inferences set the pace: its "
+    return f"{words}inferences are {speed.value:.2f}x as fast, and it needs {steps.value:.2f}x the steps."
