@@ -79,6 +79,10 @@ def gate_page() -> str:
         config.AnswersClaim,
         config.GrowthClaim,
         config.DeadlineClaim,
+        config.MotionClaim,
+        config.TaskTimeClaim,
+        config.WorstTaskClaim,
+        config.DisturbedClaim,
     ):
         names = [name for name, field in config.Gate.model_fields.items() if claim.__name__ in str(field.annotation)]
         parts.append(f"## {', '.join(names)}\n\n{inspect.cleandoc(claim.__doc__ or '')}\n\n{_options(claim)}")

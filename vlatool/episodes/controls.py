@@ -41,6 +41,7 @@ class Blind:
     """
 
     def __init__(self, control: str, action: TensorSpec, answers: Array, seed: int) -> None:
+        self.fresh = True
         self._labels = len(action.labels) if action.kind == "discrete" else 0
         self._answers = answers
         self._constant = self._middle() if control == "constant" else None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import DataError
+from vlatool.errors import DataError, nearest
 
 GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
 
@@ -71,6 +71,43 @@ class World:
             )
         observation, _, terminated, truncated, info = answer
         return self._observation(observation), self._over(terminated) or self._over(truncated), info
+
+    def disturbances(self) -> tuple[str, ...]:
+        """Return the disturbances that the environment offers.
+
+        Raises:
+            DataError: when it names them as something else than words, or has no ``disturb``.
+        """
+        named = self._own("disturbances")
+        if named is None:
+            return ()
+        listed = isinstance(named, Collection) and not isinstance(named, str | bytes)
+        if not listed or not all(isinstance(kind, str) and kind.isidentifier() for kind in named):
+            raise DataError(
+                f"'disturbances' of {self._name} is {named!r:.60}; it must be a list of words.",
+                f"write disturbances = ('light', 'start_pose'); {GUIDE}",
+            )
+        if not callable(self._own("disturb")):
+            raise DataError(
+                f"{self._name.capitalize()} names disturbances, and has no disturb(kind, strength, seed).", GUIDE
+            )
+        return tuple(named)
+
+    def disturb(self, kind: str, strength: float, seed: int) -> None:
+        """Disturb the episodes from the next reset on.
+
+        Raises:
+            DataError: when the environment does not offer that.
+        """
+        known = self.disturbances()
+        if kind not in known:
+            raise DataError(f"{self._name.capitalize()} offers no disturbance '{kind}'; {nearest(kind, known)}.")
+        self._own("disturb")(kind, strength, seed)
+
+    def _own(self, name: str) -> Any:
+        """Return an attribute of the environment, or of what its wrappers wrap."""
+        found = getattr(self._environment, name, None)
+        return getattr(getattr(self._environment, "unwrapped", None), name, None) if found is None else found
 
     def _over(self, flag: Any) -> bool:
         if np.size(flag) != 1:

@@ -72,6 +72,11 @@ class Noisy:
         self._spread = answers.std(axis=0) * noise
         self._random = np.random.default_rng((seed, 21))
 
+    @property
+    def fresh(self) -> bool:
+        """Whether the last action was the first of a chunk."""
+        return self._queue.fresh
+
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the next action: (A,) float32, or a 0-d int64 index."""
         action = self._queue.act(observation)

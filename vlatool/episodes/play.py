@@ -20,8 +20,10 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
 from vlatool.episodes.body import Body
 from vlatool.episodes.controls import Array, Blind, answers_of
+from vlatool.episodes.disturbed import OWN, Seen
 from vlatool.episodes.environment import GUIDE, World
 from vlatool.episodes.frames import KeepingEncoder, Noisy
+from vlatool.episodes.late import Late
 from vlatool.errors import DataError, VlatoolError, require
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import message_of, one_line
@@ -30,7 +32,7 @@ from vlatool.motion.measure import measured
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context
-from vlatool.user_code.children import spread
+from vlatool.user_code.children import call, spread
 
 SLICE = 10
 """Episodes of one task that a worker plays at a time."""
@@ -57,6 +59,9 @@ class EpisodesJob:
             of each action's standard deviation; for discrete actions, how often a random one is taken.
         record: Folder for what the policy was given at each inference, ``NAME.npy`` for each input; nothing is kept
             when empty.
+        disturb: Disturbance of the environment, or of what the policy sees (``episodes/disturbed.py``).
+        strength: Of the disturbance; 1 is what an ordinary day brings.
+        latency_ms: How late actions come; 0 for at once.
     """
 
     environment: str
@@ -67,6 +72,9 @@ class EpisodesJob:
     control: str = ""
     noise: float = 0.0
     record: str = ""
+    disturb: str = ""
+    strength: float = 1.0
+    latency_ms: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -121,6 +129,20 @@ def run_jobs(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Cont
         return _collect(played, len(jobs), context)
 
 
+def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
+    """Return the disturbances that can be played: those that need no environment, and its own.
+
+    Raises:
+        DataError: when the environment does not say properly which they are.
+        SourceError: when it ends the process that it runs in.
+    """
+    request = to_json(Request(str(bundle.path.absolute()), "", STEP_LIMIT, job))
+    own = call(f"{__name__}:disturbances", request, context.tell, job.environment.rpartition(":")[0])
+    if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
+        raise DataError("The process that asked the environment for its disturbances did not answer with names.")
+    return (*OWN, *(kind for kind in own if kind not in OWN))
+
+
 def _outcomes(answer: Any, job: EpisodesJob) -> tuple[Outcome, ...]:
     """Return what a child says of the episodes of a job."""
     try:
@@ -144,6 +166,10 @@ def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
 class Actor(Protocol):
     """Who acts in an episode."""
 
+    @property
+    def fresh(self) -> bool:
+        """Whether the last action was the first of a chunk."""
+
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index."""
 
@@ -154,16 +180,12 @@ class Actor(Protocol):
 class BoundedQueue(ChunkQueue):
     """A queue whose policy is stopped when an inference takes longer than any that a robot could use."""
 
-    fresh = True
-    """Whether the last action was the first of a chunk."""
-
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step.
 
         Raises:
             UsageError, DataError, GraphError: as ``ChunkQueue.act`` does, and when an inference takes too long.
         """
-        self.fresh = not self._pending
         with self.policy.stopped_after(FIRST_RUN_S):
             return super().act(observation)
 
@@ -182,7 +204,7 @@ class Worker:
 
     def environment(self, job: EpisodesJob) -> Any:
         """Return the environment of a job; one is open at a time, since some renderers allow no more."""
-        key = (job.environment, job.folder, job.task, job.instruction)
+        key = (job.environment, job.folder, job.task, job.instruction, job.disturb)
         if key != self._key:
             self.close()
             arguments = {"task": job.task, **({} if job.instruction == "right" else {"instruction": job.instruction})}
@@ -194,16 +216,14 @@ class Worker:
         """Play the episodes of a job."""
         spec = self.queue.policy.spec
         world = World(self.environment(job), job.task, spec)
-        actors = ((seed, self._actor(job, seed)) for seed in job.seeds)
-        if not job.record:
-            return [_episode(world, actor, spec, job.task, seed, limit) for seed, actor in actors]
-        with self._frames.kept(Path(job.record)):
-            return [_episode(world, actor, spec, job.task, seed, limit) for seed, actor in actors]
+        with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
+            return [_episode(world, self._actor(job, seed), spec, job, seed, limit) for seed in job.seeds]
 
     def _actor(self, job: EpisodesJob, seed: int) -> Actor:
         """Return who acts: the policy, the policy with noise, or a control that does not look."""
         if not job.control and not job.noise:
-            return self.queue
+            late = int(job.latency_ms * self.queue.policy.spec.control_hz / 1e3)
+            return Late(self.queue, late) if late else self.queue
         if self._answers is None:
             self._answers = answers_of(self.queue.policy)
         if job.noise:
@@ -243,6 +263,18 @@ def play(request: Mapping[str, Any], _tell: Callable[[str, float | None], None])
     return answer
 
 
+def disturbances(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> list[str]:
+    """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
+    asked = from_json(Request, request)
+    spec = Bundle.open(Path(asked.bundle)).manifest.spec
+    environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
+    try:
+        return list(World(environment, asked.job.task, spec).disturbances())
+    finally:
+        with contextlib.suppress(Exception):
+            environment.close()
+
+
 def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> None:
     """Close what is open in this process."""
     global _worker
@@ -251,19 +283,22 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
     _worker = None
 
 
-def _episode(world: World, queue: Actor, spec: PolicySpec, task: str, seed: int, limit: int) -> Outcome:
+def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int) -> Outcome:
+    task = job.task
     try:
         with exits_caught(f"the environment of task '{task}', at seed {seed},"):
+            if job.disturb and job.disturb not in OWN:
+                world.disturb(job.disturb, job.strength, seed)
             observation, info = world.reset(seed)
             queue.reset()
-            success, body = Success(), Body(spec)
+            success, body, seen = Success(), Body(spec), Seen(spec, job.disturb, job.strength, seed)
             body.look(info)
             told = told_to(observation, spec)
             for step in range(1, limit):
-                action = _acted(queue, observation, f"task '{task}' at seed {seed}, step {step},")
+                action = _acted(queue, seen(observation), f"task '{task}' at seed {seed}, step {step},")
                 observation, over, info = world.step(action.item() if action.ndim == 0 else action)
                 success.look(info)
-                body.acted(action, getattr(queue, "fresh", True))
+                body.acted(action, queue.fresh)
                 body.look(info)
                 if over:
                     motion = measured(body.track())

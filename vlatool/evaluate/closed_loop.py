@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
 from vlatool.accuracy.credibility import Credibility, credibility
-from vlatool.accuracy.paired import compare_success, success_row, with_chance
+from vlatool.accuracy.disturbed import with_disturbed
+from vlatool.accuracy.paired import Outcome, compare_success, success_row, with_chance
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for, run_jobs
+from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, disturbances_of, jobs_for, run_jobs
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
+from vlatool.evaluate._late import late, latency_of
+from vlatool.evaluate._told import told
 from vlatool.machine.host import fingerprint
 from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
@@ -24,6 +29,8 @@ from vlatool.user_code import trust
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
+ALL = "all"
+"""Every disturbance that there is."""
 CONTROL_EPISODES = 20
 """Episodes of each control, or a tenth of the policy's where that is more."""
 
@@ -46,6 +53,15 @@ class ClosedLoop(Measure):
     )
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
+    disturb: tuple[str, ...] = Field(
+        (), description="disturbances to play as well: all, or some of delay, dropped_frames and the environment's own"
+    )
+    strength: float = Field(1.0, ge=0, le=10, description="of the disturbances; 1 is what an ordinary day brings")
+    latency_in_the_loop: bool = Field(False, description="let actions come as late as inferences take")
+    board: str = Field(
+        "",
+        description="profile whose predicted latency that is; --profile sets it; measured here when empty",
+    )
 
     def inputs(self) -> tuple[Path, ...]:
         """The baseline's manifest, and the environment's file with its neighbours, which it may import."""
@@ -60,28 +76,67 @@ class ClosedLoop(Measure):
         """Environment and tasks are named, and the environment may run."""
         self._may_run(self._jobs(source)[0])
 
+    def on(self, profile: Profile) -> ClosedLoop:
+        """Return the evaluation with the latency that is predicted for a board, where latency counts."""
+        return self.model_copy(update={"board": profile.name}) if self.latency_in_the_loop and not self.board else self
+
     def run(self, source: Bundle, context: Context) -> Report:
         """Run all episodes of the bundle, and of the baseline when there is one."""
         jobs = self._jobs(source)
         self._may_run(jobs[0])
+        kinds = self._disturbances(source, jobs[0], context)
+        bundles = [*([Bundle.open(self.baseline)] if self.baseline else []), source]
+        waits = [latency_of(one, self.board, self.engine, context) if self.latency_in_the_loop else None
+                 for one in bundles]  # fmt: skip
         rows: list[Row] = []
         believed = Credibility("unknown")
         if self.baseline:
-            rows.append(self._reference(Bundle.open(self.baseline), jobs, context))
+            rows.append(self._reference(bundles[0], late(jobs, waits[0]), context))
             believed = credibility(rows[0]) if self.instruction == "right" else believed
-        row = success_row(source.manifest.name, "subject", run_jobs(source, jobs, self.engine, context))
-        rows.append(compare_success(rows[0], row) if rows else row)
-        success = rows[-1].get("success")
-        count = success.samples if success else 0
+        outcomes = run_jobs(source, late(jobs, waits[-1]), self.engine, context)
+        row = success_row(source.manifest.name, "subject", outcomes)
+        row = compare_success(rows[0], row) if rows else row
+        if kinds:
+            played = [self._disturbed(kinds, late(jobs, wait), one, context)
+                      for one, wait in zip(bundles, waits, strict=True)]  # fmt: skip
+            row = with_disturbed(row, played[-1], played[0] if self.baseline else None, self.strength)
+        rows = [replace(row, measurements=(*row.measurements, wait)) if wait else row
+                for row, wait in zip([*rows, row], waits, strict=True)]  # fmt: skip
+        row = rows[-1]
+        count = len(outcomes)
         how = "" if self.instruction == "right" else " told the wrong instruction"
         title = f"{source.manifest.name}{how} in {count} closed-loop episodes"
         how = f" with {self.control} actions in the place of the policy's" if self.control else how
         text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else "info"
         return Report(
-            "evaluate", title, verdict, (*believed.sentences, text), tuple(rows), environment=fingerprint(),
-            warnings=(*believed.warnings, *found_wrong(source)),
+            "evaluate", title, verdict, (*believed.sentences, text, *told(rows, self.board)), tuple(rows),
+            environment=fingerprint(), warnings=(*believed.warnings, *found_wrong(source)),
         )  # fmt: skip
+
+    def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
+        """Return the disturbances that are asked for.
+
+        Raises:
+            UsageError: when there is one that neither the evaluation nor the environment knows.
+        """
+        if not self.disturb:
+            return ()
+        known = disturbances_of(source, job, context)
+        if unknown := [kind for kind in self.disturb if kind not in (*known, ALL)]:
+            raise UsageError(f"There is no disturbance '{unknown[0]}'; {nearest(unknown[0], (*known, ALL))}.")
+        return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
+
+    def _disturbed(
+        self, kinds: Sequence[str], jobs: list[EpisodesJob], bundle: Bundle, context: Context
+    ) -> dict[str, list[Outcome]]:
+        """Return disturbance -> the episodes of a bundle under it."""
+        played = {}
+        for kind in kinds:
+            context.tell(f"episodes under {kind}", None)
+            disturbed = [replace(job, disturb=kind, strength=self.strength) for job in jobs]
+            played[kind] = run_jobs(bundle, disturbed, self.engine, context)
+        return played
 
     def _reference(self, baseline: Bundle, jobs: list[EpisodesJob], context: Context) -> Row:
         """Play the baseline, and the controls that show what succeeds by chance."""
@@ -96,12 +151,13 @@ class ClosedLoop(Measure):
 
     def controls(self) -> list[ClosedLoop]:
         """Return the evaluations that show what succeeds by chance, on the first of the same seeds."""
-        less = {"episodes": self._few(), "baseline": None}
+        less = {"episodes": self._few(), "baseline": None, "disturb": (), "latency_in_the_loop": False}
         return [self.model_copy(update={"control": control, **less}) for control in CONTROLS]
 
     def told_wrong(self) -> ClosedLoop:
         """Return the evaluation of as many episodes in which the policy is told the wrong instruction."""
-        return self.model_copy(update={"instruction": "wrong", "episodes": self._few(), "baseline": None})
+        less = {"episodes": self._few(), "baseline": None, "disturb": ()}
+        return self.model_copy(update={"instruction": "wrong", **less})
 
     def _few(self) -> int:
         return min(self.episodes, max(CONTROL_EPISODES, self.episodes // 10))

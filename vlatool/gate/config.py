@@ -15,7 +15,7 @@ from vlatool.stats.percentiles import PERCENTILES
 from vlatool.stats.sequential import ALPHA, INTERIM_ANALYSES
 from vlatool.stats.signed_rank import fewest
 
-OF_EPISODES = ("motion", "task_time", "worst_task")
+OF_EPISODES = ("motion", "task_time", "worst_task", "disturbed")
 """Claims about the closed-loop episodes that the claim of accuracy names."""
 
 
@@ -89,6 +89,16 @@ class WorstTaskClaim(_Claim):
     max_drop: float = Field(0.03, ge=0, le=1, description="largest drop of any task, a share (0.03 = 3 points)")
 
 
+class DisturbedClaim(_Claim):
+    """Under disturbances, it loses no more successes than a drop (needs ``accuracy: episodes``)."""
+
+    max_drop: float = Field(0.05, ge=0, le=1, description="largest drop under any of them, a share (0.05 = 5 points)")
+    kinds: tuple[str, ...] = Field(
+        ("all",), min_length=1, description="all, or some of delay, dropped_frames and the environment's own"
+    )
+    strength: float = Field(1.0, gt=0, le=10, description="1 is what an ordinary day brings")
+
+
 class AnswersClaim(_Claim):
     """The candidate answers when timed as it does otherwise, and follows the baseline where nothing is recorded."""
 
@@ -136,6 +146,7 @@ class Gate(Numeric):
     motion: MotionClaim | None = None
     task_time: TaskTimeClaim | None = None
     worst_task: WorstTaskClaim | None = None
+    disturbed: DisturbedClaim | None = None
     accept: tuple[str, ...] = Field((), description="findings of the bundles that are overruled, by name")
 
     @model_validator(mode="after")

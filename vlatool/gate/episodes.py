@@ -6,7 +6,7 @@ from functools import cached_property
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.gate.config import AccuracyClaim
+from vlatool.gate.config import AccuracyClaim, DisturbedClaim
 from vlatool.report import Row
 from vlatool.stage.base import Context
 
@@ -17,17 +17,25 @@ class Episodes:
     Args:
         candidate, baseline: Bundles.
         claim: Which episodes.
+        disturbed: Under which disturbances they are played as well; under none when None.
         context: Progress and workers.
         engine: Of the runtime; the one that each bundle was made for when empty.
     """
 
     def __init__(
-        self, candidate: Bundle, baseline: Bundle, claim: AccuracyClaim, context: Context, engine: str = ""
+        self,
+        candidate: Bundle,
+        baseline: Bundle,
+        claim: AccuracyClaim,
+        context: Context,
+        engine: str = "",
+        disturbed: DisturbedClaim | None = None,
     ) -> None:
         self._candidate, self._context = candidate, context
-        self._stage = ClosedLoop(
-            episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine
-        )  # fmt: skip
+        self._stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine)
+        if disturbed:
+            update = {"disturb": disturbed.kinds, "strength": disturbed.strength}
+            self._stage = self._stage.model_copy(update=update)
 
     @cached_property
     def rows(self) -> tuple[Row, Row]:

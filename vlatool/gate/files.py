@@ -46,6 +46,9 @@ task_time: null        # where both succeed, the task takes no longer
 worst_task: null       # no task loses more than so many points, however well the others do
 # worst_task:
 #   max_drop: 0.03
+disturbed: null        # nor under late, lost or noisy observations, and what else the environment offers
+# disturbed:
+#   max_drop: 0.05
 
 deadline: null
 # deadline:            # a percentile below a deadline, with 99 % confidence, on the machine that runs the gate

@@ -10,7 +10,7 @@ from typing import Any
 
 from vlatool.accuracy.credibility import FAILS
 from vlatool.bundle.bundle import Bundle, hash_file
-from vlatool.gate.claims import accuracy, answers, deadline, growth, latency, motion, task_time, worst_task
+from vlatool.gate.claims import accuracy, answers, deadline, disturbed, growth, latency, motion, task_time, worst_task
 from vlatool.gate.config import Gate, LatencyClaim
 from vlatool.gate.episodes import Episodes
 from vlatool.gate.inputs import AGREEMENT, Inputs
@@ -63,7 +63,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     if gate.memory:
         results.append(growth.examine_memory(candidate, baseline, gate.memory, how, context, inputs))
     if gate.accuracy:
-        episodes = Episodes(candidate, baseline, gate.accuracy, context, how.engine)
+        episodes = Episodes(candidate, baseline, gate.accuracy, context, how.engine, gate.disturbed)
         results.append(accuracy.examine(candidate, baseline, gate.accuracy, context, how.engine, episodes))
         results += _of_episodes(episodes, gate)
     with Recorder(open_all(), PERIOD_S) as board:
@@ -91,6 +91,8 @@ def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:
         yield task_time.examine(episodes, gate.task_time)
     if gate.worst_task:
         yield worst_task.examine(episodes, gate.worst_task)
+    if gate.disturbed:
+        yield disturbed.examine(episodes, gate.disturbed)
 
 
 def _agreement(timed: Timed, gate: Gate, inputs: Inputs) -> Agreement:

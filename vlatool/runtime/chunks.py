@@ -32,6 +32,8 @@ class ChunkQueue:
         self.policy = policy
         self.execute = execute or policy.spec.execute or policy.spec.chunk
         self._pending: list[NDArray[Any]] = []
+        self.fresh = False
+        """Whether the last action was the first of a chunk."""
         self._turn = threading.RLock()  # a signal handler may strike between lock and owner
         self._owner = 0
 
@@ -49,7 +51,8 @@ class ChunkQueue:
         with self._turn:
             try:
                 self._owner = threading.get_ident()
-                if not self._pending:
+                self.fresh = not self._pending
+                if self.fresh:
                     self._pending = list(self.policy.infer(observation).chunk[: self.execute])
                 return np.asarray(self._pending.pop(0))
             finally:

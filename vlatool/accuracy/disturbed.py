@@ -1,0 +1,85 @@
+"""What disturbances cost: the same episodes of a variant and of what it is held against, under each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from vlatool.accuracy.moved import RATIO, STEPS
+from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.report import Measurement, Row
+from vlatool.stats.intervals import paired_drop, wilson
+
+Episodes = Mapping[str, Sequence[Outcome]]
+DISTURBED = "disturbed."
+"""What the names of raw samples begin with that say which episodes succeeded under a disturbance."""
+OF_BASELINE = ", baseline"
+"""What they end with of the same episodes of what the variant is held against."""
+TABLE = "under disturbances"
+SHOWN = {"task_time": "task time", "path_length": "path", "jerk": "jerk", "action_rate": "action rate"}
+"""Metrics of motion that the table has, where both succeed."""
+
+
+def with_disturbed(
+    row: Row,
+    played: Mapping[str, Sequence[Outcome]],
+    reference: Mapping[str, Sequence[Outcome]] | None,
+    strength: float,
+) -> Row:
+    """Return the row with how it does under each disturbance, the worst first.
+
+    Args:
+        row: Of the variant, undisturbed.
+        played: Disturbance -> episodes of the variant.
+        reference: The same of what it is held against; None where there is nothing.
+        strength: Of all of them.
+    """
+    records, raw = [], dict[str, list[float]]()
+    wins = count = 0
+    for kind, own in played.items():
+        base = reference[kind] if reference else None
+        disturbed = success_row(kind, "subject", own)
+        if base is not None:
+            disturbed = compare_success(success_row("baseline", "baseline", base), disturbed)
+            raw[f"{DISTURBED}{kind}{OF_BASELINE}"] = [float(outcome.success) for outcome in base]
+        raw[f"{DISTURBED}{kind}"] = disturbed.raw["success"]
+        wins, count = wins + int(sum(disturbed.raw["success"])), count + len(own)
+        records.append(_record(kind, strength, disturbed, base))
+    records.sort(key=lambda record: (-record.get("drop", 0.0), record["success"]))
+    low, high = wilson(wins, count)
+    note = f"under {', '.join(played)}; strength {strength:g}"
+    rate = Measurement("success_disturbed", wins / count, "1", samples=count, low=low, high=high, note=note)
+    measurements, details = (*row.measurements, rate), {**row.details, TABLE: records}
+    return replace(row, measurements=measurements, raw={**row.raw, **raw}, details=details)
+
+
+def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measurement]:
+    """Return disturbance -> how many more episodes fail than of the baseline, with an interval of that coverage.
+
+    Args:
+        row: Of ``with_disturbed``; those that have no reference are left out.
+        confidence: Of each interval.
+    """
+    drops = {}
+    for name in row.raw:
+        if not name.startswith(DISTURBED) or f"{name}{OF_BASELINE}" not in row.raw:
+            continue
+        kind = name.removeprefix(DISTURBED)
+        pairs = list(zip(row.raw[f"{name}{OF_BASELINE}"], row.raw[name], strict=True))
+        lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
+        drop, low, high = paired_drop(lost, won, len(pairs), confidence)
+        drops[kind] = Measurement("disturbed_drop", drop, "1", samples=len(pairs), low=low, high=high,
+                                  confidence=confidence, note=kind)  # fmt: skip
+    return drops
+
+
+def _record(kind: str, strength: float, row: Row, base: Sequence[Outcome] | None) -> dict[str, Any]:
+    record: dict[str, Any] = {"disturbance": kind, "strength": strength, "episodes": len(row.raw["success"])}
+    if base is not None:
+        record["baseline"] = round(sum(outcome.success for outcome in base) / len(base), 4)
+    record["success"] = round(row.value("success"), 4)
+    if drop := row.get("success_drop"):
+        record |= {"drop": round(drop.value, 4), "low": round(drop.low or 0.0, 4), "high": round(drop.high or 0.0, 4)}
+    named = {STEPS: "steps", **{f"{name}{RATIO}": words for name, words in SHOWN.items()}}
+    return record | {f"{words}, x": round(ratio.value, 3) for name, words in named.items() if (ratio := row.get(name))}

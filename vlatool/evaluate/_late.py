@@ -1,0 +1,48 @@
+"""How late a bundle's actions come in the loop: as long as an inference takes, here or on a board."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from statistics import median
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.episodes.play import EpisodesJob
+from vlatool.errors import DataError
+from vlatool.hardware.profile import load_profile
+from vlatool.latency_model.predict import predictions
+from vlatool.measurement import agent
+from vlatool.measurement.jobs import LatencyJob
+from vlatool.report import Measurement
+from vlatool.stage.base import Context
+
+LATE = "latency_in_the_loop"
+CALLS, SECONDS = 50, 2.0
+"""Of each bundle, when its latency is measured."""
+
+
+def latency_of(bundle: Bundle, board: str, engine: str, context: Context) -> Measurement:
+    """Return how long an inference takes.
+
+    Args:
+        bundle: With graphs.
+        board: Profile that it is predicted for; measured on this machine with one thread when empty.
+        engine: Of the runtime; the bundle's own when empty.
+        context: For progress.
+
+    Raises:
+        ProfileError: when there is no such board.
+        DataError: when it cannot be predicted.
+    """
+    if board:
+        latency = predictions(load_profile(board), bundle, engine)[0]
+        if not latency.known:
+            raise DataError(f"The latency on {board} cannot be predicted: {latency.note}.", "name another board")
+        return replace(latency, name=LATE)
+    job = LatencyJob((str(bundle.path.absolute()),), engine, 1, CALLS, SECONDS, check=False)
+    calls = agent.measure(job, context.tell).policies[0].samples
+    return Measurement(LATE, median(calls), "ms", samples=len(calls), note="median, one thread")
+
+
+def late(jobs: list[EpisodesJob], latency: Measurement | None) -> list[EpisodesJob]:
+    """Return the jobs with actions that come so late; as they are without a latency."""
+    return jobs if latency is None else [replace(job, latency_ms=latency.value) for job in jobs]

@@ -1,0 +1,38 @@
+"""What an evaluation says of a variant beside its success: its worst task, how it moves, what disturbs it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from vlatool.accuracy.disturbed import TABLE
+from vlatool.accuracy.moved import RATIO, STEPS, WORST
+from vlatool.evaluate._late import LATE
+from vlatool.report import Row
+
+
+def told(rows: Sequence[Row], board: str) -> Iterator[str]:
+    """Yield sentences on the last row.
+
+    Args:
+        rows: The baseline, where there is one, and the variant.
+        board: What latencies in the loop are predicted for; measured here when empty.
+    """
+    row = rows[-1]
+    worst, steps = row.get(WORST), row.get(STEPS)
+    if worst and worst.value > 0:
+        yield f"The task that loses most is {worst.note.partition(',')[0]}: {100 * worst.value:.3g} points."
+    changed = [item for item in row.measurements if item.name.endswith(RATIO) and item is not steps]
+    if rougher := [item for item in changed if (item.low or 0.0) > 1]:
+        words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {item.value:.3g}x" for item in rougher)
+        yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
+    if steps and (steps.low or 0.0) > 1:
+        yield f"Over all episodes, it needs {steps.value:.3g}x the steps."
+    if table := row.details.get(TABLE):
+        first = table[0]
+        drop = f", {100 * first['drop']:.3g} points fewer than of the baseline" if first.get("drop", 0) > 0 else ""
+        yield f"It succeeds least{' beside the baseline' if 'drop' in first else ''} under {first['disturbance']}: " \
+              f"{first['success']:.1%}{drop}."  # fmt: skip
+    if any(one.get(LATE) for one in rows):
+        late = ", ".join(f"{one.name} {one.value(LATE):.3g} ms" for one in rows)
+        where = f"predicted for {board}" if board else "measured here"
+        yield f"Actions come as late as inferences take ({where}): {late}."
