@@ -32,7 +32,8 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
         drop = f", {100 * first['drop']:.3g} points fewer than of the baseline" if first.get("drop", 0) > 0 else ""
         yield f"It succeeds least{' beside the baseline' if 'drop' in first else ''} under {first['disturbance']}: " \
               f"{first['success']:.1%}{drop}."  # fmt: skip
-    if any(one.get(LATE) for one in rows):
-        late = ", ".join(f"{one.name} {one.value(LATE):.3g} ms" for one in rows)
+    latencies = {one.name: item.value for one in rows for item in one.measurements if item.name == LATE}
+    if latencies:
+        late = ", ".join(f"{name} {ms:.3g} ms" for name, ms in latencies.items())
         where = f"predicted for {board}" if board else "measured here"
         yield f"Actions come as late as inferences take ({where}): {late}."

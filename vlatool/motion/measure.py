@@ -16,7 +16,6 @@ RESAMPLES = 2000
 CONFIDENCE = 0.95
 FEWEST = 8
 """Pairs below which a ratio has no interval."""
-LARGEST = 1e300
 
 
 @cache
@@ -28,7 +27,7 @@ def metrics() -> dict[str, Metric]:
 def measured(track: Track) -> dict[str, float]:
     """Return name -> number of one episode; what the track does not have is left out."""
     values = {name: metric.of(track) for name, metric in metrics().items()}
-    return {name: float(value) for name, value in values.items() if value is not None and abs(value) < LARGEST}
+    return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def ratio_of(

@@ -1,0 +1,184 @@
+"""Episodes of a point that is moved to a goal: what success does not show, motion and disturbances do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests._reach import EAGER, GOOD, TREMBLES, bundle_of, folder_of
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import DataError, UsageError
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.evaluate.recorded import Recorded
+from vlatool.hardware.profile import load_profile
+from vlatool.report import Report, Row
+from vlatool.stage.base import Context
+from vlatool.stage.run import cached_measure
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Bundle]:
+    """One bundle of each kind."""
+    folder = tmp_path_factory.mktemp("reach")
+    kinds = {"good": GOOD, "trembles": TREMBLES, "eager": EAGER}
+    return {name: bundle_of(folder / name, kind) for name, kind in kinds.items()}
+
+
+def evaluated(bundles: dict[str, Bundle], name: str, episodes: int = 60, **options: object) -> Report:
+    baseline = bundles["good"]
+    stage = ClosedLoop(policy=baseline.path.parent / "policy", baseline=baseline.path, episodes=episodes, **options)
+    stage.check(bundles[name], None)
+    return stage.run(bundles[name], Context())
+
+
+@pytest.fixture(scope="module")
+def trembling(bundles: dict[str, Bundle]) -> Report:
+    """The good policy beside the one that trembles."""
+    return evaluated(bundles, "trembles")
+
+
+def test_a_policy_that_trembles_keeps_its_success_and_is_found_by_its_motion(trembling: Report):
+    base, row = trembling.rows
+    assert base.value("success") == row.value("success") == 1.0
+    assert row.value("success_drop") == 0.0
+    for name in (
+        "jerk_ratio",
+        "path_length_ratio",
+        "action_rate_ratio",
+        "spectral_arc_length_ratio",
+    ):
+        assert row.get(name).low > 1.05, name
+        assert row.get(name).samples == 60
+    assert row.value("task_time_ratio") == row.value("steps_ratio") == 1.0
+    assert "most in near" in row.get("jerk_ratio").note, "it trembles as much where there is little to do"
+    assert any(
+        "Where both succeed, more than the baseline's: " in said and "jerk" in said for said in trembling.summary
+    )
+    (first, second) = row.details["against the baseline, by task"]
+    assert {first["task"], second["task"]} == {"near", "far"}
+    assert (first["baseline"], first["success"], first["drop"]) == (1.0, 1.0, 0.0)
+
+
+def test_a_policy_beside_itself_moves_as_it_does(bundles: dict[str, Bundle]):
+    row = evaluated(bundles, "good", 20).rows[-1]
+    ratios = {item.name: (item.value, item.low, item.high) for item in row.measurements if item.name.endswith("_ratio")}
+    assert {"task_time_ratio", "path_length_ratio", "jerk_ratio", "detour_ratio", "steps_ratio"} <= set(ratios)
+    assert set(ratios.values()) == {(1.0, 1.0, 1.0)}
+
+
+def test_a_row_alone_tells_how_it_moves(bundles: dict[str, Bundle]):
+    (row,) = ClosedLoop(policy=bundles["good"].path.parent / "policy", episodes=10).run(bundles["good"], Context()).rows
+    assert row.value("task_time") == pytest.approx(2.0)
+    assert row.get("path_length").unit == "length"
+    assert row.value("detour") == pytest.approx(1.0, abs=0.02)
+    assert "gripper_flips" not in {item.name for item in row.measurements}
+
+
+def test_the_numbers_survive_the_report(trembling: Report):
+    again = Report.from_json(trembling.to_json())
+    assert again.rows[-1].raw == trembling.rows[-1].raw
+    assert "motion.jerk" in again.rows[-1].raw
+
+
+def test_an_eager_policy_is_as_good_and_falls_to_late_observations(bundles: dict[str, Bundle]):
+    report = evaluated(bundles, "eager", disturb=("all",), strength=3.0)
+    row = report.rows[-1]
+    assert row.value("success_drop") == 0.0
+    table = {record["disturbance"]: record for record in row.details["under disturbances"]}
+    assert next(iter(table)) == "delay", "the worst comes first"
+    assert set(table) == {"delay", "dropped_frames", "push"}
+    assert table["delay"]["baseline"] > 0.9
+    assert table["delay"]["drop"] > 0.5
+    assert table["push"]["drop"] == 0.0
+    assert row.get("success_disturbed").samples == 180
+    assert "under delay" in " ".join(report.summary)
+    assert sum(row.raw["disturbed.delay"]) < sum(row.raw["disturbed.delay, baseline"])
+
+
+def test_disturbances_are_the_same_again_and_change_with_their_strength(bundles: dict[str, Bundle]):
+    def path(strength: float) -> tuple[float, ...]:
+        row = evaluated(bundles, "good", 6, disturb=("push", "dropped_frames"), strength=strength).rows[-1]
+        return tuple(record["success"] for record in row.details["under disturbances"]), row.raw["disturbed.push"]
+
+    assert path(1.0) == path(1.0)
+    assert evaluated(bundles, "good", 6, disturb=("push",), strength=0.0).rows[-1].value("success_disturbed") == 1.0
+
+
+@pytest.mark.parametrize(
+    ("kinds", "says"), [(("pushh",), "There is no disturbance 'pushh'.*push"), (("",), "There is no")]
+)
+def test_an_unknown_disturbance_is_refused(bundles: dict[str, Bundle], kinds: tuple[str, ...], says: str):
+    with pytest.raises(UsageError, match=says):
+        evaluated(bundles, "good", 2, disturb=kinds)
+
+
+WRONG = {
+    "words": ('disturbances = ("push",)', 'disturbances = "push"', "it must be a list of words"),
+    "a number": ('disturbances = ("push",)', "disturbances = 5", "it must be a list of words"),
+    "numbers": ('disturbances = ("push",)', "disturbances = (1, 2)", "it must be a list of words"),
+    "no method": ("def disturb(", "def disturbed(", "has no disturb"),
+    "another kind": ("raise ValueError(f", "pass; raise ValueError(f", "failed at seed|offers no|unknown"),
+    "it raises": ("self.push = (strength, seed)", "raise RuntimeError('jammed')", "RuntimeError: jammed"),
+}
+
+
+@pytest.mark.parametrize("case", [name for name in WRONG if name != "another kind"])
+def test_an_environment_that_offers_disturbances_wrongly_is_named(
+    bundles: dict[str, Bundle], tmp_path: Path, case: str
+):
+    before, after, says = WRONG[case]
+    folder = folder_of(tmp_path / "policy")
+    file = folder / "environment.py"
+    text = file.read_text()
+    assert before in text
+    file.write_text(text.replace(before, after))
+    stage = ClosedLoop(policy=folder, episodes=2, disturb=("all",))
+    with pytest.raises(DataError, match=says):
+        stage.run(bundles["good"], Context())
+
+
+def test_an_environment_without_disturbances_has_those_of_the_evaluation(bundles: dict[str, Bundle], tmp_path: Path):
+    folder = folder_of(tmp_path / "policy")
+    file = folder / "environment.py"
+    file.write_text(file.read_text().replace('disturbances = ("push",)', "pass").replace("def disturb(", "def other("))
+    (row,) = ClosedLoop(policy=folder, episodes=2, disturb=("all",)).run(bundles["good"], Context()).rows
+    assert {record["disturbance"] for record in row.details["under disturbances"]} == {"delay", "dropped_frames"}
+
+
+def test_actions_come_as_late_as_a_board_takes(bundles: dict[str, Bundle]):
+    stage = ClosedLoop(policy=bundles["good"].path.parent / "policy", episodes=4, latency_in_the_loop=True)
+    assert ClosedLoop(episodes=4).on(load_profile("raspberry-pi-4")).board == ""
+    on_board = stage.on(load_profile("raspberry-pi-4"))
+    assert on_board.board == "raspberry-pi-4"
+    report = on_board.run(bundles["good"], Context())
+    late = report.rows[0].get("latency_in_the_loop", "predicted")
+    assert late is not None
+    assert late.where == "raspberry-pi-4"
+    assert report.rows[0].value("success") == 1.0
+    assert "predicted for raspberry-pi-4" in report.summary[-1]
+    here = stage.run(bundles["good"], Context())
+    assert here.rows[0].get("latency_in_the_loop").value > 0
+    assert "measured here" in here.summary[-1]
+
+
+def test_what_was_told_and_cannot_be_used_is_said(bundles: dict[str, Bundle], tmp_path: Path):
+    folder = folder_of(tmp_path / "policy")
+    file = folder / "environment.py"
+    file.write_text(file.read_text().replace('{"position": self.at, "success"', '{"position": "here", "success"'))
+    (row,) = ClosedLoop(policy=folder, episodes=2).run(bundles["good"], Context()).rows
+    assert row.details["unmeasured"] == [
+        {"what": "motion from info['position']", "why": "it is str and no number (2 of 2 episodes)"}
+    ]
+    assert {name for name in row.raw if name.startswith("motion.")} == {"motion.task_time", "motion.action_rate",
+                                                                       "motion.reversals"}  # fmt: skip
+
+
+def test_an_evaluation_with_motion_is_kept_and_found_again(bundles: dict[str, Bundle], tmp_path: Path):
+    stage = ClosedLoop(policy=bundles["good"].path.parent / "policy", episodes=4)
+    first = cached_measure(stage, bundles["trembles"], tmp_path, Context())
+    again = cached_measure(stage, bundles["trembles"], tmp_path, Context())
+    assert json.dumps(first.rows[0].raw) == json.dumps(again.rows[0].raw)
+    assert isinstance(first.rows[0], Row)
+    assert Recorded is not ClosedLoop

@@ -1,0 +1,150 @@
+"""Claims about how a candidate moves, its worst task and disturbances, on episodes that are made up."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from tests._reach import EAGER, TREMBLES, bundle_of
+from vlatool.accuracy.disturbed import with_disturbed
+from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.gate.claims import disturbed, motion, task_time, worst_task
+from vlatool.gate.config import DisturbedClaim, Gate, MotionClaim, TaskTimeClaim, WorstTaskClaim, read_gate
+from vlatool.gate.files import gate_files
+from vlatool.gate.run import run_gate
+from vlatool.report import Row
+from vlatool.stage.base import Context
+
+TASKS = ("open", "close", "press")
+
+
+def played(
+    seed: int, count: int, jerk: float = 1.0, time: float = 1.0, lost: dict[str, float] | None = None, own: bool = True
+) -> list[Outcome]:
+    """``count`` episodes; the scene of an episode, and what each policy makes of it, vary."""
+    outcomes = []
+    for number in range(count):
+        task = TASKS[number % 3]
+        scene = np.random.default_rng((7, number)).lognormal(0, 0.4)
+        chance = np.random.default_rng((seed, number, 5))
+        steps = max(2, round(60 * scene * time * chance.lognormal(0, 0.03)))
+        rough = {"path_length": scene, "jerk": jerk * 50 * scene * chance.lognormal(0, 0.05), "task_time": steps / 20}
+        success = bool(chance.random() > (lost or {}).get(task, 0.02))
+        outcomes.append(Outcome(task, number, success, steps, "", rough if own else {"task_time": steps / 20}))
+    return outcomes
+
+
+def episodes(one: list[Outcome], two: list[Outcome], **under: tuple[list[Outcome], list[Outcome]]) -> Any:
+    base = success_row("baseline", "baseline", one)
+    row = compare_success(base, success_row("subject", "subject", two))
+    if under:
+        own, reference = ({kind: pair[place] for kind, pair in under.items()} for place in (1, 0))
+        row = with_disturbed(row, own, reference, 1.0)
+    return SimpleNamespace(rows=(base, row))
+
+
+@pytest.mark.parametrize(("jerk", "verdict"), [(1.0, "pass"), (1.05, "pass"), (1.3, "fail"), (1.1, "inconclusive")])
+def test_rougher_motion_fails(jerk: float, verdict: str):
+    result = motion.examine(episodes(played(1, 300), played(2, 300, jerk=jerk)), MotionClaim(margin=0.1))
+    assert result.verdict == verdict, result.sentence
+    assert result.claim == "motion"
+    assert "allowed: +10.0%" in result.sentence
+    if verdict == "fail":
+        assert re.search(
+            r"^jerk \+\d\d\.\d% \(\+\d\d\.\d% to \+\d\d\.\d%\), most in ", result.sentence.replace("; ", ", ")
+        )
+        assert "path" not in result.sentence, "only what fails is told"
+
+
+def test_honest_candidates_are_not_called_rougher():
+    verdicts = [
+        motion.examine(episodes(played(10 + trial, 150), played(500 + trial, 150)), MotionClaim(margin=0.0)).verdict
+        for trial in range(200)
+    ]
+    assert verdicts.count("fail") <= 6, "1 % of 200 are expected"
+
+
+def test_metrics_that_are_named_count_and_must_be_known():
+    rough = episodes(played(1, 120), played(2, 120, jerk=1.5))
+    assert motion.examine(rough, MotionClaim(metrics=("path_length",), margin=0.1)).verdict == "pass"
+    result = motion.examine(rough, MotionClaim(metrics=("path_length", "gripper_flips"), margin=0.1))
+    assert (result.verdict, "not known: gripper_flips" in result.sentence) == ("inconclusive", True)
+    with pytest.raises(ValidationError, match=r"no metric of motion jitter; allowed: .*jerk"):
+        MotionClaim(metrics=("jitter",))
+
+
+def test_without_positions_or_common_successes_nothing_is_decided():
+    bare = episodes(played(1, 60, own=False), played(2, 60, own=False))
+    assert motion.examine(bare, MotionClaim()).verdict == "inconclusive"
+    lost = episodes(played(1, 30), played(2, 30, lost=dict.fromkeys(TASKS, 1.0)))
+    for result in (motion.examine(lost, MotionClaim()), task_time.examine(lost, TaskTimeClaim())):
+        assert result.verdict == "inconclusive"
+        assert "both succeed" in result.sentence
+
+
+@pytest.mark.parametrize(("time", "verdict"), [(1.0, "pass"), (1.2, "fail"), (1.05, "inconclusive")])
+def test_a_longer_task_fails(time: float, verdict: str):
+    result = task_time.examine(episodes(played(1, 300), played(2, 300, time=time)), TaskTimeClaim())
+    assert result.verdict == verdict, result.sentence
+
+
+def test_a_task_that_is_lost_fails_however_well_the_others_do():
+    bad = episodes(played(1, 600), played(2, 600, lost={"close": 0.3}))
+    result = worst_task.examine(bad, WorstTaskClaim())
+    assert result.verdict == "fail"
+    assert re.search(r"^more failed episodes: close \+2\d\.\d\d%", result.sentence)
+    assert result.measurements[0].note == "close"
+    assert worst_task.examine(episodes(played(1, 30), played(2, 30)), WorstTaskClaim()).verdict == "inconclusive"
+    good = played(1, 3000)
+    assert worst_task.examine(episodes(good, good), WorstTaskClaim()).verdict == "pass"
+
+
+def test_a_disturbance_that_costs_more_than_the_baseline_fails():
+    same = played(1, 600)
+    frail = episodes(same, same, delay=(same, played(3, 600, lost=dict.fromkeys(TASKS, 0.4))), light=(same, same))
+    result = disturbed.examine(frail, DisturbedClaim())
+    assert (result.verdict, "delay" in result.sentence, "light" in result.sentence) == ("fail", True, False)
+    firm = episodes(same, same, delay=(same, same), light=(same, same))
+    assert disturbed.examine(firm, DisturbedClaim()).verdict == "pass"
+
+
+def test_a_gate_with_every_claim_runs_the_episodes_once(tmp_path: Path):
+    good, rough, eager = (bundle_of(tmp_path / name, kind) for name, kind in
+                          (("good", (0.2, 0.0)), ("rough", TREMBLES), ("eager", EAGER)))  # fmt: skip
+    gate = Gate.model_validate({
+        "accuracy": {"max_drop": 0.2, "episodes": 40, "policy": good.path.parent / "policy"}, "latency": None,
+        "answers": None, "memory": None, "size": None, "motion": {}, "task_time": {}, "worst_task": {"max_drop": 0.5},
+        "disturbed": {"max_drop": 0.2, "kinds": ["delay"], "strength": 3},
+    })  # fmt: skip
+
+    def verdicts(candidate: Any) -> dict[str, str]:
+        row: Row = run_gate(candidate, good, gate, Context(), seed=1).rows[-1]
+        return {record["claim"]: record["verdict"] for record in row.details["claims"]}
+
+    passed = {"accuracy": "pass", "motion": "pass", "task_time": "pass", "worst_task": "pass", "disturbed": "pass"}
+    assert verdicts(good) == passed
+    assert verdicts(rough) == {**passed, "motion": "fail"}
+    found = verdicts(eager)
+    assert (found["accuracy"], found["worst_task"], found["disturbed"]) == ("pass", "pass", "fail")
+
+
+def test_claims_of_episodes_need_episodes(tmp_path: Path):
+    with pytest.raises(ValidationError, match=r"motion, disturbed is claimed of closed-loop episodes.*accuracy"):
+        Gate.model_validate({"motion": {}, "disturbed": {}})
+    file = tmp_path / "gate.yaml"
+    file.write_text(gate_files("baseline", "candidate")["gate.yaml"])
+    gate = read_gate(file)
+    assert (gate.motion, gate.task_time, gate.worst_task, gate.disturbed) == (None,) * 4
+    text = file.read_text()
+    for name in ("motion", "task_time", "worst_task", "disturbed"):
+        text = re.sub(rf"^{name}: null.*\n# {name}:\n#  ( .*)$", rf"{name}:\n \1", text, flags=re.MULTILINE)
+    file.write_text(text.replace("# episodes: 200", "episodes: 200"))
+    gate = read_gate(file)
+    assert (gate.motion.margin, gate.task_time.margin) == (0.1, 0.05)
+    assert (gate.worst_task.max_drop, gate.disturbed.max_drop) == (0.03, 0.05)
