@@ -24,6 +24,11 @@ ORDER = (
 """The order in which the numbers of a benchmark are shown; others follow in the order of the report."""
 ABSENT = "unmeasured"
 """The details table that says what could not be had; shown with the numbers that are NaN."""
+BY_TASK, UNDER = "success by task", "under disturbances"
+"""Tables of details that the section on motion draws, beside those against the baseline."""
+AGAINST_BASELINE = "against the baseline"
+OF_MOTION = ("task_speedup", "steps_ratio", "success_disturbed", "worst_task_drop")
+"""Measurements of that section, beside the ratios of metrics."""
 BOARDS = "hwselect"
 """The kind of a report that ranks boards: its rows are no variants."""
 SHORT = {"success_drop": "drop", "latency_p50": "latency p50", "peak_rss": "memory"}
@@ -74,9 +79,16 @@ def headline(report: Report) -> list[str]:
 
 def other_names(report: Report) -> list[str]:
     """Return the measured names that neither the headline nor the error table shows."""
-    shown = {*headline(report), *percentile_names(report)}
+    shown = {*headline(report), *percentile_names(report), *motion_names(report)}
     others = [name for name in names(report) if name not in shown and not ERROR_OF_DIMENSION.match(name)]
     return sorted(others, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
+
+
+def motion_names(report: Report) -> list[str]:
+    """Return the names of the measured numbers that say how the variants move beside the baseline."""
+    present = names(report)
+    ratios = sorted(name for name in present if name.endswith("_ratio") and name not in OF_MOTION)
+    return [*(name for name in OF_MOTION if name in present), *ratios]
 
 
 def percentile_names(report: Report) -> list[str]:

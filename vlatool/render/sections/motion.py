@@ -1,0 +1,70 @@
+"""How the variants move, on which tasks they fail, and what disturbs them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+from vlatool.render._format import plain
+from vlatool.render._view import BY_TASK, UNDER, motion_names
+from vlatool.render.cells import matrix, records_table
+from vlatool.render.charts.shares import Share, shares
+from vlatool.render.charts.svg import tinted
+from vlatool.render.document import Block, Chart, Section
+from vlatool.report import Report
+
+ABOUT = (
+    "Ratios to the baseline in the episodes in which both succeed, less is better; steps are of all episodes, failures "
+    "at full length. The task speed-up is that of an inference by the ratio of steps."
+)
+CAPTION = "Dots: share of episodes that succeed, with its 95 % interval; the worst first."
+AGAINST = "against the baseline, by task"
+INSTRUCTIONS = "against the baseline, by instruction"
+
+
+class Motion:
+    """A table of ratios, success by task and under disturbances."""
+
+    def build(self, report: Report) -> Iterator[Section]:
+        """Return one section, when episodes were played."""
+        blocks: list[Block] = []
+        if shown := motion_names(report):
+            blocks.append(matrix(report, shown, "measured"))
+        for title, groups, key in (
+            ("Success by task", _by_task(report), "task"), ("Success under disturbances", _disturbed(report), "under")
+        ):  # fmt: skip
+            if groups:
+                blocks.append(Chart(partial(shares, groups, title, key), CAPTION))
+        tables = (records_table(report, title) for title in (AGAINST, INSTRUCTIONS, UNDER))
+        blocks += [table for table in tables if table]
+        if blocks:
+            about = ABOUT if shown else ""
+            yield Section("How it moves, and where it fails", tuple(blocks), 45, "measured", about=about, brief=False)
+
+
+def _by_task(report: Report) -> list[tuple[str, list[Share]]]:
+    """Return task -> how often each variant succeeds, that with the worst variant first; nothing for one task."""
+    groups: dict[str, list[Share]] = {}
+    for row, css in tinted(report.rows):
+        for record in row.details.get(BY_TASK, ()):
+            share = Share(
+                plain(row.name), css, record["success"], record.get("low"), record.get("high"), record["episodes"]
+            )
+            groups.setdefault(plain(record.get("task", "")), []).append(share)
+    return _worst_first(groups) if len(groups) > 1 else []
+
+
+def _disturbed(report: Report) -> list[tuple[str, list[Share]]]:
+    groups: dict[str, list[Share]] = {}
+    base = next((row.name for row in report.rows if row.role == "baseline"), "baseline")
+    for row, css in tinted(report.rows):
+        for record in row.details.get(UNDER, ()):
+            group = groups.setdefault(plain(record.get("disturbance", "")), [])
+            if not group and record.get("baseline") is not None:
+                group.append(Share(plain(base), "s-base", record["baseline"], None, None, record["episodes"]))
+            group.append(Share(plain(row.name), css, record["success"], None, None, record["episodes"]))
+    return _worst_first(groups)
+
+
+def _worst_first(groups: dict[str, list[Share]]) -> list[tuple[str, list[Share]]]:
+    return sorted(groups.items(), key=lambda item: min(share.value for share in item[1]))
