@@ -1,12 +1,18 @@
 """BabyAI GoToLocal as the policy sees it: stacked egocentric RGB frames, previous actions, an instruction.
 
 minigrid is imported only when an environment is made, so that a caller can report a missing package.
+The info of every reset and step tells where the agent is, and `disturb` makes the next episodes harder: see README.md.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import math
+import zlib
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -27,7 +33,17 @@ BLANK, UNSEEN, EMPTY, WALL, AGENT, FIRST_OBJECT = range(6)
 CODES = FIRST_OBJECT + len(TYPES) * len(COLOURS)
 HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))  # forward (x, y) of minigrid's agent_dir
 WRONG_INSTRUCTION_STREAM = 20_011  # keeps the draw of a wrong instruction apart from the level's own draws
+# What a disturbance of strength 1 changes, as README.md says it; each is drawn anew for every seed.
+START_CELLS = 2  # how far away the agent starts, at most
+SHIFT = 1  # pixels; whole ones, at least one
+BRIGHTNESS, TINT = 0.15, 0.05  # of the logarithm of the gain of all channels, and of each one, at most
+PIXEL_NOISE = 12.0  # standard deviation, grey levels of 255
+DARK_SHARE = 0.04  # of the image
+# Wordings that training did not use: it always said "go to the COLOUR TYPE" or, of several, "go to a COLOUR TYPE".
+REWORDED = ("to {article} {thing}", "go to {thing}", "go {article} {thing}")
+SHORT = "{thing}"
 
+Cell = tuple[int, int]  # x, y
 Observation = dict[str, Any]
 
 
@@ -94,13 +110,110 @@ def wrong_instruction(colour: str, kind: str, seed: int) -> str:
     return f"go to the {choice[0]} {choice[1]}"
 
 
+def walking_distances(grid: Any, start: Cell) -> dict[Cell, int]:
+    """Every cell that can be reached from `start` over free ones, with the number of moves that takes."""
+    distances, queue = {start: 0}, deque([start])
+    while queue:
+        cell = queue.popleft()
+        for neighbour in neighbours(cell):
+            if neighbour not in distances and grid.get(*neighbour) is None:
+                distances[neighbour] = distances[cell] + 1
+                queue.append(neighbour)
+    return distances
+
+
+def neighbours(cell: Cell) -> list[Cell]:
+    """The cells around one, in the order of `HEADINGS`."""
+    return [(cell[0] + x, cell[1] + y) for x, y in HEADINGS]
+
+
+def pose(level: Any) -> tuple[Cell, int]:
+    """Cell and heading of the agent."""
+    x, y = level.agent_pos
+    return (int(x), int(y)), int(level.agent_dir)
+
+
+def targets(level: Any) -> set[Cell]:
+    """The cells of all objects that fit the mission of a level."""
+    return {(int(x), int(y)) for x, y in level.instrs.desc.obj_poss}
+
+
+def shortest_path(grid: Any, start: Cell, goals: Iterable[Cell]) -> float:
+    """Moves from `start` to the nearest cell beside a goal, from where the agent only has to turn to it."""
+    beside = {cell for goal in goals for cell in neighbours(goal)}
+    return float(min((n for cell, n in walking_distances(grid, start).items() if cell in beside), default=math.inf))
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What is different in an episode. All of it is drawn from the seed and the kind; without a kind, nothing is."""
+
+    kind: str = ""
+    strength: float = 0.0
+    seed: int = 0
+
+    def random(self, step: int = 0) -> np.random.Generator:
+        """What this disturbance draws from at a step of the episode."""
+        return np.random.default_rng([self.seed, zlib.crc32(self.kind.encode()), step])
+
+    def move_start(self, level: Any) -> None:
+        """Put the agent on another cell nearby, or turn it, with no object of the mission right in front."""
+        if self.kind != "start_pose":
+            return
+        moves = walking_distances(level.grid, pose(level)[0])
+        near = [cell for cell, number in moves.items() if number <= self.strength * START_CELLS]
+        poses = [(c, h) for c in near for h in range(4) if neighbours(c)[h] not in targets(level)]
+        poses = [new for new in poses if new != pose(level)]
+        if poses:
+            level.agent_pos, level.agent_dir = poses[self.random().integers(len(poses))]
+
+    def images(self, images: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
+        """The frames (8, 56, 56, 3) at a step, shifted, partly covered, noisy or in another light."""
+        if self.kind == "camera_shift":
+            angle, border = self.random().uniform(0, 2 * math.pi), math.ceil(self.strength * SHIFT)
+            y, x = border + round(border * math.sin(angle)), border + round(border * math.cos(angle))
+            padded = np.pad(images, ((0, 0), (border, border), (border, border), (0, 0)), mode="edge")
+            return padded[:, y : y + PIXELS, x : x + PIXELS]
+        if self.kind == "occlusion":
+            side = min(round(PIXELS * math.sqrt(self.strength * DARK_SHARE)), PIXELS)
+            y, x = self.random().integers(PIXELS - side + 1, size=2)
+            covered = images.copy()
+            covered[:, y : y + side, x : x + side] = 0
+            return covered
+        if self.kind == "light":
+            random = self.random()
+            gain = BRIGHTNESS * random.uniform(-1, 1) + TINT * random.uniform(-1, 1, 3)
+            return np.clip(np.rint(images * np.exp(self.strength * gain)), 0, 255).astype(np.uint8)
+        if self.kind == "sensor_noise":
+            noise = np.zeros(images.shape)
+            for age in range(min(step + 1, FRAMES)):  # a frame keeps the noise that it was taken with
+                noise[-1 - age] = self.random(step - age).normal(size=images.shape[1:])
+            return np.clip(np.rint(images + self.strength * PIXEL_NOISE * noise), 0, 255).astype(np.uint8)
+        return images
+
+    def instruction(self, instruction: str) -> str:
+        """Other words for the same, in a share `strength` of the seeds; above 1, some name the object alone."""
+        if self.kind != "wording":
+            return instruction
+        random = self.random()
+        reworded = REWORDED[random.integers(len(REWORDED))]
+        share = random.uniform()
+        if share >= self.strength:
+            return instruction
+        _, _, article, thing = instruction.split(maxsplit=3)
+        return (SHORT if share < self.strength - 1 else reworded).format(article=article, thing=thing)
+
+
 class GoToLocal(gymnasium.Env[Observation, int]):
     """One GoToLocal level; the last 8 frames and 7 actions are the observation, so the policy needs no state.
 
     Attributes:
         level: minigrid's own environment, which moves the agent and judges success.
-        view_codes: (8, 7, 7) tile codes of the frames of the current observation.
+        view_codes: (8, 7, 7) tile codes of the frames of the current observation, without any disturbance.
+        disturbances: the kinds that `disturb` knows.
     """
+
+    disturbances = ("start_pose", "camera_shift", "light", "sensor_noise", "wording", "occlusion")
 
     def __init__(self, task: str, instruction: str = "right") -> None:
         if instruction not in ("right", "wrong"):
@@ -119,6 +232,19 @@ class GoToLocal(gymnasium.Env[Observation, int]):
             }
         )
         self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
+        self._disturbance = self._next_disturbance = Disturbance()
+
+    def disturb(self, kind: str, strength: float, seed: int) -> None:
+        """Make the episodes from the next reset on differ by one of `disturbances`.
+
+        Strength 0 changes nothing, 1 is an ordinary day in a lab, and 2 is twice that. What is drawn depends on the
+        seed and the kind alone; the level stays that of the episode's own seed.
+        """
+        if kind not in self.disturbances:
+            raise ValueError(f"unknown disturbance {kind!r}; known: {', '.join(self.disturbances)}")
+        if not 0 <= strength < math.inf:
+            raise ValueError(f"the strength of a disturbance must be 0 or more, not {strength}")
+        self._next_disturbance = Disturbance(kind, strength, seed) if strength else Disturbance()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -130,17 +256,24 @@ class GoToLocal(gymnasium.Env[Observation, int]):
             self.level.reset(seed=seed)
         target = self.level.instrs.desc
         wrong = self.instruction_mode == "wrong"
-        self.instruction = wrong_instruction(target.color, target.type, seed) if wrong else self.level.mission
+        self._disturbance = self._next_disturbance
+        self._disturbance.move_start(self.level)
+        told = wrong_instruction(target.color, target.type, seed) if wrong else self.level.mission
+        self.instruction = self._disturbance.instruction(told)
         self._floor = floor_codes(self.level.grid)
         self.view_codes = np.full((FRAMES, VIEW, VIEW), BLANK, np.uint8)
         self.past_actions = np.full(FRAMES - 1, NO_ACTION, np.int64)
         self._remember_view()
-        return self._observation(), {"mission": self.level.mission}
+        path = shortest_path(self.level.grid, pose(self.level)[0], targets(self.level))
+        return self._observation(), {"mission": self.level.mission, "shortest_path": path, **self._where()}
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take action 0 left, 1 right or 2 forward; `success` stands in the info of every step."""
+        before = pose(self.level)[0]
         truncated, success = self.move(action)
-        return self._observation(), float(success), success, truncated and not success, {"success": success}
+        collision = ACTIONS[int(action)] == "forward" and pose(self.level)[0] == before and not success
+        info = {"success": success, "collision": collision, **self._where()}
+        return self._observation(), float(success), success, truncated and not success, info
 
     def move(self, action: int) -> tuple[bool, bool]:
         """Act without rendering; returns whether the time is up and whether the mission is accomplished."""
@@ -149,13 +282,19 @@ class GoToLocal(gymnasium.Env[Observation, int]):
         self._remember_view()
         return bool(truncated), bool(reward > 0)
 
+    def _where(self) -> dict[str, Any]:
+        """Position (x, y in cells) and heading (rad, from x towards y, which points down)."""
+        cell, heading = pose(self.level)
+        return {"position": np.array(cell, float), "heading": heading * math.pi / 2}
+
     def _remember_view(self) -> None:
-        x, y = self.level.agent_pos
-        view = egocentric_view(self._floor, x, y, self.level.agent_dir)
+        (x, y), heading = pose(self.level)
+        view = egocentric_view(self._floor, x, y, heading)
         self.view_codes = np.concatenate((self.view_codes[1:], view[None]))
 
     def _observation(self) -> Observation:
-        return {"image": render(self.view_codes), "actions": self.past_actions, "instruction": self.instruction}
+        image = self._disturbance.images(render(self.view_codes), self.level.step_count)
+        return {"image": image, "actions": self.past_actions, "instruction": self.instruction}
 
 
 def make(task: str, instruction: str = "right") -> gymnasium.Env[Observation, int]:
