@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from tests._flow import write_flow
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.environment import World
 from vlatool.episodes.play import EpisodesJob, run_jobs
 from vlatool.errors import DataError
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.export.onnx import ExportOnnx
+from vlatool.runtime import load
+from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
+from vlatool.stage.run import run_transform
 
 GOOD = """\
 import numpy as np
@@ -109,3 +117,38 @@ def test_a_reset_that_hides_its_parameters_is_believed():
             return Box.reset(self, **named)
 
     assert list(World(Hidden(), "any", ONE).reset(1)[0]) == ["state"]
+
+
+FLOW_WORLD = """\
+import numpy as np
+
+class World:
+    def reset(self, *, seed=None):
+        self.first = []
+        return {"state": np.ones(3, np.float32)}, {}
+
+    def step(self, action):
+        return {"state": np.ones(3, np.float32)}, 0.0, True, False, {"success": bool(action[0] > THRESHOLD)}
+
+def make(task):
+    return World()
+"""
+
+
+def test_each_episode_has_noise_of_its_own_and_every_variant_the_same(tmp_path: Path):
+    """The world is always the same: only the noise can make one episode succeed and another fail."""
+    folder = write_flow(tmp_path / "flow")
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "module", Context())
+    bundle = run_transform(ExportOnnx(), source, tmp_path / "bundle", Context())
+    policy = load(bundle.path, seed=3)
+    firsts = []
+    for seed in range(8):
+        policy.reset(seed)
+        firsts.append(float(policy.infer({"state": np.ones(3, np.float32)}).chunk[0, 0]))
+    assert len(set(firsts)) == 8
+    threshold = sorted(firsts)[3]
+    (folder / "world.py").write_text(FLOW_WORLD.replace("THRESHOLD", repr(threshold)))
+    stage = ClosedLoop(environment=f"{folder / 'world.py'}:make", tasks=("any",), episodes=8, first_seed=0,
+                       baseline=bundle.path)  # fmt: skip
+    for row in stage.run(bundle, Context(workers=2)).rows:
+        assert row.raw["success"] == [float(first > threshold) for first in firsts]

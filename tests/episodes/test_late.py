@@ -29,7 +29,7 @@ class Numbered:
     def stopped_after(self, _seconds: float) -> Any:
         return contextlib.nullcontext()
 
-    def reset(self) -> None:
+    def reset(self, seed: int | None = None) -> None:
         self.resets += 1
 
 

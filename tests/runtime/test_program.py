@@ -92,6 +92,14 @@ def test_the_seed_fixes_the_noise_and_reset_restarts_it():
     np.testing.assert_array_equal(first.run({})["y"], drawn[0])
 
 
+def test_an_episode_may_have_a_seed_of_its_own():
+    program, other = noisy(seed=5), noisy(seed=9)
+    program.reset(seed=9)
+    np.testing.assert_array_equal(program.run({})["y"], other.run({})["y"])
+    program.reset()
+    np.testing.assert_array_equal(program.run({})["y"], noisy(seed=5).run({})["y"])
+
+
 def test_without_a_seed_noise_is_fresh():
     assert not np.array_equal(noisy().run({})["y"], noisy().run({})["y"])
 

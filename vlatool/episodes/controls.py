@@ -60,5 +60,5 @@ class Blind:
             return np.asarray(self._random.integers(self._labels))
         return np.array(self._answers[self._random.integers(len(self._answers))])
 
-    def reset(self) -> None:
+    def reset(self, seed: int | None = None) -> None:
         """Nothing is carried from episode to episode."""

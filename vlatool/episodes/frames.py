@@ -85,6 +85,6 @@ class Noisy:
             return np.asarray(random) if self._random.random() < self._noise else action
         return np.asarray(action + self._random.standard_normal(action.shape) * self._spread, action.dtype)
 
-    def reset(self) -> None:
-        """Begin an episode."""
-        self._queue.reset()
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode, with noise of this seed."""
+        self._queue.reset(seed)

@@ -71,10 +71,10 @@ class Late:
             return self._rest.pop(0)
         return held(self._action, self._last)
 
-    def reset(self) -> None:
-        """Begin an episode."""
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode, with noise of this seed."""
         self._begin()
-        self._policy.reset()
+        self._policy.reset(seed)
 
 
 def held(action: TensorSpec, last: Array | None) -> Array:

@@ -173,8 +173,8 @@ class Actor(Protocol):
     def act(self, observation: Mapping[str, Any]) -> Array:
         """Return the action of this control step: (A,) float32, or a 0-d int64 index."""
 
-    def reset(self) -> None:
-        """Begin an episode."""
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode, with noise of this seed."""
 
 
 class BoundedQueue(ChunkQueue):
@@ -290,7 +290,7 @@ def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, see
             if job.disturb and job.disturb not in OWN:
                 world.disturb(job.disturb, job.strength, seed)
             observation, info = world.reset(seed)
-            queue.reset()
+            queue.reset(seed)
             success, body, seen = Success(), Body(spec), Seen(spec, job.disturb, job.strength, seed)
             body.look(info)
             told = told_to(observation, spec)

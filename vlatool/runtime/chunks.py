@@ -58,14 +58,17 @@ class ChunkQueue:
             finally:
                 self._owner = 0
 
-    def reset(self) -> None:
+    def reset(self, seed: int | None = None) -> None:
         """Forget the pending actions and what the policy carries from step to step.
 
+        Args:
+            seed: Of the noise of the new episode; see ``Policy.reset``.
+
         Raises:
-            UsageError: when this thread's own step is under way.
+            UsageError: when this thread's own step is under way, or as ``Policy.reset`` does.
         """
         if self._owner == threading.get_ident():
             raise UsageError("The queue is reset within its own step (a signal handler?).", "reset between two steps")
         with self._turn:
             self._pending = []
-            self.policy.reset()
+            self.policy.reset(seed)

@@ -17,6 +17,7 @@ from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import BundleError, GraphError, UsageError
 from vlatool.files.printable import printable
+from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.arithmetic import int8_trouble, machine
 from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, written_as_declared
 from vlatool.runtime.decoder import Decoder
@@ -157,17 +158,21 @@ class Policy:
                 fix,
             )
 
-    def reset(self) -> None:
-        """Start a new episode: forget kept values, restart the noise from its seed.
+    def reset(self, seed: int | None = None) -> None:
+        """Start a new episode: forget kept values, restart the noise.
+
+        Args:
+            seed: Of the noise of this episode; that of the policy when None, so that all episodes draw the same.
 
         Raises:
-            UsageError: when this thread's own inference is under way.
+            UsageError: when the seed is no whole number from 0, or this thread's own inference is under way.
         """
+        check_whole("seed", seed, 0, optional=True)
         with self._turn:
             if self._busy:
                 self._check_overlap()
             self._sequence = 0
-            self.program.reset()
+            self.program.reset(seed)
 
     @contextlib.contextmanager
     def stopped_after(self, seconds: float) -> Iterator[None]:

@@ -56,9 +56,9 @@ class Program:
             return None
         return self.sessions[step.graph].run, list(step.feeds.items()), list(step.gives.items())
 
-    def reset(self) -> None:
-        """Zero the kept values and restart the noise from the seed."""
-        self._random = np.random.default_rng(self._seed)
+    def reset(self, seed: int | None = None) -> None:
+        """Zero the kept values and restart the noise: from this seed, or from that of the program when None."""
+        self._random = np.random.default_rng(self._seed if seed is None else seed)
         self._kept = {
             name: np.zeros(kept["shape"], kept.get("dtype", "float32"))
             for step in self.steps
