@@ -78,7 +78,7 @@ def tables(comparison: Plan, discordant: list[float]) -> None:
         f"\nlimit {comparison.limit:.1%}, at most {comparison.most} pairs, alpha {comparison.alpha:.1%} on either side"
     )
     print("  drop discordant     fail     pass inconclusive  pairs  saved")
-    for drop in (comparison.limit, 0.0):
+    for drop in sorted({comparison.limit, 0.0}, reverse=True):
         for share in discordant:
             if share < drop or not share:
                 continue
