@@ -120,7 +120,7 @@ def test_what_is_hopeless_ends_early_and_nothing_else_changes() -> None:
 
 @pytest.mark.parametrize(("lose", "win"), [(0.03, 0.03), (0.1, 0.02)])
 def test_the_interval_covers_the_drop_wherever_the_comparison_ended(lose: float, win: float) -> None:
-    comparison, runs = plan(limit=0.05, most=120), 500
+    comparison, runs = plan(limit=0.05, most=120), 300
     found = played(comparison, [(lose, win)], runs)
     cells = list(zip(found.lost.tolist(), found.won.tolist(), found.pairs.tolist(), strict=True))
     intervals = {cell: comparison.interval(*cell) for cell in set(cells)}
@@ -134,7 +134,7 @@ def test_the_interval_agrees_with_the_verdict(limit: float) -> None:
     random = np.random.default_rng(1)
     comparison = plan(limit, most=200, futile=0)
     seen = set()
-    for _ in range(60):
+    for _ in range(40):
         pairs = int(random.choice(comparison.interim_analyses))
         lost = int(random.binomial(pairs, random.choice([0.01, 0.1, 0.3])))
         won = int(random.binomial(pairs - lost, random.choice([0.0, 0.02, 0.3])))
@@ -145,6 +145,15 @@ def test_the_interval_agrees_with_the_verdict(limit: float) -> None:
         assert found.verdict == comparison.verdict(lost, won, pairs)
         seen.add(found.verdict)
     assert {"fail", "go on"} <= seen
+
+
+def test_the_interval_agrees_with_the_verdict_however_near_the_limit_is_to_a_bound() -> None:
+    _, low, high = plan(0.0, 200).interval(20, 4, 200)
+    for bound in (low, high):
+        for off in np.linspace(-2e-5, 2e-5, 9):
+            found = plan(bound + off, 200).judge(20, 4, 200)
+            assert (found.low > found.limit) == (found.verdict == "fail")
+            assert (found.high <= found.limit) == (found.verdict == "pass")
 
 
 def restricted_by_search(lost: int, won: int, pairs: int, drop: float) -> float:

@@ -42,8 +42,8 @@ ANALYSES = 10
 FUTILE = 0.1
 """Chance of a verdict below which no more pairs are played."""
 GO_ON = "go on"
-_WINDOW = 7.0
-"""Standard deviations of the number of discordant pairs beyond which nothing is summed up (about 1e-12 is left)."""
+_WINDOW = 6.0
+"""Standard deviations of the number of discordant pairs, and pairs, beyond which nothing is added up (1e-9)."""
 _RESOLUTION = 1e-5
 """Of the bounds, a share."""
 _GRID = 801
@@ -286,7 +286,7 @@ def exact_p(lost: int, won: int, pairs: int, drop: float) -> float:
     away = 0.5 / math.sqrt(pairs)  # a standard error of the root of a share
     least = max(abs(drop), 1e-9)
     rates = np.clip(np.array([max(0.0, rate - away), rate, rate + away]) ** 2, least, 1)[:, None]
-    spread = _WINDOW * np.sqrt(pairs * rates * (1 - rates)) + 2 * _WINDOW
+    spread = _WINDOW * np.sqrt(pairs * rates * (1 - rates)) + _WINDOW
     first = max(0, math.floor(float((pairs * rates - spread).min())))
     last = min(pairs, math.ceil(float((pairs * rates + spread).max())))
     discordant = np.arange(first, last + 1)
@@ -304,11 +304,10 @@ def _fewest_lost(lost: int, won: int, pairs: int, drop: float, discordant: NDArr
     """
     seen = float(_score(lost, won, pairs, drop)) - 1e-9
     below, reached = np.full_like(discordant, -1), discordant + 1
-    while (reached - below > 1).any():
-        middle = np.clip((below + reached) // 2, 0, discordant)
+    for _ in range(int(reached[-1] + 1).bit_length()):
+        middle = np.maximum((below + reached) // 2, 0)
         enough = _score(middle, discordant - middle, pairs, drop) >= seen
-        open_ = reached - below > 1
-        reached, below = np.where(open_ & enough, middle, reached), np.where(open_ & ~enough, middle, below)
+        below, reached = np.where(enough, below, middle), np.where(enough, middle, reached)
     return reached
 
 
@@ -322,7 +321,7 @@ def _restricted(lost: int | NDArray[np.int64], won: int | NDArray[np.int64], pai
     """Return the maximum likelihood estimate of the chance to win when the true drop is ``drop`` (Tango 1998)."""
     linear = (2 * pairs - lost + won) * drop - (lost + won)
     root = np.sqrt(np.maximum(linear * linear + 8 * pairs * won * drop * (1 - drop), 0.0))
-    return np.clip((root - linear) / (4 * pairs), max(0.0, -drop), (1 - drop) / 2)
+    return np.asarray(np.maximum((root - linear) / (4 * pairs), max(0.0, -drop)))
 
 
 def _lower_bound(lost: int, won: int, pairs: int, level: float, limit: float) -> float:
