@@ -20,6 +20,10 @@ statistic does, or is a standard error to either side of that, whichever gives t
 Lloyd and Moldovan (Statistics in Medicine 27, 2008), and some of the maximum of Berger and Boos (J. American
 Statistical Association 89, 1994). ``tests/soak/success_trials.py`` adds up both errors exactly.
 
+**What it saves.** Without a drop, two episodes of five and more wherever the largest number would nearly always do: up
+to 8 % discordant pairs of 1,000 at a limit of 3 %, 2 % of 3,000 at 1 %. Where even all of them leave every other
+comparison open, 30 %, most of it by ending what is hopeless.
+
 **What the caller must see to.** Every task has the same share of the pairs at each interim analysis (``plan(tasks=)``
 makes that possible), since the drop is one over all tasks; and the pairs of an analysis are all played before it.
 """
