@@ -12,7 +12,8 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.stats import binom, multinomial, norm
 
-from vlatool.stats.success_sequential import Decision, Plan, exact_p, plan, spent_in_turns
+from vlatool.stats.intervals import paired_drop
+from vlatool.stats.success_sequential import Decision, Plan, exact_drop, exact_p, plan, spent_in_turns
 
 RUNS = 10_000
 
@@ -325,3 +326,20 @@ def test_a_decision_is_plain_numbers() -> None:
     found = plan(0.03, 500).judge(3, 1, 250)
     assert [type(value) for value in vars(found).values()] == [str, float, float, float, float, int, int, int, int]
     assert isinstance(found, Decision)
+
+
+@pytest.mark.parametrize(("pairs", "limit", "confidence"), [(200, 0.01, 0.95), (200, 0.03, 0.98), (300, 0.01, 0.98)])
+def test_a_fixed_number_of_pairs_passes_falsely_no_more_often_than_it_says(
+    pairs: int, limit: float, confidence: float
+) -> None:
+    """On the limit, with nothing won: how often the upper bound lies below it, added up exactly."""
+    alpha = (1 - confidence) / 2
+    chances = [math.comb(pairs, lost) * limit**lost * (1 - limit) ** (pairs - lost) for lost in range(20)]
+    errs = {
+        bounds.__name__: sum(
+            chance for lost, chance in enumerate(chances) if bounds(lost, 0, pairs, confidence)[2] <= limit
+        )
+        for bounds in (exact_drop, paired_drop)
+    }
+    assert errs["exact_drop"] <= alpha
+    assert errs["paired_drop"] > 2 * alpha, "which is why the gate asks for the exact one"

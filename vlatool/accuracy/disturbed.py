@@ -9,7 +9,8 @@ from typing import Any
 from vlatool.accuracy.moved import RATIO, STEPS
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.report import Measurement, Row
-from vlatool.stats.intervals import paired_drop, wilson
+from vlatool.stats.intervals import wilson
+from vlatool.stats.success_sequential import exact_drop
 
 Episodes = Mapping[str, Sequence[Outcome]]
 DISTURBED = "disturbed."
@@ -68,7 +69,7 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
         kind = name.removeprefix(DISTURBED)
         pairs = list(zip(row.raw[f"{name}{OF_BASELINE}"], row.raw[name], strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
-        drop, low, high = paired_drop(lost, won, len(pairs), confidence)
+        drop, low, high = exact_drop(lost, won, len(pairs), confidence)
         drops[kind] = Measurement("disturbed_drop", drop, "1", samples=len(pairs), low=low, high=high,
                                   confidence=confidence, note=kind)  # fmt: skip
     return drops

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vlatool.motion.measure import FEWEST, ratio_of
 from vlatool.report import Measurement, Row
-from vlatool.stats.intervals import paired_drop
+from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
 MOTION = "motion."
@@ -171,7 +171,7 @@ class _Pairs:
     def _drop(self, chosen: NDArray[np.bool_], confidence: float) -> tuple[tuple[float, float, float], int]:
         before, after = (won[chosen] for won in self._wins)
         lost, won = int((before & ~after).sum()), int((after & ~before).sum())
-        return paired_drop(lost, won, len(before), confidence), len(before)
+        return exact_drop(lost, won, len(before), confidence), len(before)
 
     def _values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:
         base, own = (self._of(one, f"{MOTION}{name}") for one in self._rows)

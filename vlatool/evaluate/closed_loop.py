@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -18,11 +19,12 @@ from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, disturbances_of
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
+from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._told import told
 from vlatool.machine.host import fingerprint
 from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
-from vlatool.report import Report, Row
+from vlatool.report import Measurement, Report, Row
 from vlatool.stage.base import Context, Measure
 from vlatool.user_code import trust
 
@@ -53,6 +55,12 @@ class ClosedLoop(Measure):
     )
     instruction: Literal["right", "wrong"] = Field("right", description="wrong: the control that a policy must fail")
     engine: str = Field("", description="engine of the runtime; the one that each bundle was made for when empty")
+    limit: float | None = Field(
+        None,
+        ge=0,
+        lt=1,
+        description="stop when it is decided whether the drop is above this share (0.03 = 3 points)",
+    )
     disturb: tuple[str, ...] = Field(
         (), description="disturbances to play as well: all, or some of delay, dropped_frames and the environment's own"
     )
@@ -73,7 +81,9 @@ class ClosedLoop(Measure):
         return (*([self.baseline / MANIFEST] if self.baseline else []), *code)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Environment and tasks are named, and the environment may run."""
+        """Environment and tasks are named, the environment may run, and a limit has something to hold against."""
+        if self.limit is not None and (not self.baseline or self.control):
+            raise UsageError("--limit is the largest drop against a baseline, and none is named.", "add --baseline DIR")
         self._may_run(self._jobs(source)[0])
 
     def on(self, profile: Profile) -> ClosedLoop:
@@ -88,14 +98,21 @@ class ClosedLoop(Measure):
         bundles = [*([Bundle.open(self.baseline)] if self.baseline else []), source]
         waits = [latency_of(one, self.board, self.engine, context) if self.latency_in_the_loop else None
                  for one in bundles]  # fmt: skip
+        plays = [partial(self._play, one, wait, context) for one, wait in zip(bundles, waits, strict=True)]
         rows: list[Row] = []
-        believed = Credibility("unknown")
+        believed, decision = Credibility("unknown"), None
+        if self.baseline and self.limit is not None:
+            first, outcomes, decision = played_until(jobs, self.limit, plays[0], plays[1], context)
+            reference = [first]
+            jobs = jobs_for(jobs[0], list(dict.fromkeys(job.task for job in jobs)), decision.pairs, self.first_seed)
+        else:
+            *reference, outcomes = (play(jobs) for play in plays)
         if self.baseline:
-            rows.append(self._reference(bundles[0], late(jobs, waits[0]), context))
+            rows.append(self._reference(bundles[0], reference[0], context))
             believed = credibility(rows[0]) if self.instruction == "right" else believed
-        outcomes = run_jobs(source, late(jobs, waits[-1]), self.engine, context)
         row = success_row(source.manifest.name, "subject", outcomes)
         row = compare_success(rows[0], row) if rows else row
+        row = with_decision(row, decision) if decision else row
         if kinds:
             played = [self._disturbed(kinds, late(jobs, wait), one, context)
                       for one, wait in zip(bundles, waits, strict=True)]  # fmt: skip
@@ -108,11 +125,17 @@ class ClosedLoop(Measure):
         title = f"{source.manifest.name}{how} in {count} closed-loop episodes"
         how = f" with {self.control} actions in the place of the policy's" if self.control else how
         text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
-        verdict = "inconclusive" if believed.fails else "info"
+        verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
+        decided = (sentence(decision),) if decision else ()
         return Report(
-            "evaluate", title, verdict, (*believed.sentences, text, *told(rows, self.board)), tuple(rows),
+            "evaluate", title, verdict, (*believed.sentences, *decided, text, *told(rows, self.board)), tuple(rows),
             environment=fingerprint(), warnings=(*believed.warnings, *found_wrong(source)),
         )  # fmt: skip
+
+    def _play(
+        self, bundle: Bundle, wait: Measurement | None, context: Context, jobs: list[EpisodesJob]
+    ) -> list[Outcome]:
+        return run_jobs(bundle, late(jobs, wait), self.engine, context)
 
     def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
         """Return the disturbances that are asked for.
@@ -138,9 +161,9 @@ class ClosedLoop(Measure):
             played[kind] = run_jobs(bundle, disturbed, self.engine, context)
         return played
 
-    def _reference(self, baseline: Bundle, jobs: list[EpisodesJob], context: Context) -> Row:
-        """Play the baseline, and the controls that show what succeeds by chance."""
-        row = success_row("baseline", "baseline", run_jobs(baseline, jobs, self.engine, context))
+    def _reference(self, baseline: Bundle, outcomes: list[Outcome], context: Context) -> Row:
+        """Return the row of the baseline's episodes; play the controls that show what succeeds by chance."""
+        row = success_row("baseline", "baseline", outcomes)
         if self.instruction != "right":
             return row
         controls = []
@@ -151,12 +174,12 @@ class ClosedLoop(Measure):
 
     def controls(self) -> list[ClosedLoop]:
         """Return the evaluations that show what succeeds by chance, on the first of the same seeds."""
-        less = {"episodes": self._few(), "baseline": None, "disturb": (), "latency_in_the_loop": False}
+        less = {"episodes": self._few(), "baseline": None, "disturb": (), "latency_in_the_loop": False, "limit": None}
         return [self.model_copy(update={"control": control, **less}) for control in CONTROLS]
 
     def told_wrong(self) -> ClosedLoop:
         """Return the evaluation of as many episodes in which the policy is told the wrong instruction."""
-        less = {"episodes": self._few(), "baseline": None, "disturb": ()}
+        less = {"episodes": self._few(), "baseline": None, "disturb": (), "limit": None}
         return self.model_copy(update={"instruction": "wrong", **less})
 
     def _few(self) -> int:

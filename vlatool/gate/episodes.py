@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.evaluate.closed_loop import ClosedLoop
@@ -32,10 +33,10 @@ class Episodes:
         disturbed: DisturbedClaim | None = None,
     ) -> None:
         self._candidate, self._context = candidate, context
-        self._stage = ClosedLoop(episodes=claim.episodes, baseline=baseline.path, policy=claim.policy, engine=engine)
+        self._options: dict[str, Any] = {"episodes": claim.episodes, "baseline": baseline.path, "policy": claim.policy}
+        self._options |= {"engine": engine}
         if disturbed:
-            update = {"disturb": disturbed.kinds, "strength": disturbed.strength}
-            self._stage = self._stage.model_copy(update=update)
+            self._options |= {"disturb": disturbed.kinds, "strength": disturbed.strength}
 
     @cached_property
     def rows(self) -> tuple[Row, Row]:
@@ -44,6 +45,7 @@ class Episodes:
         Raises:
             DataError: when no environment is named, or it fails.
         """
-        self._stage.check(self._candidate, None)
-        baseline, candidate = self._stage.run(self._candidate, self._context).rows
+        stage = ClosedLoop(**self._options)
+        stage.check(self._candidate, None)
+        baseline, candidate = stage.run(self._candidate, self._context).rows
         return baseline, candidate

@@ -71,4 +71,4 @@ class ChunkQueue:
             raise UsageError("The queue is reset within its own step (a signal handler?).", "reset between two steps")
         with self._turn:
             self._pending = []
-            self.policy.reset(seed)
+            self.policy.reset() if seed is None else self.policy.reset(seed)

@@ -350,3 +350,16 @@ def _lower_bound(lost: int, won: int, pairs: int, level: float, limit: float) ->
         middle = (below + above) / 2
         below, above = (middle, above) if ruled_out(middle) else (below, middle)
     return (below + above) / 2
+
+
+def exact_drop(lost: int, won: int, pairs: int, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Return the drop of a fixed number of pairs, with an interval whose bounds err no more often than they say.
+
+    ``intervals.paired_drop`` is quicker, and near nominal on both sides together; on one side it errs up to five times
+    as often as it says where hardly any pair is discordant.
+
+    Args:
+        lost, won, pairs: Counts; pairs from 1.
+        confidence: Of the interval.
+    """
+    return plan(0.0, pairs, alpha=(1 - confidence) / 2, analyses=1).interval(lost, won, pairs)

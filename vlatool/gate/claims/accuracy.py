@@ -19,7 +19,7 @@ from vlatool.gate.episodes import Episodes
 from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
-from vlatool.stats.intervals import paired_drop
+from vlatool.stats.success_sequential import exact_drop
 
 MOST_SAMPLES = 100_000
 
@@ -121,7 +121,7 @@ def _closed_loop(episodes: Episodes) -> _Drop:
     before, after = (row.raw["success"] for row in rows)
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
-    value, low, high = paired_drop(lost, won, len(before), CONFIDENCE)
+    value, low, high = exact_drop(lost, won, len(before), CONFIDENCE)
     return _Drop("success_drop", "more failed episodes:", value, low, high, len(before), rows[0].measurements)
 
 
