@@ -23,6 +23,8 @@ SPEEDUP = "task_speedup"
 BY_TASK, BY_INSTRUCTION = "success by task", "success by instruction"
 AGAINST = {"task": "against the baseline, by task", "instruction": "against the baseline, by instruction"}
 CONFIDENCE = 0.95
+LONGEST = 20
+"""Tasks, or instructions, of a table: those that lose most."""
 
 
 def compare_motion(baseline: Row, row: Row) -> Row:
@@ -147,15 +149,16 @@ class _Pairs:
             record = {key: name, "episodes": count, "baseline": round(before, 4), "success": round(after, 4)}
             record |= {"drop": round(value, 4), "low": round(low, 4), "high": round(high, 4)}
             records.append(record | self._ratios_of(own))
-        return sorted(records, key=lambda record: -record["drop"]) if len(records) > 1 else []
+        return sorted(records, key=lambda record: -record["drop"])[:LONGEST] if len(records) > 1 else []
 
     def _ratios_of(self, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return metric -> ratio among some episodes."""
+        """Return metric -> ratio among some episodes; nothing where both succeed in fewer than ``FEWEST`` of them."""
         ratios: dict[str, Any] = {}
         for name in self._metrics:
             own, base, known = self._values(name)
             known = known & chosen
-            if (own[known].any() or base[known].any()) and (ratio := ratio_of(own[known], base[known])):
+            enough = known.sum() >= FEWEST and (own[known].any() or base[known].any())
+            if enough and (ratio := ratio_of(own[known], base[known])):
                 ratios[f"{name.replace('_', ' ')}, x"] = round(ratio[0], 3)
         return ratios
 

@@ -50,7 +50,7 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
     words = "; ".join(f"{name}: {', '.join(share.told for share in group)}" for name, group in groups)
     canvas = Canvas(f"shares-{key}-{width}", width, round(height), title, words)
     least = min(share.value if share.low is None else share.low for _, group in groups for share in group)
-    across = Axis(max(0.0, min(0.9, least - 0.02)), 1.0, left + 8, width - 14.0)
+    across = Axis(max(0.0, min(0.9, least - 0.02)), 1.0, left + 8, width - 24.0)
     base = height - FOOT
     for value in across.ticks(6 if width > 500 else 4):
         canvas.line(across(value), TOP, across(value), base, "grid")

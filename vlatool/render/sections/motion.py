@@ -12,6 +12,7 @@ from vlatool.render.charts.shares import Share, shares
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Block, Chart, Section
 from vlatool.report import Report
+from vlatool.stats.intervals import wilson
 
 ABOUT = (
     "Ratios to the baseline in the episodes in which both succeed, less is better; steps are of all episodes, failures "
@@ -34,7 +35,7 @@ class Motion:
             ("Success by task", _by_task(report), "task"), ("Success under disturbances", _disturbed(report), "under")
         ):  # fmt: skip
             if groups:
-                blocks.append(Chart(partial(shares, groups, title, key), CAPTION))
+                blocks.append(Chart(partial(shares, groups, title, key), f"{title}. {CAPTION}"))
         tables = (records_table(report, title) for title in (AGAINST, INSTRUCTIONS, UNDER))
         blocks += [table for table in tables if table]
         if blocks:
@@ -61,9 +62,13 @@ def _disturbed(report: Report) -> list[tuple[str, list[Share]]]:
         for record in row.details.get(UNDER, ()):
             group = groups.setdefault(plain(record.get("disturbance", "")), [])
             if not group and record.get("baseline") is not None:
-                group.append(Share(plain(base), "s-base", record["baseline"], None, None, record["episodes"]))
-            group.append(Share(plain(row.name), css, record["success"], None, None, record["episodes"]))
+                group.append(_share(base, "s-base", record["baseline"], record["episodes"]))
+            group.append(_share(row.name, css, record["success"], record["episodes"]))
     return _worst_first(groups)
+
+
+def _share(variant: str, css: str, value: float, count: int) -> Share:
+    return Share(plain(variant), css, value, *wilson(round(value * count), count), count)
 
 
 def _worst_first(groups: dict[str, list[Share]]) -> list[tuple[str, list[Share]]]:

@@ -1,0 +1,53 @@
+"""The section on motion: what is drawn of rows with episodes, and nothing without any."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from vlatool.accuracy.disturbed import with_disturbed
+from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.render.formats.html import HtmlRenderer
+from vlatool.render.formats.markdown import MarkdownRenderer
+from vlatool.render.sections.motion import Motion
+from vlatool.report import Report
+
+TASKS = ("open", "close & <shut>")
+
+
+def played(jerk: float, lost: int) -> list[Outcome]:
+    return [Outcome(task, seed, seed >= lost, 40, "", {"jerk": jerk + seed, "task_time": 2.0})
+            for task in TASKS for seed in range(20)]  # fmt: skip
+
+
+@pytest.fixture
+def report() -> Report:
+    base = success_row("baseline", "baseline", played(10.0, 1))
+    row = compare_success(base, success_row("int8", "subject", played(14.0, 3)))
+    row = with_disturbed(row, {"delay": played(1.0, 9)}, {"delay": played(1.0, 4)}, 2.0)
+    return Report("evaluate", "a title", rows=(base, row))
+
+
+def test_ratios_tasks_and_disturbances_are_shown(report: Report):
+    text = MarkdownRenderer().render(report)
+    section = text[text.index("How it moves, and where it fails") :]
+    assert re.search(r"\| jerk ratio \| 1\.\d+×", section)
+    assert "| steps ratio |" in section
+    assert re.search(r"\| delay \| 2 \| 40 \| 0\.8 \| 0\.55 \|", section)
+    further = section[section.index("Further measurements") :]
+    assert "jerk ratio |" not in further, "no number stands twice"
+    assert "| jerk |" in further
+
+
+def test_the_drawings_say_what_they_show_and_escape_names(report: Report):
+    page = HtmlRenderer().render(report)
+    assert "Success by task" in page
+    assert "Success under disturbances" in page
+    assert "close &amp; &lt;shut&gt;: " in page
+    assert "<shut>" not in page
+    assert "int8: 55 % (39.8 to 69.3 %) of 40 episodes" in page
+
+
+def test_without_episodes_there_is_no_section():
+    assert list(Motion().build(Report("benchmark", "a title"))) == []
