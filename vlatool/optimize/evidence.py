@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from vlatool.accuracy.paired import compare_success, with_chance
+from vlatool.accuracy.paired import ABSENT, compare_success, with_chance
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import EVALUATION
 from vlatool.errors import DataError, SourceError
@@ -90,6 +90,8 @@ def told_wrong(bundle: Bundle, loop: ClosedLoop | None, cache: Path, context: Co
 def _joined(row: Row, played: Row) -> Row:
     measurements = (*row.measurements, *played.measurements)
     raw, details = {**row.raw, **played.raw}, {**row.details, **played.details}
+    if lacking := [*row.details.get(ABSENT, ()), *played.details.get(ABSENT, ())]:
+        details[ABSENT] = lacking
     return replace(row, measurements=measurements, raw=raw, details=details)
 
 
