@@ -146,7 +146,12 @@ class _Pairs:
             own = self._places[key] == place
             (value, low, high), count = self._drop(own, self._confidence)
             before, after = (float(won[own].mean()) for won in self._wins)
-            record: dict[str, Any] = {key: name, "episodes": count, "baseline": round(before, 4), "success": round(after, 4)}
+            record: dict[str, Any] = {
+                key: name,
+                "episodes": count,
+                "baseline": round(before, 4),
+                "success": round(after, 4),
+            }
             record |= {"drop": round(value, 4), "low": round(low, 4), "high": round(high, 4)}
             records.append(record | self._ratios_of(own))
         return sorted(records, key=lambda record: -record["drop"])[:LONGEST] if len(records) > 1 else []

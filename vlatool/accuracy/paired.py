@@ -32,6 +32,7 @@ class Outcome:
         instruction: What the policy was told; empty for one that takes no text.
         motion: Metric of motion -> its number.
         refused: What the environment told of the robot's body and could not be used -> why.
+        series: What was asked for to be shown: ``position.x``, ``action.NAME``, ``fresh``, a number a step.
     """
 
     task: str
@@ -41,6 +42,7 @@ class Outcome:
     instruction: str = ""
     motion: Mapping[str, float] = field(default_factory=dict)
     refused: Mapping[str, str] = field(default_factory=dict)
+    series: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
 
 def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:

@@ -17,6 +17,8 @@ SERIES = {"position": 1, "joints": 1, "heading": 0, "gripper": 0, "collision": 0
 MOST = {"position": 3, "joints": 64}
 """Elements that they may have."""
 TIME, SHORTEST = "time", "shortest_path"
+SHOWN = 2000
+"""Steps of an episode that is shown."""
 UNEVEN = 0.01
 """Share by which two steps of an environment's clock may differ."""
 
@@ -130,6 +132,24 @@ class Body:
         else:
             return float(1 / steps.mean())
         return self._hz
+
+
+def series_of(track: Track, action: TensorSpec) -> dict[str, tuple[float, ...]]:
+    """Return what a drawing of an episode needs: ``position.x``, ``action.NAME`` and ``fresh``, of its first steps.
+
+    Args:
+        track: Of the episode.
+        action: Of the spec; a discrete one gives ``action``, its index.
+    """
+    series = {"fresh": track.fresh.astype(float)}
+    if track.position is not None:
+        series |= {f"position.{axis}": values for axis, values in zip("xyz", track.position.T, strict=False)}
+    if track.actions.ndim == 1:
+        series["action"] = track.actions.astype(float)
+    else:
+        names = action.labels or tuple(map(str, range(track.actions.shape[1])))
+        series |= {f"action.{name}": values for name, values in zip(names, track.actions.T, strict=False)}
+    return {name: tuple(np.asarray(values, np.float64)[:SHOWN].tolist()) for name, values in series.items()}
 
 
 def alike(action: TensorSpec) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from vlatool.accuracy.paired import Outcome
 from vlatool.accuracy.success import Success
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec
-from vlatool.episodes.body import Body
+from vlatool.episodes.body import Body, series_of
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.disturbed import OWN, Seen
 from vlatool.episodes.environment import GUIDE, World
@@ -62,6 +62,7 @@ class EpisodesJob:
         disturb: Disturbance of the environment, or of what the policy sees (``episodes/disturbed.py``).
         strength: Of the disturbance; 1 is what an ordinary day brings.
         latency_ms: How late actions come; 0 for at once.
+        show: Whether the outcomes hold the path and the actions of each step.
     """
 
     environment: str
@@ -75,6 +76,7 @@ class EpisodesJob:
     disturb: str = ""
     strength: float = 1.0
     latency_ms: float = 0.0
+    show: bool = False
 
 
 @dataclass(frozen=True)
@@ -301,8 +303,10 @@ def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, see
                 body.acted(action, queue.fresh)
                 body.look(info)
                 if over:
-                    motion = measured(body.track())
-                    return Outcome(task, seed, success.at_the_end(task, seed), step, told, motion, body.refused)
+                    track = body.track()
+                    series = series_of(track, spec.action) if job.show else {}
+                    won = success.at_the_end(task, seed)
+                    return Outcome(task, seed, won, step, told, measured(track), body.refused, series)
     except VlatoolError:
         raise
     except Exception as error:  # the seam: a user's environment may raise anything

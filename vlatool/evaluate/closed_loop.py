@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from pydantic import Field
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.disturbed import with_disturbed
 from vlatool.accuracy.paired import Outcome, compare_success, success_row, with_chance
+from vlatool.accuracy.shown import differs_most, with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, disturbances_of, jobs_for, run_jobs
@@ -117,6 +118,9 @@ class ClosedLoop(Measure):
             played = [self._disturbed(kinds, late(jobs, wait), one, context)
                       for one, wait in zip(bundles, waits, strict=True)]  # fmt: skip
             row = with_disturbed(row, played[-1], played[0] if self.baseline else None, self.strength)
+        if rows:
+            shown = self._shown(jobs[0], reference[0], outcomes, plays)
+            rows, row = [with_episode(rows[0], shown[0])], with_episode(row, shown[1])
         rows = [replace(row, measurements=(*row.measurements, wait)) if wait else row
                 for row, wait in zip([*rows, row], waits, strict=True)]  # fmt: skip
         row = rows[-1]
@@ -131,6 +135,14 @@ class ClosedLoop(Measure):
             "evaluate", title, verdict, (*believed.sentences, *decided, text, *told(rows, self.board)), tuple(rows),
             environment=fingerprint(), warnings=(*believed.warnings, *found_wrong(source)),
         )  # fmt: skip
+
+    def _shown(
+        self, job: EpisodesJob, base: list[Outcome], own: list[Outcome], plays: Sequence[Callable[..., list[Outcome]]]
+    ) -> list[Outcome]:
+        """Return the episode in which both differ most, played again by each and kept step by step."""
+        most = own[differs_most(base, own)]
+        again = replace(job, task=most.task, seeds=(most.seed,), show=True)
+        return [play([again])[0] for play in plays]
 
     def _play(
         self, bundle: Bundle, wait: Measurement | None, context: Context, jobs: list[EpisodesJob]

@@ -26,6 +26,7 @@ ABSENT = "unmeasured"
 """The details table that says what could not be had; shown with the numbers that are NaN."""
 BY_TASK, UNDER = "success by task", "under disturbances"
 """Tables of details that the section on motion draws, beside those against the baseline."""
+SHOWN = "the episode that differs most"
 AGAINST_BASELINE = "against the baseline"
 OF_MOTION = ("task_speedup", "steps_ratio", "success_disturbed", "worst_task_drop")
 """Measurements of that section, beside the ratios of metrics."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from vlatool.render._view import ABSENT, AGAINST_BASELINE, UNDER, ranks_boards
+from vlatool.render._view import ABSENT, AGAINST_BASELINE, SHOWN, UNDER, ranks_boards
 from vlatool.render.cells import records_table
 from vlatool.render.document import Section, Table
 from vlatool.render.sections.parts import PARTS
@@ -24,5 +24,5 @@ def tables(report: Report) -> list[Table]:
     """Return the tables, that of the telemetry first."""
     titles = dict.fromkeys(("telemetry", *(title for row in report.rows for title in row.details)))
     shown = (title for title in titles if title not in (ABSENT, *PARTS) and not title.startswith(TRAINED))
-    shown = (title for title in shown if title != UNDER and not title.startswith(AGAINST_BASELINE))
+    shown = (title for title in shown if title not in (UNDER, SHOWN) and not title.startswith(AGAINST_BASELINE))
     return [table for title in shown if (table := records_table(report, title))]

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from functools import partial
 
 from vlatool.render._format import plain
-from vlatool.render._view import BY_TASK, UNDER, motion_names
+from vlatool.render._view import BY_TASK, SHOWN, UNDER, motion_names
 from vlatool.render.cells import matrix, records_table
+from vlatool.render.charts.episode import Played, episode
+from vlatool.render.charts.samples import finite
 from vlatool.render.charts.shares import Share, shares
 from vlatool.render.charts.svg import tinted
 from vlatool.render.document import Block, Chart, Section
-from vlatool.report import Report
+from vlatool.report import Report, Row
 from vlatool.stats.intervals import wilson
 
 ABOUT = (
@@ -19,6 +21,8 @@ ABOUT = (
     "at full length. The task speed-up is that of an inference by the ratio of steps."
 )
 CAPTION = "Dots: share of episodes that succeed, with its 95 % interval; the worst first."
+HELP = "Paths end at the dot; the actions of each step are below, and short marks show where a new chunk begins."
+EPISODE = "episode."
 AGAINST = "against the baseline, by task"
 INSTRUCTIONS = "against the baseline, by instruction"
 
@@ -38,9 +42,28 @@ class Motion:
                 blocks.append(Chart(partial(shares, groups, title, key), f"{title}. {CAPTION}"))
         tables = (records_table(report, title) for title in (AGAINST, INSTRUCTIONS, UNDER))
         blocks += [table for table in tables if table]
+        blocks += _episode(report)
         if blocks:
             about = ABOUT if shown else ""
             yield Section("How it moves, and where it fails", tuple(blocks), 45, "measured", about=about, brief=False)
+
+
+def _episode(report: Report) -> list[Block]:
+    """Return the drawing of the episode in which the variants differ most, and how it ended for each."""
+    played = [Played(plain(row.name), css, series) for row, css in tinted(report.rows) if (series := _series(row))]
+    table = records_table(report, SHOWN)
+    if len(played) < 2 or table is None:
+        return []
+    title = "The episode in which the variants differ most"
+    return [Chart(partial(episode, played, title), f"{title}. {HELP}"), table]
+
+
+def _series(row: Row) -> dict[str, list[float]]:
+    """Return the steps of the episode that a row shows; nothing where one of them is no number."""
+    series = {name.removeprefix(EPISODE): list(values) for name, values in row.raw.items() if name.startswith(EPISODE)}
+    usable = all(values and len(finite(values)) == len(values) for values in series.values())
+    lengths = {len(values) for name, values in series.items() if name.startswith("position")}
+    return series if usable and "fresh" in series and len(lengths) < 2 else {}
 
 
 def _by_task(report: Report) -> list[tuple[str, list[Share]]]:

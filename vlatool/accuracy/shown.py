@@ -1,0 +1,34 @@
+"""The episode in which two variants differ most, to be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from vlatool.accuracy.paired import Outcome
+from vlatool.report import Row
+
+EPISODE = "episode."
+"""What the names of raw samples begin with that show one episode."""
+TABLE = "the episode that differs most"
+
+
+def differs_most(base: Sequence[Outcome], own: Sequence[Outcome]) -> int:
+    """Return the place of the pair that differs most: in success, then in steps, then in the worst ratio of motion."""
+
+    def difference(place: int) -> tuple[float, ...]:
+        one, two = base[place], own[place]
+        alike = (abs(two.motion[name] - value) / value for name, value in one.motion.items()
+                 if value > 0 and name in two.motion)  # fmt: skip
+        return abs(one.success - two.success), abs(one.steps - two.steps), max(alike, default=0.0), -place
+
+    return max(range(len(base)), key=difference)
+
+
+def with_episode(row: Row, outcome: Outcome) -> Row:
+    """Return the row with the steps of an episode, and a line on how it ended."""
+    raw = {f"{EPISODE}{name}": list(values) for name, values in outcome.series.items()}
+    record = {"task": outcome.task, "seed": outcome.seed, "instruction": outcome.instruction,
+              "success": "yes" if outcome.success else "no", "steps": outcome.steps}  # fmt: skip
+    told = {name: value for name, value in record.items() if value != ""}
+    return replace(row, raw={**row.raw, **raw}, details={**row.details, TABLE: [told]})
