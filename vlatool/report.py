@@ -217,7 +217,7 @@ def _row(data: Mapping[str, Any]) -> Row:
         Measurement(**{**item, "value": math.nan if item["value"] is None else item["value"]})
         for item in data.get("measurements", ())
     ]
-    raw = {name: _series(values) for name, values in (data.get("raw") or {}).items()}
+    raw = {name: _series(values) for name, values in data.get("raw", {}).items()}
     return Row(**{**data, "measurements": tuple(measurements), "raw": raw})
 
 

@@ -9,7 +9,9 @@ import pytest
 
 from tests._reach import EAGER, GOOD, TREMBLES, bundle_of, folder_of
 from vlatool.bundle.bundle import Bundle
+from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, UsageError
+from vlatool.evaluate import closed_loop
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import load_profile
@@ -182,3 +184,27 @@ def test_an_evaluation_with_motion_is_kept_and_found_again(bundles: dict[str, Bu
     assert json.dumps(first.rows[0].raw) == json.dumps(again.rows[0].raw)
     assert isinstance(first.rows[0], Row)
     assert Recorded is not ClosedLoop
+
+
+@pytest.mark.parametrize(("options", "says"), [
+    ({"board": "raspberry-pi-4"}, "--board says whose latency counts"), ({"strength": 2.0}, "--strength is of disturb"),
+])  # fmt: skip
+def test_an_option_that_would_do_nothing_is_refused(bundles: dict[str, Bundle], options: dict[str, object], says: str):
+    with pytest.raises(UsageError, match=says):
+        ClosedLoop(policy=bundles["good"].path.parent / "policy", **options).check(bundles["good"], None)
+
+
+def test_an_episode_that_cannot_be_played_again_costs_its_picture_alone(
+    bundles: dict[str, Bundle], monkeypatch: pytest.MonkeyPatch
+):
+    real = closed_loop.run_jobs
+
+    def run(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context):
+        if jobs[0].show:
+            raise DataError("the environment is gone")
+        return real(bundle, jobs, engine, context)
+
+    monkeypatch.setattr(closed_loop, "run_jobs", run)
+    row = evaluated(bundles, "trembles", 4).rows[-1]
+    assert row.value("success") == 1.0
+    assert not any(name.startswith("episode.") for name in row.raw)

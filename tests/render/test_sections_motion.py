@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -51,3 +52,15 @@ def test_the_drawings_say_what_they_show_and_escape_names(report: Report):
 
 def test_without_episodes_there_is_no_section():
     assert list(Motion().build(Report("benchmark", "a title"))) == []
+
+
+@pytest.mark.parametrize("record", [
+    {}, {"task": "a", "success": None, "episodes": 4}, {"task": "a", "success": "1", "episodes": 4},
+    {"task": "a", "success": 0.5, "episodes": 0}, {"task": "a", "success": 7, "episodes": 4}, {"task": 5, "success": 1},
+])  # fmt: skip
+def test_tables_of_a_report_from_elsewhere_are_drawn_as_far_as_they_go(report: Report, record: dict[str, object]):
+    base, row = report.rows
+    broken = {"success by task": [record], "under disturbances": [record]}
+    odd = replace(row, details={**row.details, **broken})
+    page = HtmlRenderer().render(replace(report, rows=(base, odd)))
+    assert "How it moves, and where it fails" in page

@@ -12,7 +12,7 @@ from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
 from vlatool.stats.success_sequential import exact_drop
 
-Episodes = Mapping[str, Sequence[Outcome]]
+Played = Sequence[Outcome]
 DISTURBED = "disturbed."
 """What the names of raw samples begin with that say which episodes succeeded under a disturbance."""
 OF_BASELINE = ", baseline"
@@ -23,10 +23,7 @@ SHOWN = {"task_time": "task time", "path_length": "path", "jerk": "jerk", "actio
 
 
 def with_disturbed(
-    row: Row,
-    played: Mapping[str, Sequence[Outcome]],
-    reference: Mapping[str, Sequence[Outcome]] | None,
-    strength: float,
+    row: Row, played: Mapping[str, Played], reference: Mapping[str, Played] | None, strength: float
 ) -> Row:
     """Return the row with how it does under each disturbance, the worst first.
 
@@ -56,16 +53,16 @@ def with_disturbed(
 
 
 def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measurement]:
-    """Return disturbance -> how many more episodes fail than of the baseline, with an interval of that coverage.
+    """Return disturbance -> how many more episodes fail than of the baseline, each with an interval.
 
     Args:
         row: Of ``with_disturbed``; those that have no reference are left out.
-        confidence: Of each interval.
+        confidence: Of all intervals together (Bonferroni).
     """
     drops = {}
-    for name in row.raw:
-        if not name.startswith(DISTURBED) or f"{name}{OF_BASELINE}" not in row.raw:
-            continue
+    names = [name for name in row.raw if name.startswith(DISTURBED) and f"{name}{OF_BASELINE}" in row.raw]
+    confidence = 1 - (1 - confidence) / max(1, len(names))
+    for name in names:
         kind = name.removeprefix(DISTURBED)
         pairs = list(zip(row.raw[f"{name}{OF_BASELINE}"], row.raw[name], strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)

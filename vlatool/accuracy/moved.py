@@ -52,7 +52,7 @@ def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = 
 
 
 def drops_by_task(baseline: Row, row: Row, confidence: float = CONFIDENCE) -> dict[str, Measurement]:
-    """Return task -> how many more of its episodes fail, a share, each with an interval of that coverage."""
+    """Return task -> how many more of its episodes fail, a share, with intervals of a joint coverage (Bonferroni)."""
     return _Pairs(baseline, row, confidence).drops()
 
 
@@ -69,12 +69,6 @@ def with_task_speedup(row: Row) -> Row:
     note = "speed-up of an inference / ratio of steps, failures at full length"
     task = Measurement(SPEEDUP, speed.value / steps.value, "x", samples=steps.samples, low=low, high=high, note=note)
     return replace(row, measurements=(*row.measurements, task))
-
-
-def ratio_names(row: Row) -> list[str]:
-    """Return the metrics of motion that a row has a ratio of, by name."""
-    ends = (item.name for item in row.measurements if item.name.endswith(RATIO) and item.name != STEPS)
-    return [name.removesuffix(RATIO) for name in ends]
 
 
 def _ratio(name: str, ratio: tuple[float, float, float], count: int, note: str, confidence: float) -> Measurement:
@@ -122,21 +116,21 @@ class _Pairs:
             yield _ratio(STEPS, ratio, len(own), "steps of all episodes, failures at full length", CONFIDENCE)
 
     def worst(self) -> Iterator[Measurement]:
-        """Yield the drop of the task that loses most, with an interval that allows for the choice (Bonferroni)."""
-        tasks = len(self._names.get("task", ()))
-        if tasks < 2:
-            return
-        drops = self.drops(1 - (1 - self._confidence) / tasks)
-        name = max(drops, key=lambda task: drops[task].value)
-        yield replace(drops[name], name=WORST, note=f"{name}, the worst of {tasks} tasks")
+        """Yield the drop of the task that loses most, with an interval that allows for the choice."""
+        drops = self.drops()
+        if len(drops) > 1:
+            name = max(drops, key=lambda task: drops[task].value)
+            yield replace(drops[name], note=f"{name}, the worst of {len(drops)} tasks")
 
-    def drops(self, confidence: float = 0.0) -> dict[str, Measurement]:
-        """Return task -> its drop, with an interval of a coverage; that of the pairs when 0."""
+    def drops(self) -> dict[str, Measurement]:
+        """Return task -> its drop; all intervals together have the coverage of the pairs (Bonferroni)."""
+        names = self._names.get("task", [])
+        confidence = 1 - (1 - self._confidence) / max(1, len(names))
         drops = {}
-        for place, name in enumerate(self._names.get("task", ())):
-            (value, low, high), count = self._drop(self._places["task"] == place, confidence or self._confidence)
-            drops[name] = Measurement(WORST, value, "1", samples=count, low=low, high=high,
-                                      confidence=confidence or self._confidence, note=name)  # fmt: skip
+        for place, name in enumerate(names):
+            (value, low, high), count = self._drop(self._places["task"] == place, confidence)
+            drops[name] = Measurement(WORST, value, "1", samples=count, low=low, high=high, confidence=confidence,
+                                      note=name)  # fmt: skip
         return drops
 
     def table(self, key: str) -> list[dict[str, Any]]:

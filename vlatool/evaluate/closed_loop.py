@@ -85,6 +85,10 @@ class ClosedLoop(Measure):
         """Environment and tasks are named, the environment may run, and a limit has something to hold against."""
         if self.limit is not None and (not self.baseline or self.control):
             raise UsageError("--limit is the largest drop against a baseline, and none is named.", "add --baseline DIR")
+        if self.board and not self.latency_in_the_loop:
+            raise UsageError("--board says whose latency counts, and none does.", "add --latency-in-the-loop")
+        if self.strength != 1.0 and not self.disturb:
+            raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
         self._may_run(self._jobs(source)[0])
 
     def on(self, profile: Profile) -> ClosedLoop:
@@ -118,8 +122,7 @@ class ClosedLoop(Measure):
             played = [self._disturbed(kinds, late(jobs, wait), one, context)
                       for one, wait in zip(bundles, waits, strict=True)]  # fmt: skip
             row = with_disturbed(row, played[-1], played[0] if self.baseline else None, self.strength)
-        if rows:
-            shown = self._shown(jobs[0], reference[0], outcomes, plays)
+        if rows and (shown := self._shown(jobs[0], reference[0], outcomes, plays)):
             rows, row = [with_episode(rows[0], shown[0])], with_episode(row, shown[1])
         rows = [replace(row, measurements=(*row.measurements, wait)) if wait else row
                 for row, wait in zip([*rows, row], waits, strict=True)]  # fmt: skip
@@ -139,10 +142,16 @@ class ClosedLoop(Measure):
     def _shown(
         self, job: EpisodesJob, base: list[Outcome], own: list[Outcome], plays: Sequence[Callable[..., list[Outcome]]]
     ) -> list[Outcome]:
-        """Return the episode in which both differ most, played again by each and kept step by step."""
+        """Return the episode in which both differ most, played again by each and kept step by step.
+
+        Nothing where that fails: all that is measured was measured before.
+        """
         most = own[differs_most(base, own)]
         again = replace(job, task=most.task, seeds=(most.seed,), show=True)
-        return [play([again])[0] for play in plays]
+        try:
+            return [play([again])[0] for play in plays]
+        except (DataError, SourceError):
+            return []
 
     def _play(
         self, bundle: Bundle, wait: Measurement | None, context: Context, jobs: list[EpisodesJob]

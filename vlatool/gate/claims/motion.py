@@ -12,6 +12,7 @@ from vlatool.motion.measure import metrics
 OF_BODY = ("path_length", "joint_path", "jerk", "joint_jerk")
 OF_ACTIONS = ("action_rate",)
 """Metrics that count where the environment tells nothing of the robot's body."""
+ZERO = " (not told, or 0 in every episode of the baseline)"
 NOTHING = "no episode in which both succeed tells how they move"
 
 
@@ -28,6 +29,6 @@ def examine(episodes: Episodes, claim: MotionClaim) -> ClaimResult:
     lacking = [name for name in claim.metrics if f"{name}{RATIO}" not in found]
     result = judged("motion", told, claim.margin, NOTHING)
     if lacking and result.verdict == "pass":
-        return ClaimResult("motion", "inconclusive", f"not known: {', '.join(lacking)}; {result.sentence}",
+        return ClaimResult("motion", "inconclusive", f"no ratio of {', '.join(lacking)}{ZERO}; {result.sentence}",
                            result.measurements)  # fmt: skip
     return result

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from vlatool.accuracy.moved import RATIO, ratios
-from vlatool.gate.claims._ratio import confidence_of, judged
+from vlatool.gate.claims._ratio import judged
 from vlatool.gate.config import TaskTimeClaim
 from vlatool.gate.episodes import Episodes
-from vlatool.gate.result import ClaimResult
+from vlatool.gate.result import CONFIDENCE, ClaimResult
 
 METRIC = "task_time"
 NOTHING = "there is no episode in which both succeed"
@@ -18,5 +18,5 @@ def examine(episodes: Episodes, claim: TaskTimeClaim) -> ClaimResult:
     Raises:
         DataError: when no environment is named, or it fails.
     """
-    found = ratios(*episodes.rows, (METRIC,), confidence_of(1)).get(f"{METRIC}{RATIO}")
+    found = ratios(*episodes.rows, (METRIC,), CONFIDENCE).get(f"{METRIC}{RATIO}")
     return judged(METRIC, {"task time": found} if found else {}, claim.margin, NOTHING)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from vlatool.accuracy.moved import drops_by_task
 from vlatool.gate.claims._drops import judged
-from vlatool.gate.claims._ratio import confidence_of
 from vlatool.gate.config import WorstTaskClaim
 from vlatool.gate.episodes import Episodes
-from vlatool.gate.result import ClaimResult
+from vlatool.gate.result import CONFIDENCE, ClaimResult
 
 
 def examine(episodes: Episodes, claim: WorstTaskClaim) -> ClaimResult:
@@ -16,5 +15,4 @@ def examine(episodes: Episodes, claim: WorstTaskClaim) -> ClaimResult:
     Raises:
         DataError: when no environment is named, or it fails.
     """
-    tasks = len(drops_by_task(*episodes.rows))
-    return judged("worst_task", drops_by_task(*episodes.rows, confidence_of(tasks)), claim.max_drop)
+    return judged("worst_task", drops_by_task(*episodes.rows, CONFIDENCE), claim.max_drop)

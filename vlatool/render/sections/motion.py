@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 from vlatool.render._format import plain
 from vlatool.render._view import BY_TASK, SHOWN, UNDER, motion_names
@@ -71,10 +72,8 @@ def _by_task(report: Report) -> list[tuple[str, list[Share]]]:
     groups: dict[str, list[Share]] = {}
     for row, css in tinted(report.rows):
         for record in row.details.get(BY_TASK, ()):
-            share = Share(
-                plain(row.name), css, record["success"], record.get("low"), record.get("high"), record["episodes"]
-            )
-            groups.setdefault(plain(record.get("task", "")), []).append(share)
+            if share := _share(row.name, css, record.get("success"), record.get("episodes")):
+                groups.setdefault(plain(record.get("task", "")), []).append(share)
     return _worst_first(groups) if len(groups) > 1 else []
 
 
@@ -83,14 +82,17 @@ def _disturbed(report: Report) -> list[tuple[str, list[Share]]]:
     base = next((row.name for row in report.rows if row.role == "baseline"), "baseline")
     for row, css in tinted(report.rows):
         for record in row.details.get(UNDER, ()):
-            group = groups.setdefault(plain(record.get("disturbance", "")), [])
-            if not group and record.get("baseline") is not None:
-                group.append(_share(base, "s-base", record["baseline"], record["episodes"]))
-            group.append(_share(row.name, css, record["success"], record["episodes"]))
-    return _worst_first(groups)
+            kind, count = plain(record.get("disturbance", "")), record.get("episodes")
+            before = None if kind in groups else _share(base, "s-base", record.get("baseline"), count)
+            found = [share for share in (before, _share(row.name, css, record.get("success"), count)) if share]
+            groups[kind] = [*groups.get(kind, ()), *found]
+    return _worst_first({kind: group for kind, group in groups.items() if group})
 
 
-def _share(variant: str, css: str, value: float, count: int) -> Share:
+def _share(variant: str, css: str, value: Any, count: Any) -> Share | None:
+    """Return a share with Wilson's interval; None where a report from elsewhere does not have its numbers."""
+    if type(count) is not int or count < 1 or type(value) not in (int, float) or not 0 <= value <= 1:
+        return None
     return Share(plain(variant), css, value, *wilson(round(value * count), count), count)
 
 
