@@ -12,10 +12,11 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, UsageError
 from vlatool.evaluate import closed_loop
+from vlatool.evaluate._told import told
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import load_profile
-from vlatool.report import Report, Row
+from vlatool.report import Measurement, Report, Row
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_measure
 
@@ -208,3 +209,14 @@ def test_an_episode_that_cannot_be_played_again_costs_its_picture_alone(
     row = evaluated(bundles, "trembles", 4).rows[-1]
     assert row.value("success") == 1.0
     assert not any(name.startswith("episode.") for name in row.raw)
+
+
+def ratio(name: str, value: float) -> Measurement:
+    return Measurement(name, value, "x", low=value - 0.002, high=value + 0.002)
+
+
+def test_a_ratio_that_would_be_printed_as_one_is_worth_no_sentence():
+    row = Row(
+        "int8", measurements=(ratio("path_length_ratio", 1.003), ratio("jerk_ratio", 1.04), ratio("steps_ratio", 1.004))
+    )
+    assert list(told([row], "")) == ["Where both succeed, more than the baseline's: jerk 1.04x."]

@@ -7,7 +7,10 @@ from collections.abc import Iterator, Sequence
 from vlatool.accuracy.disturbed import TABLE
 from vlatool.accuracy.moved import RATIO, STEPS, WORST
 from vlatool.evaluate._late import LATE
-from vlatool.report import Row
+from vlatool.report import Measurement, Row
+
+LEAST = 1.005
+"""Ratio below which two decimals say 1.00, and nothing is worth a sentence."""
 
 
 def told(rows: Sequence[Row], board: str) -> Iterator[str]:
@@ -22,11 +25,11 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
     if worst and worst.value > 0:
         yield f"The task that loses most is {worst.note.partition(',')[0]}: {100 * worst.value:.3g} points."
     changed = [item for item in row.measurements if item.name.endswith(RATIO) and item is not steps]
-    if rougher := [item for item in changed if (item.low or 0.0) > 1]:
-        words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {item.value:.3g}x" for item in rougher)
+    if rougher := [item for item in changed if _is_more(item)]:
+        words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {_times(item.value)}" for item in rougher)
         yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
-    if steps and (steps.low or 0.0) > 1:
-        yield f"Over all episodes, it needs {steps.value:.3g}x the steps."
+    if steps and _is_more(steps):
+        yield f"Over all episodes, it needs {_times(steps.value)} the steps."
     if table := row.details.get(TABLE):
         first = table[0]
         drop = f", {100 * first['drop']:.3g} points fewer than of the baseline" if first.get("drop", 0) > 0 else ""
@@ -37,3 +40,12 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
         late = ", ".join(f"{name} {ms:.3g} ms" for name, ms in latencies.items())
         where = f"predicted for {board}" if board else "measured here"
         yield f"Actions come as late as inferences take ({where}): {late}."
+
+
+def _is_more(ratio: Measurement) -> bool:
+    """Say whether a ratio is shown to be above 1, by as much as is printed."""
+    return ratio.value >= LEAST and (ratio.low or 0.0) > 1
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.2f}x" if ratio < 10 else f"{ratio:.3g}x"
