@@ -23,7 +23,7 @@ from vlatool.stage.base import Context, Transform, build_stage
 CALLS, SECONDS = 200, 3.0
 """Of each policy in a run, at least."""
 UNDISTURBED = 25
-"""Percentile of the calls whose ratios are compared: where other programs run, more of them than half may be held up."""
+"""Percentile of the calls whose ratios are compared: where other programs run, more than half may be held up."""
 
 
 class Clock:
