@@ -1,8 +1,8 @@
 """Weights of which every process holds a part alone (FSDP2): whole only while the block that they belong to computes.
 
-``fully_shard`` of torch.distributed cuts each weight along its first axis. Before a block runs, its weights are gathered
-from all processes, and freed after it; ``backward`` does the same, and adds its gradients up part by part. What a
-training keeps beside the weights (AdamW's moments, the average, the best) is of the parts alone.
+``fully_shard`` of torch.distributed cuts each weight along its first axis. Before a block runs, its weights are
+gathered from all processes, and freed after it; ``backward`` does the same, and adds its gradients up part by part.
+What a training keeps beside the weights (AdamW's moments, the average, the best) is of the parts alone.
 
 A unit is what is gathered at once: each block of a stack, then what else a graph's module has. A weight stays whole in
 every process where that cannot be: scalars, weights that several units share, other types, and modules that are traced
@@ -12,6 +12,7 @@ again for each batch size. All processes must call the units equally often.
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -217,6 +218,7 @@ def _sharded(modules: Mapping[str, nn.Module], group: Group) -> Any:
             """Give nothing."""
 
     for unit, others in _units(cut, modules):
+        unit.register_forward_hook(_apart)
         fsdp.fully_shard(unit, mesh=mesh, reshard_after_forward=True, ignored_params=others)
         unit.set_gradient_divide_factor(1.0)  # sums, as without shards
         unit.set_force_sum_reduction_for_comms(True)
@@ -229,6 +231,13 @@ def _sharded(modules: Mapping[str, nn.Module], group: Group) -> Any:
     return root
 
 
+def _apart(_module: Any, _arguments: Any, gives: Any) -> Any:
+    """Copy what a unit gives as a view: an operation in place on it would lose what prepares ``backward``."""
+    if isinstance(gives, require("torch", "build").Tensor):
+        return gives.clone() if gives._is_view() else gives
+    return type(gives)(_apart(None, None, each) for each in gives) if type(gives) in (tuple, list) else gives
+
+
 def _runs_as_it_is(module: Any) -> bool:
     """Say whether a module is called itself: no container, and none that is traced again for each batch size."""
     nn = require("torch", "build").nn
@@ -237,24 +246,38 @@ def _runs_as_it_is(module: Any) -> bool:
 
 def _units(cut: Mapping[str, nn.Module], modules: Mapping[str, nn.Module]) -> list[tuple[Any, set[Any]]]:
     """Return what is gathered at once, from the inside outwards, each with its weights that stay whole there."""
-    owners, taken = _owners(modules), set[int]()
+    owners, seen, taken = _owners(modules), set[int](), set[int]()
     blocks = [block for _, stack in reversed(stacks_of(cut, mixed=True)) for block in stack]
     units = []
     for unit in dict.fromkeys([*filter(_runs_as_it_is, blocks), *cut.values()]):
-        fits = _fitting(unit, owners, taken)
+        fits = _fitting(unit, owners, seen, _outside(unit, modules))
+        seen |= {id(value) for value in unit.parameters()}
         taken |= fits
         if fits:
             units.append((unit, {value for value in unit.parameters() if id(value) not in taken}))
     return units
 
 
-def _fitting(unit: Any, owners: Owners, taken: set[int]) -> set[int]:
+def _fitting(unit: Any, owners: Owners, seen: set[int], outside: set[int]) -> set[int]:
     """Return the weights of a unit that are cut with it: of one type, no scalars, and nobody else's."""
-    inside = {id(module) for module in unit.modules()}
     fits = [value for value in unit.parameters()
-            if id(value) not in taken and value.dim() and value.dtype.is_floating_point and value.is_contiguous()
-            and all(id(module) in inside for module, _ in owners[id(value)])]  # fmt: skip
-    return {id(value) for value in fits if value.dtype == fits[0].dtype}
+            if id(value) not in seen and value.dim() and value.dtype.is_floating_point and value.is_contiguous()
+            and all(id(module) not in outside for module, _ in owners[id(value)])]  # fmt: skip
+    sizes = Counter[Any]()
+    for value in fits:
+        sizes[value.dtype] += value.numel()
+    return {id(value) for value in fits if value.dtype == max(sizes, key=sizes.__getitem__)}
+
+
+def _outside(unit: Any, modules: Mapping[str, nn.Module]) -> set[int]:
+    """Return what runs although a unit does not: all modules that another path leads to."""
+    found, waiting = set[int](), list[Any](modules.values())
+    while waiting:
+        module = waiting.pop()
+        if module is not unit and id(module) not in found:
+            found.add(id(module))
+            waiting += module.children()
+    return found
 
 
 def _owners(modules: Mapping[str, nn.Module]) -> Owners:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool import errors
-from vlatool.errors import RecipeError, SourceError, VlatoolError, require
+from vlatool.errors import InputError, MissingExtra, RecipeError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of, one_line
 from vlatool.machine.version import VERSION
 from vlatool.user_code.children import Apart
@@ -36,7 +36,8 @@ what shows that a process sees that folder."""
 PRELOAD = ("torch", "vlatool.training.peer")
 LEAVE = "leave"
 """A call after which a process forgets the training."""
-START_S, POLL_S = 300.0, 0.05
+START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
+"""Seconds in which another process comes, and goes; and between two looks at the store."""
 LOOPBACK = ("127.", "localhost", "::1")
 AGAIN = "run the same command again on all machines: it goes on from the last checkpoint"
 SHARED = "let all machines see one cache under the same path (VLATOOL_CACHE=FOLDER on a shared file system)"
@@ -106,8 +107,8 @@ def launched() -> Launch | None:
     rank, size, local_rank, local_size = (int(said[name]) for name in NAMES[:4])
     if not (rank < size and local_rank < local_size <= size):
         raise RecipeError(
-            f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is no process "
-            "of torchrun's: each rank is below its size.",
+            f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is no "
+            "process of torchrun's: each rank is below its size.",
             "unset RANK and WORLD_SIZE",
         )
     return Launch(rank, size, local_rank, local_size, said["MASTER_ADDR"], int(said["MASTER_PORT"]))
@@ -172,6 +173,7 @@ class Follower:
 
         Raises:
             SourceError: when it does not come.
+            VlatoolError: what it met before.
         """
         self._wait("here", time.monotonic() + START_S)
         return self
@@ -186,10 +188,7 @@ class Follower:
         Raises:
             VlatoolError: what it raised; SourceError when the process is gone.
         """
-        answer = self._wait(f"answer/{self._ask(function, job)}")
-        if answer:
-            kind = getattr(errors, answer["error"], SourceError)
-            raise kind(f"{self._who} ({answer['host']}): {answer['message']}", answer["fix"])
+        self._wait(f"answer/{self._ask(function, job)}")
 
     def end(self) -> None:
         """Wait for it no longer, from any thread."""
@@ -200,14 +199,22 @@ class Follower:
         self._store.set(f"{self._rank}/call/{number}", json.dumps({"function": function, "job": dict(job)}))
         return number
 
-    def _wait(self, name: str, until: float = float("inf")) -> Any:
-        failed = f"{self._rank}/failed"
+    def _wait(self, name: str, until: float = float("inf")) -> None:
+        """Wait for what it says, and raise what went wrong there."""
         while not self._lost.is_set() and time.monotonic() < until:
-            for key in (failed, f"{self._rank}/{name}"):
+            for key in (f"{self._rank}/failed", f"{self._rank}/{name}"):
                 if self._store.check([key]):
-                    return json.loads(self._store.get(key))
+                    self._believe(json.loads(self._store.get(key)))
+                    return
             time.sleep(POLL_S)
         raise SourceError(f"{self._who} of the training does not answer.", AGAIN)
+
+    def _believe(self, answer: Mapping[str, str] | None) -> None:
+        if answer is None:
+            return
+        kind = getattr(errors, answer["error"], None)
+        known = isinstance(kind, type) and issubclass(kind, InputError | MissingExtra)
+        raise (kind if known else SourceError)(f"{self._who} ({answer['host']}): {answer['message']}", answer["fix"])
 
 
 @contextlib.contextmanager
@@ -220,7 +227,7 @@ def leading(launch: Launch) -> Iterator[None]:
         store.set("over", "1")
         if os.environ.get(AGENT) != "True":  # this process serves the store: let them read that
             with contextlib.suppress(RuntimeError):
-                store.wait([f"{rank}/left" for rank in range(1, launch.size)], timedelta(seconds=5))
+                store.wait([f"{rank}/left" for rank in range(1, launch.size)], timedelta(seconds=LEFT_S))
 
 
 def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
@@ -240,6 +247,7 @@ def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
         ready()
     except VlatoolError as error:
         store.set(f"{launch.rank}/failed", json.dumps(_told(error)))
+        store.set(f"{launch.rank}/left", "1")
         raise
     store.set(f"{launch.rank}/here", "null")
     with contextlib.ExitStack() as opened:
