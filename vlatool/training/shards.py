@@ -136,7 +136,8 @@ class Parts(Shards):
         for name, value in self.held.items():
             if value.grad is not None:
                 squares[name in self._cut] += float(torch.linalg.vector_norm(value.grad, dtype=torch.float64)) ** 2
-        return torch.tensor((squares[False] + group.total(squares[True])) ** 0.5)
+        norm: Tensor = torch.tensor((squares[False] + group.total(squares[True])) ** 0.5)
+        return norm
 
     def part(self, name: str, whole: Tensor) -> Tensor:
         """Return this process's rows."""

@@ -212,9 +212,10 @@ class Follower:
     def _believe(self, answer: Mapping[str, str] | None) -> None:
         if answer is None:
             return
-        kind = getattr(errors, answer["error"], None)
-        known = isinstance(kind, type) and issubclass(kind, InputError | MissingExtra)
-        raise (kind if known else SourceError)(f"{self._who} ({answer['host']}): {answer['message']}", answer["fix"])
+        found = getattr(errors, answer["error"], None)
+        known = isinstance(found, type) and issubclass(found, InputError | MissingExtra)
+        kind: Callable[[str, str], VlatoolError] = found if known and found else SourceError
+        raise kind(f"{self._who} ({answer['host']}): {answer['message']}", answer["fix"])
 
 
 @contextlib.contextmanager
