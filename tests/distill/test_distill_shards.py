@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -13,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 from _deep import write_deep
-from _trainings import RECORDED, Killed, digest, distilled, killed_after, raise_killed, training_of
+from _trainings import RECORDED, digest, distilled, killed_after, peers, training_of
 from safetensors import safe_open
 from safetensors.numpy import load_file
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError
+from vlatool.errors import RecipeError, SourceError
 from vlatool.machine.processes import import_path
 from vlatool.prune.neurons import Neurons
 from vlatool.sources.torch_module import TorchModule
@@ -84,13 +85,24 @@ def test_parts_train_as_one_process(
 
 
 def test_parts_go_on_after_a_kill_to_the_same_bits(pruned_deep: Bundle, two: Bundle, tmp_path: Path):
-    with killed_after(5, raise_killed), pytest.raises(Killed):
+    killed = pytest.raises(SourceError, match=r"process 2 of 2: the process that ran it was killed \(SIGKILL\)")
+    with killed_after(5, lambda: os.kill(peers()[0].pid, signal.SIGKILL)), killed:
         distilled(pruned_deep, tmp_path / "out", processes=2, shard=True, **ALL)
     (checkpoint,) = (tmp_path / "cache").rglob("checkpoint.safetensors")
     with safe_open(checkpoint, "pt") as opened:
         assert opened.metadata()["step"] == "3", "of the round before the kill"
     again = distilled(pruned_deep, tmp_path / "out", processes=2, shard=True, **ALL)
     assert digest(again) == digest(two)
+
+
+def test_the_student_plays_with_the_weights_of_all(pruned_deep: Bundle, tmp_path: Path):
+    options = {"steps": 4, "every": 2, "batch": 8, "episodes": 2, "student_episodes": 2, "threads": 2}
+    one = distilled(pruned_deep, tmp_path / "one", **options)
+    two = distilled(pruned_deep, tmp_path / "two", processes=2, shard=True, **options)
+    rounds = [training_of(made)["rounds"] for made in (one, two)]
+    assert len(rounds[0]) == 2
+    assert rounds[1] == rounds[0]
+    assert max(apart(two, one)) < TOLERANCE
 
 
 def test_torchrun_trains_as_processes_of_one_machine_do(policy: Path, pruned_deep: Bundle, two: Bundle, tmp_path: Path):

@@ -70,6 +70,7 @@ def main() -> None:
     parser.add_argument("--layers", type=int, default=10)
     parser.add_argument("--width", type=int, default=2048)
     parser.add_argument("--steps", type=int, default=4)
+    parser.add_argument("--only", choices=("whole", "parts"), help="one of both, without a comparison")
     parser.add_argument("options", nargs="*", help="of vlatool distill policy, after --")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
@@ -80,11 +81,14 @@ def main() -> None:
         train = ["distill", "policy", str(place / "pruned"), "--trust", str(policy), "--steps", str(asked.steps),
                  "--batch", "8", "--episodes", "0", "--student-episodes", "0", "--precision", "float32",
                  "--threads", "2", "--processes", "2", *asked.options]  # fmt: skip
-        for name, more in (("whole", []), ("parts", ["--shard"])):
+        ways = {"whole": [], "parts": ["--shard"]}
+        for name, more in ways.items() if asked.only is None else [(asked.only, ways[asked.only])]:
             begin = time.monotonic()
             peaks = sorted(run(*train, "-o", str(place / name), *more).values())[-2:]
             told = ", ".join(f"{bytes_ / 2**30:.2f} GiB" for bytes_ in reversed(peaks))
             print(f"{name}: {told} (first process, second), {time.monotonic() - begin:.0f} s", flush=True)
+        if asked.only:
+            return
         whole, parts = (place / name / "module/main.safetensors" for name in ("whole", "parts"))
         print(f"weights {whole.stat().st_size / 2**30:.2f} GiB, {apart(whole, parts):.1e} apart")
 

@@ -136,7 +136,7 @@ class Trainer:
         """
         saved = time.monotonic()
         while self.step < until:
-            with self._settings.device.computing():
+            with self._settings.device.computing(), self._shards.computing():
                 self._take_step(draw)
             tell(self.step, float(np.mean(self.losses[-20:])))
             if self._due(saved):
@@ -222,7 +222,8 @@ class Trainer:
         """Let the averaged weights be the weights within the block."""
         self.swap()
         try:
-            yield
+            with self._shards.computing():
+                yield
         finally:
             self.swap()
 
@@ -233,7 +234,7 @@ class Trainer:
     def look(self, look: Callable[[], None]) -> None:
         """Let programs find out together whether their modules take batches, where processes hold parts of weights."""
         if self._shards.several:
-            with self._settings.device.computing(), self._shards.looking():
+            with self._settings.device.computing(), self._shards.computing(), self._shards.looking():
                 look()
 
     def finish(self) -> None:
@@ -261,9 +262,8 @@ class Trainer:
             for _, name, held in tensors if shards.several else ():
                 shards.whole(name, held)
             return
-        about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text()}
-        about["looks"] = json.dumps(self.looks)
-        about["seconds"] = f"{self.seconds:.3f}"
+        about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text(),
+                 "looks": json.dumps(self.looks), "seconds": f"{self.seconds:.3f}"}  # fmt: skip
         with whole_file(self._file) as draft:
             if not shards.several:
                 save_tensors(

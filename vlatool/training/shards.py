@@ -4,28 +4,26 @@
 gathered from all processes, and freed after it; ``backward`` does the same, and adds its gradients up part by part.
 What a training keeps beside the weights (AdamW's moments, the average, the best) is of the parts alone.
 
-A unit is what is gathered at once: each block of a stack, then what else a graph's module has. A weight stays whole in
-every process where that cannot be: scalars, weights that several units share, other types, and modules that are traced
-again for each batch size. All processes must call the units equally often.
+What is gathered at once, and what stays whole, says ``units``. All processes must call the units equally often.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
+import ctypes
+import gc
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import RecipeError, SourceError, require
-from vlatool.module.blocks import stacks_of
-from vlatool.module.cut import RETRACE
-from vlatool.training.group import Group, lost_told
+from vlatool.training.group import LOST, Group, lost_told
+from vlatool.training.units import cut_units, owners_of
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-Owners = dict[int, list[tuple[Any, str]]]
-"""Identity of a weight -> the modules that hold it, and its name in each."""
+BETWEEN = ("/gloo/", "NCCL", "ncclUnhandled", "Connection closed by peer", "Connection reset by peer")
+"""Parts of messages of torch.distributed."""
 LEAVE = "leave --shard out: every process then holds all weights"
 
 
@@ -85,6 +83,11 @@ class Shards:
         """Let programs find out whether their modules take batches, with the same rows in every process."""
         yield
 
+    @contextlib.contextmanager
+    def computing(self) -> Iterator[None]:
+        """Say of a module that fails since another process is gone, that one is gone."""
+        yield
+
 
 class Parts(Shards):
     """What a process holds of each weight: its part.
@@ -102,7 +105,8 @@ class Parts(Shards):
         self._tensor = require("torch.distributed.tensor", "build").DTensor
         trained_in(modules)
         with lost_told():
-            self._root = _sharded(modules, group)
+            self._root = cut_units(modules, group)
+        _give_back()
         weights = trained_in(modules)
         self._cut: dict[str, Any] = {name: value for name, value in weights.items() if isinstance(value, self._tensor)}
         if not self._cut:
@@ -110,7 +114,7 @@ class Parts(Shards):
                 "--shard would share no weight out: the modules are traced again for each batch size, or have none of "
                 "their own.", LEAVE
             )  # fmt: skip
-        self._owners = _owners(modules)
+        self._owners = owners_of(modules)
         with torch.no_grad():  # the same memory: a step that changes a part changes what is gathered next
             parts = {name: torch.nn.Parameter(value.to_local().detach()) for name, value in self._cut.items()}
         super().__init__({**weights, **parts})
@@ -188,6 +192,20 @@ class Parts(Shards):
             setattr(module, name, instead)
 
     @contextlib.contextmanager
+    def computing(self) -> Iterator[None]:
+        """Tell what fails between processes from what fails in a module: weights are gathered while it runs.
+
+        Raises:
+            SourceError: when another process is gone.
+        """
+        try:
+            yield
+        except (RuntimeError, SourceError) as error:
+            if _is_between(error):
+                raise SourceError(LOST) from error
+            raise
+
+    @contextlib.contextmanager
     def looking(self) -> Iterator[None]:
         """Begin anew afterwards: a module that takes no batches may fail while its weights are whole.
 
@@ -204,92 +222,16 @@ class Parts(Shards):
         self._root.reset_iter_state()
 
 
-def _sharded(modules: Mapping[str, nn.Module], group: Group) -> Any:
-    """Cut the weights of modules; return what holds all units."""
-    torch = require("torch", "build")
-    fsdp = require("torch.distributed.fsdp", "build")
-    kind = torch.get_default_device().type
-    mesh = require("torch.distributed.device_mesh", "build").init_device_mesh(kind, (group.size,))
-    cut = {graph: module for graph, module in modules.items() if _runs_as_it_is(module)}
-
-    class Root(torch.nn.ModuleList):  # type: ignore[misc, name-defined]
-        """All units; runs first, and computes nothing, so that none of them takes itself for the first."""
-
-        def forward(self) -> None:
-            """Give nothing."""
-
-    for unit, others in _units(cut, modules):
-        unit.register_forward_hook(_apart)
-        fsdp.fully_shard(unit, mesh=mesh, reshard_after_forward=True, ignored_params=others)
-        unit.set_gradient_divide_factor(1.0)  # sums, as without shards
-        unit.set_force_sum_reduction_for_comms(True)
-    root = Root(cut.values())
-    tensor = require("torch.distributed.tensor", "build").DTensor
-    fsdp.fully_shard(
-        root, mesh=mesh, ignored_params={each for each in root.parameters() if not isinstance(each, tensor)}
-    )
-    root()
-    return root
+def _give_back() -> None:
+    """Let the system have the memory of what was loaded whole; glibc would keep it for later."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
-def _apart(_module: Any, _arguments: Any, gives: Any) -> Any:
-    """Copy what a unit gives as a view: an operation in place on it would lose what prepares ``backward``."""
-    if isinstance(gives, require("torch", "build").Tensor):
-        return gives.clone() if gives._is_view() else gives
-    return type(gives)(_apart(None, None, each) for each in gives) if type(gives) in (tuple, list) else gives
-
-
-def _runs_as_it_is(module: Any) -> bool:
-    """Say whether a module is called itself: no container, and none that is traced again for each batch size."""
-    nn = require("torch", "build").nn
-    return getattr(module, RETRACE, None) is None and not isinstance(module, nn.ModuleDict | nn.ModuleList)
-
-
-def _units(cut: Mapping[str, nn.Module], modules: Mapping[str, nn.Module]) -> list[tuple[Any, set[Any]]]:
-    """Return what is gathered at once, from the inside outwards, each with its weights that stay whole there."""
-    owners, seen, taken = _owners(modules), set[int](), set[int]()
-    blocks = [block for _, stack in reversed(stacks_of(cut, mixed=True)) for block in stack]
-    units = []
-    for unit in dict.fromkeys([*filter(_runs_as_it_is, blocks), *cut.values()]):
-        fits = _fitting(unit, owners, seen, _outside(unit, modules))
-        seen |= {id(value) for value in unit.parameters()}
-        taken |= fits
-        if fits:
-            units.append((unit, {value for value in unit.parameters() if id(value) not in taken}))
-    return units
-
-
-def _fitting(unit: Any, owners: Owners, seen: set[int], outside: set[int]) -> set[int]:
-    """Return the weights of a unit that are cut with it: of one type, no scalars, and nobody else's."""
-    fits = [value for value in unit.parameters()
-            if id(value) not in seen and value.dim() and value.dtype.is_floating_point and value.is_contiguous()
-            and all(id(module) not in outside for module, _ in owners[id(value)])]  # fmt: skip
-    sizes = Counter[Any]()
-    for value in fits:
-        sizes[value.dtype] += value.numel()
-    return {id(value) for value in fits if value.dtype == max(sizes, key=sizes.__getitem__)}
-
-
-def _outside(unit: Any, modules: Mapping[str, nn.Module]) -> set[int]:
-    """Return what runs although a unit does not: all modules that another path leads to."""
-    found, waiting = set[int](), list[Any](modules.values())
-    while waiting:
-        module = waiting.pop()
-        if module is not unit and id(module) not in found:
-            found.add(id(module))
-            waiting += module.children()
-    return found
-
-
-def _owners(modules: Mapping[str, nn.Module]) -> Owners:
-    """Return who holds each weight."""
-    found: Owners = {}
-    parts = {id(part): part for module in modules.values() for part in module.modules()}
-    for part in parts.values():
-        for name, value in part._parameters.items():
-            if value is not None:
-                found.setdefault(id(value), []).append((part, name))
-    return found
+def _is_between(error: Exception) -> bool:
+    """Say whether an error is of what connects processes: the modules of a user run in the midst of it."""
+    return any(name in str(error) for name in BETWEEN)
 
 
 def shards_of(modules: Mapping[str, nn.Module], group: Group, *, cut: bool) -> Shards:
