@@ -65,8 +65,9 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
     group, frames, expert = Group(job["rank"], job["size"]), Frames(place), Expert(place)
     teacher, lesson = stage.prepared(load_modules(source), source)
     device, launch = stage.settings().device, launched()
-    device.choose(launch.local_rank if launch else job["rank"])
-    opened.enter_context(device.holding(lesson.trained, teacher.program.modules))
+    if device.name != "cpu":  # else nothing keeps the teacher, unless the lesson does
+        device.choose(launch.local_rank if launch else job["rank"])
+        opened.enter_context(device.holding(lesson.trained, teacher.program.modules))
     batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
     draw = draw_of(batches, stage.supervision().alpha, lesson.expert, expert.frames)
     _peer[:] = [Peer(stage, place, group, frames, expert, lesson, draw, opened)]
