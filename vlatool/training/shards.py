@@ -172,6 +172,7 @@ class Parts(Shards):
     def gather(self, *, keep: bool) -> None:
         """Gather one weight after the other; what is gathered is no part of the training."""
         parameter = require("torch", "build").nn.Parameter
+        _give_back()
         for name, value in self._cut.items():
             whole = self.whole(name, self.held[name])
             if keep:
@@ -223,7 +224,7 @@ class Parts(Shards):
 
 
 def _give_back() -> None:
-    """Let the system have the memory of what was loaded whole; glibc would keep it for later."""
+    """Let the system have the memory of what was freed, such as what was loaded whole; glibc would keep it."""
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
