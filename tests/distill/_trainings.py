@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from vlatool.bundle.bundle import Bundle
@@ -56,3 +57,11 @@ def training_of(made: Bundle) -> dict[str, Any]:
 def digest(made: Bundle) -> str:
     """Of the weights."""
     return made.manifest.files["module/main.safetensors"].sha256
+
+
+def peers() -> list[psutil.Process]:
+    """The other processes of the training: children of the servers that this process started."""
+    servers = [
+        child for child in psutil.Process().children() if "vlatool.user_code._child" in " ".join(child.cmdline())
+    ]
+    return [peer for server in servers for peer in server.children()]

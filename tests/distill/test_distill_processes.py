@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
-from _trainings import digest, distilled, killed_after, training_of
+from _trainings import digest, distilled, killed_after, peers, training_of
 from safetensors.numpy import load_file
 
 from vlatool.bundle.bundle import Bundle
@@ -30,14 +29,6 @@ def weights(made: Bundle) -> np.ndarray:
     return np.concatenate(
         [value.ravel() for _, value in sorted(load_file(made.path / "module/main.safetensors").items())]
     )
-
-
-def peers() -> list[psutil.Process]:
-    """The other processes of the training: children of the servers that this process started."""
-    servers = [
-        child for child in psutil.Process().children() if "vlatool.user_code._child" in " ".join(child.cmdline())
-    ]
-    return [peer for server in servers for peer in server.children()]
 
 
 def test_two_processes_train_as_one_does(pruned_once: Bundle, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -14,8 +14,8 @@ from vlatool.episodes.frames import file_of
 from vlatool.training.batches import Batches
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group
+from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, Trainer
-from vlatool.training.session import Lesson
 
 ROWS = 40
 

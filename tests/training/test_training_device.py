@@ -34,6 +34,7 @@ MANY = ("reshape(1, 4, 2)", "reshape(-1, 4, 2)")
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: not including_emulation)
 
 
@@ -41,6 +42,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     ("auto", "auto", 1, Device("cuda", True)),
     ("auto", "float32", 1, Device("cuda", False)),
     ("cuda", "bfloat16", 1, Device("cuda", True)),
+    ("cuda", "bfloat16", 2, Device("cuda", True)),
     ("auto", "float32", 2, Device("cpu", False)),
     ("cpu", "float32", 1, CPU),
 ])  # fmt: skip
@@ -54,8 +56,11 @@ def test_a_gpu_that_is_not_there_or_would_be_shared_is_refused(monkeypatch: pyte
     with pytest.raises(RecipeError, match="--device cuda was asked for, and this torch finds no GPU"):
         device_of("cuda", "auto")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    with pytest.raises(RecipeError, match=r"--device cuda trains in one process; asked for --processes 2"):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(RecipeError, match=r"takes a GPU for each process of a machine; asked for 2, torch finds 1"):
         device_of("cuda", "auto", 2)
+    with pytest.raises(RecipeError, match=r"asked for 3, torch finds 1"):
+        device_of("cuda", "auto", 6, 3)
 
 
 @pytest.mark.parametrize(("features", "native"), [(("avx512_bf16",), True), (("avx2",), False), (None, False)])

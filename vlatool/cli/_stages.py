@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from vlatool import registry
-from vlatool.cli import _complete, _run
+from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.base import Measure, Stage, Transform, validated
@@ -85,10 +85,13 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
         context: typer.Context = arguments.pop("context")
         options = {name: arguments.pop(name) for name in own}
         chosen = {name: value for name, value in options.items() if _typed(context, name)}
-        built = validated(stage, chosen, f"vlatool {stage.kind()} {registry_name(stage)}")
-        built = built.named()
+        name = f"vlatool {stage.kind()} {registry_name(stage)}"
+        launch = _torchrun.launch_for(name, trains=issubclass(stage, Transform) and stage.trains)
+        built = validated(stage, _torchrun.with_processes(chosen, launch), name).named()
         if measures:
             _run.measure(typing.cast(Measure, built), **arguments)
+        elif launch is not None:
+            _torchrun.train(typing.cast(Any, built), launch, **arguments)
         else:
             _run.transform(typing.cast(Any, built), **arguments)
 

@@ -14,6 +14,7 @@ from vlatool.cli._console import default_workers, file_or_none, progress, raise_
 from vlatool.cli._document import document, put, report_document
 from vlatool.cli._options import Force
 from vlatool.cli._plan import plan_document
+from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.report import REPORT
@@ -100,6 +101,7 @@ def optimize(
     from vlatool.optimize.plan import make_plan
     from vlatool.stage.run import cache_directory
 
+    launch_for("vlatool optimize", trains=False)
     if not dry_run:
         refuse_existing(output, force, source, recipe, file_or_none(profile), cache, kind=BUNDLE)
     board = load_profile(profile) if profile else None

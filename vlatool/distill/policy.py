@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from vlatool.hardware.profile import Profile
-    from vlatool.training.session import Lesson
+    from vlatool.training.lesson import Lesson
     from vlatool.training.teacher import Teacher
 
 OF_LABELS = ("l1", "l2", "huber")

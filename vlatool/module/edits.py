@@ -8,6 +8,7 @@ the weights are those of the policy's shards (``vlatool.module.stored``): blocks
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import weakref
@@ -25,7 +26,7 @@ from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
 FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
@@ -35,6 +36,8 @@ SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": 
 """Axis -> attributes of a module that say its size."""
 
 
+STORED = {"torch.float32": "F32", "torch.float64": "F64", "torch.float16": "F16", "torch.bfloat16": "BF16"}
+"""Type of a weight that is trained -> as safetensors calls it."""
 _CHANGED: weakref.WeakSet[Any] = weakref.WeakSet()
 """Modules that were changed in this process."""
 
@@ -264,12 +267,52 @@ def save_tensors(path: Path, tensors: Mapping[str, Any], about: Mapping[str, str
         raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from error
 
 
+def stream_tensors(
+    path: Path, forms: Mapping[str, tuple[Any, Sequence[int]]], tensors: Iterable[Tensor], about: Mapping[str, str]
+) -> None:
+    """Write a safetensors file of tensors that come one after the other, so that one is in memory at a time.
+
+    Args:
+        path: A new file.
+        forms: Name -> dtype and shape, in the order in which they come.
+        tensors: The tensors.
+        about: Texts that go with them.
+
+    Raises:
+        OSError: when it cannot be written; what there is of it stays.
+    """
+    torch = require("torch", "build")
+    header: dict[str, Any] = {"__metadata__": dict(about)}
+    end = 0
+    for name, (dtype, shape) in forms.items():
+        start, end = end, end + math.prod(shape) * dtype.itemsize
+        header[name] = {"dtype": STORED[str(dtype)], "shape": list(shape), "data_offsets": [start, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    with path.open("wb") as stream:
+        stream.write(len(text).to_bytes(8, "little") + text)
+        for tensor in tensors:
+            stream.write(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+
+
 def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module]) -> None:
     """Write the edits and the weights of the modules to a new bundle; no modules where the weights stay in shards."""
     (out / FOLDER).mkdir()
     (out / EDITS).write_text(json.dumps([asdict(edit) for edit in edits]) + "\n", encoding="utf-8")
     for graph, module in modules.items():
-        tensors = {name: value.detach().contiguous().clone() for name, value in module.state_dict().items()}
+        tensors = _apart(module.state_dict())
         path = out / FOLDER / f"{graph}.safetensors"
         save_tensors(path, tensors)
         path.chmod((out / EDITS).stat().st_mode & 0o777)  # safetensors lets nobody else read it
+
+
+def _apart(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return tensors that share no memory, as a file of them needs; those that share none are not copied."""
+    seen: set[int] = set()
+    apart = {}
+    for name, value in state.items():
+        held = value.detach().contiguous()
+        place = held.untyped_storage().data_ptr()
+        apart[name] = held.clone() if place in seen else held
+        seen.add(place)
+    return apart

@@ -107,11 +107,15 @@ class ModuleStage(Transform):
             changed = self._written(bundle, out, self._chosen_on_shards(bundle, context), {}, context)
             _run_once(changed)
             return changed
-        modules = load_modules(bundle)
-        done = self.change(modules, bundle, context)
-        changed = self._written(bundle, out, done, apply(modules, done.edits, bundle), context)
+        changed = self._changed(bundle, out, context)
         torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
+
+    def _changed(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
+        """Change the modules and write them; nothing keeps them while what was written runs."""
+        modules = load_modules(bundle)
+        done = self.change(modules, bundle, context)
+        return self._written(bundle, out, done, apply(modules, done.edits, bundle), context)
 
     def _chosen_on_shards(self, bundle: Bundle, context: Context) -> Changed:
         """Return what is to be changed; no more than one weight is in memory, unless the choice needs all."""

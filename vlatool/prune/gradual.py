@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from vlatool.hardware.profile import Profile
-    from vlatool.training.session import Lesson
+    from vlatool.training.lesson import Lesson
     from vlatool.training.teacher import Teacher
 
 
@@ -47,6 +47,11 @@ class Gradual(ImitationStage):
         """The ratio is that of the pattern, and the last weights count."""
         super().check(source, profile)
         check_pattern(self.pattern, self.ratio)
+        if self.shard:
+            raise RecipeError(
+                "--shard cuts layers into parts, and which of a layer's weights become zero is chosen in all of it.",
+                "leave --shard out",
+            )
         if self.patience:
             raise RecipeError(
                 "--patience would choose weights from before the last ones became zero.", "leave --patience out"

@@ -1,4 +1,4 @@
-"""The other processes of a training: started, told what to do, and ended by the first one."""
+"""The other processes of a training: started (by torchrun, or here), told what to do, and ended by the first one."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import SourceError, VlatoolError
+from vlatool.errors import RecipeError, SourceError, VlatoolError
 from vlatool.training.group import LOST, Group, joined_group
+from vlatool.training.torchrun import MEETING, PRELOAD, Follower, Launch, launched, meeting_of, shown
 from vlatool.user_code.children import Apart
 
 HERE = "vlatool.training.peer"
 GRACE_S = 5.0
 """Seconds in which a process that was lost says how, before the others are ended."""
-MEETING = "meeting"
-"""File through which the processes find each other, in the folder of the training."""
-PRELOAD = ("torch", HERE)
 AGAIN = "run the same command again: it goes on from the last checkpoint"
 
 
@@ -30,23 +28,24 @@ class Crew:
         threads: One for each, which waits for it.
     """
 
-    def __init__(self, children: Sequence[Apart] = (), threads: ThreadPoolExecutor | None = None) -> None:
+    def __init__(self, children: Sequence[Apart | Follower] = (), threads: ThreadPoolExecutor | None = None) -> None:
         self.group = Group(0, len(children) + 1)
         self._children, self._threads = children, threads
         self._errors: list[BaseException] = []
 
     @contextlib.contextmanager
-    def training(self, rounds: int, until: int) -> Iterator[None]:
+    def training(self, rounds: int, rows: int, until: int) -> Iterator[None]:
         """Let the others train, too, while the block does.
 
         Args:
             rounds: How many rounds of rows there are.
+            rows: How many rows in all of them.
             until: Number of the step to stop before.
 
         Raises:
             VlatoolError: what one of them met, or how it ended.
         """
-        with self.calling("train", {"rounds": rounds, "until": until}):
+        with self.calling("train", {"rounds": rounds, "rows": rows, "until": until}):
             yield
 
     @contextlib.contextmanager
@@ -67,12 +66,12 @@ class Crew:
         if self._end(calls, wait=True):
             raise self._cause(self._errors[0])
 
-    def _submit(self, child: Apart, function: str, job: Mapping[str, Any]) -> Future[None]:
+    def _submit(self, child: Apart | Follower, function: str, job: Mapping[str, Any]) -> Future[None]:
         if self._threads is None:
             raise RuntimeError("a crew of several has threads")
         return self._threads.submit(self._call, child, function, job)
 
-    def _call(self, child: Apart, function: str, job: Mapping[str, Any]) -> None:
+    def _call(self, child: Apart | Follower, function: str, job: Mapping[str, Any]) -> None:
         try:
             child.call(f"{HERE}:{function}", job, lambda _what, _share: None)
         except BaseException as error:  # told in the first process; the others wait for this one in vain
@@ -98,27 +97,51 @@ class Crew:
 
 
 @contextlib.contextmanager
-def crew_of(job: Mapping[str, Any], size: int, place: Path, about: str) -> Iterator[Crew]:
+def crew_of(job: Mapping[str, Any], size: int, place: Path, about: str, device: str = "cpu") -> Iterator[Crew]:
     """Yield the crew of a training, each process with the student loaded, and this one among them.
 
     Args:
-        job: What ``peer.join`` needs to know.
+        job: What ``peer.load`` needs to know.
         size: How many processes there are with this one.
         place: Folder of the training.
         about: Whose code they run.
+        device: On which they train.
+
+    Raises:
+        RecipeError: when torchrun started another number of processes.
     """
+    launch = launched()
+    check_launch(launch, size)
     if size == 1:
         yield Crew()
         return
-    meeting = place / MEETING
-    meeting.unlink(missing_ok=True)
+    (place / MEETING).unlink(missing_ok=True)
+    job = {**job, "place": str(place), "size": size, **(shown(place) if launch else {})}
     with contextlib.ExitStack() as opened:
         threads = opened.enter_context(ThreadPoolExecutor(size - 1))
-        names = (f"{about}, process {rank + 1} of {size}" for rank in range(1, size))
-        children = [opened.enter_context(Apart(name, PRELOAD)) for name in names]
-        crew = Crew(children, threads)
-        with crew.calling("load", {**job, "place": str(place), "size": size}):
+        others: list[Apart | Follower] = []
+        for rank in range(1, size):
+            other = Follower(launch, rank) if launch else Apart(f"{about}, process {rank + 1} of {size}", PRELOAD)
+            opened.enter_context(other)
+            others.append(other)
+        crew = Crew(others, threads)
+        with crew.calling("load", job):
             pass
-        with crew.calling("join", {}):
-            opened.enter_context(joined_group(meeting, crew.group))
+        store, here = meeting_of(job)
+        with crew.calling("join", job):
+            opened.enter_context(joined_group(store, crew.group, device, here=here))
         yield crew
+
+
+def check_launch(launch: Launch | None, size: int) -> None:
+    """Refuse a number of processes that is not torchrun's, and another process than its first one.
+
+    Raises:
+        RecipeError: saying so.
+    """
+    if launch is not None and (launch.size != size or launch.rank):
+        raise RecipeError(
+            f"torchrun started {launch.size} processes, of which this is number {launch.rank + 1}; the training was "
+            f"asked for {size}, by the first one.",
+            "leave --processes out: torchrun says how many there are",
+        )

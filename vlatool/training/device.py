@@ -72,6 +72,15 @@ class Device:
         )
         return context
 
+    def choose(self, number: int) -> None:
+        """Let a GPU be the one that this process computes on, where it computes on one.
+
+        Args:
+            number: Of the process, of those on this machine.
+        """
+        if self.name == "cuda":
+            require("torch", "build").cuda.set_device(number)
+
     @contextlib.contextmanager
     def holding(self, *programs: Mapping[str, nn.Module]) -> Iterator[None]:
         """Keep modules on the device within the block, and bring them back after it."""
@@ -87,27 +96,30 @@ CPU = Device()
 """A processor, in float32."""
 
 
-def device_of(asked: Asked, precision: str, processes: int = 1) -> Device:
+def device_of(asked: Asked, precision: str, processes: int = 1, here: int | None = None) -> Device:
     """Return what to compute on, and how.
 
     Args:
-        asked: ``auto``: a GPU where torch has one.
+        asked: ``auto``: a GPU where torch has one; several processes share the processors unless ``cuda`` is asked for.
         precision: ``auto``: bfloat16 where the device multiplies it natively.
-        processes: That train together; these share processors.
+        processes: That train together.
+        here: How many of them are on this machine, each with a GPU of its own; all when None.
 
     Raises:
-        RecipeError: when a GPU is asked for where there is none, or by several processes.
+        RecipeError: when a GPU is asked for where there is none, or by more processes than there are.
     """
     cuda = require("torch", "build").cuda
     has = cuda.is_available()
     if asked == "cuda" and not has:
         raise RecipeError("--device cuda was asked for, and this torch finds no GPU.", "take --device cpu or auto")
-    if asked == "cuda" and processes > 1:
+    wanted = processes if here is None else here
+    if asked == "cuda" and wanted > cuda.device_count():
         raise RecipeError(
-            f"--device cuda trains in one process; asked for --processes {processes}.",
-            "leave --processes out, or share the processors: --device cpu",
+            f"--device cuda takes a GPU for each process of a machine; asked for {wanted}, torch finds "
+            f"{cuda.device_count()}.",
+            "start fewer processes, or share the processors: --device cpu",
         )
-    name = "cuda" if has and asked != "cpu" and processes == 1 else "cpu"
+    name = "cuda" if has and asked != "cpu" and (processes == 1 or asked == "cuda") else "cpu"
     native = cuda.is_bf16_supported(including_emulation=False) if name == "cuda" else has_bfloat16()
     return Device(name, precision == "bfloat16" or (precision == "auto" and bool(native)))
 

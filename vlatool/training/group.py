@@ -2,7 +2,8 @@
 
 Modules are not wrapped (``DistributedDataParallel`` hooks into ``forward``, and a program calls modules many times, row
 by row, or traces them again): every process has the same weights, adds its gradients to those of the others after
-``backward``, and takes the same step. Sums are the same bits in all processes, so the weights stay equal.
+``backward``, and takes the same step. Sums are the same bits in all processes, so the weights stay equal. Where each
+process holds a part of the weights alone, see ``shards``.
 """
 
 from __future__ import annotations
@@ -10,10 +11,9 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import SourceError, require
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 LOST = "Another process of the training is gone."
 INTERFACE = "GLOO_SOCKET_IFNAME"
+BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
+"""Device -> what adds up: counts and losses on the processor in any case."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +48,31 @@ class Group:
         """
         if self.size == 1:
             return loss
-        try:
+        with lost_told():
             return _summed(loss, weights)
-        except RuntimeError as error:
-            raise SourceError(LOST) from error
+
+    def total(self, number: float) -> float:
+        """Return the sum of a number over all processes; the same bits in each.
+
+        Raises:
+            SourceError: when another process is gone.
+        """
+        return self.summed(number, ())
+
+
+@contextlib.contextmanager
+def lost_told() -> Iterator[None]:
+    """Say of what fails between processes that one of them is gone."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise SourceError(LOST) from error
 
 
 def _summed(loss: float, weights: Sequence[Tensor]) -> float:
     torch = require("torch", "build")
     has = [float(value.grad is not None) for value in weights]
-    numbers = torch.tensor([loss, *has], dtype=torch.float64)
+    numbers = torch.tensor([loss, *has], dtype=torch.float64, device="cpu")
     torch.distributed.all_reduce(numbers)
     used = [value for value, count in zip(weights, numbers[1:].tolist(), strict=True) if count]
     for value in used:
@@ -76,20 +93,24 @@ def _add_up(gradients: Sequence[Tensor]) -> None:
 
 
 @contextlib.contextmanager
-def joined_group(meeting: Path, group: Group) -> Iterator[None]:
+def joined_group(store: Callable[[], Any], group: Group, device: str = "cpu", *, here: bool = True) -> Iterator[None]:
     """Be one of the processes of a group within the block; all of them must come.
 
     Args:
-        meeting: A file through which they find each other; it must be new.
+        store: Opens a store of ``torch.distributed`` through which they find each other; a new one for each group.
         group: Which one this is.
+        device: ``cpu`` or ``cuda``, of what is added up.
+        here: Whether all of them are on this machine, so that no other one needs to reach them.
+
+    Raises:
+        SourceError: when they do not find each other.
     """
     if group.size == 1:
         yield
         return
     distributed = require("torch.distributed", "build")
-    with _on_this_machine():
-        store = distributed.FileStore(str(meeting), group.size)
-        distributed.init_process_group("gloo", store=store, rank=group.rank, world_size=group.size)
+    with _on_this_machine() if here else contextlib.nullcontext(), lost_told():
+        distributed.init_process_group(BACKENDS[device], store=store(), rank=group.rank, world_size=group.size)
     try:
         yield
     finally:

@@ -74,6 +74,11 @@ class HeldOut:
         self.recording = recording.only(held)
         next_round(self._frames, 0, partial(write, self.recording))
 
+    def read(self) -> None:
+        """Use what another process holds out."""
+        self._frames.read(0)
+        self.expert.read()
+
     def loss(self, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, device: Device) -> float:
         """Return the mean loss of what is held out.
 

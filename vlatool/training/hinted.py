@@ -14,9 +14,9 @@ from vlatool.errors import RecipeError, SourceError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.feeds import recorded_inputs
 from vlatool.training.device import device_in_use
+from vlatool.training.lesson import Lesson
 from vlatool.training.matching import Pair, Stack, pairs_of
 from vlatool.training.rounds import NOISE, tensors
-from vlatool.training.session import Lesson
 from vlatool.training.taps import Form, Place, Taps
 from vlatool.training.teacher import Teacher
 

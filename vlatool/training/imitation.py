@@ -15,8 +15,8 @@ from vlatool.errors import RecipeError, nearest
 from vlatool.module.batched import BatchedProgram
 from vlatool.training.flow import CHUNK, check_loops, flow_loss
 from vlatool.training.hinted import with_hints
+from vlatool.training.lesson import Lesson
 from vlatool.training.rounds import LABEL, NOISE, tensors
-from vlatool.training.session import Lesson
 from vlatool.training.stage import TrainingStage
 
 if TYPE_CHECKING:

@@ -6,10 +6,11 @@ the same weights, bit for bit, on the same processor with the same number of thr
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ from vlatool.errors import DataError, require
 from vlatool.files.edited import whole_file
 from vlatool.files.printable import message_of
 from vlatool.module.batched import no_gradient
-from vlatool.module.edits import save_tensors
+from vlatool.module.edits import save_tensors, stream_tensors
 from vlatool.training.best import Best
 from vlatool.training.constraint import Constraint
 from vlatool.training.device import CPU, Device
@@ -28,6 +29,7 @@ from vlatool.training.group import Group
 from vlatool.training.mixture import Draw as Draw
 from vlatool.training.mixture import Mixture
 from vlatool.training.mixture import Part as Part
+from vlatool.training.shards import shards_of
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -53,6 +55,7 @@ class Settings:
         seed: Of the batches.
         device: On what, and in which precision.
         checkpoint_s: Seconds between checkpoints.
+        shard: Whether each process holds a part of the weights alone.
     """
 
     steps: int
@@ -62,6 +65,7 @@ class Settings:
     seed: int = 0
     device: Device = CPU
     checkpoint_s: float = 30.0
+    shard: bool = False
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step: linear warm-up, then a cosine to zero."""
@@ -97,12 +101,9 @@ class Trainer:
         torch = require("torch", "build")
         self._settings, self._group, self._constraint = settings, group or Group(), constraint or Constraint()
         self._file = folder / CHECKPOINT
-        self._weights = {
-            f"{graph}.{name}": value.requires_grad_()
-            for graph, module in modules.items()
-            for name, value in module.named_parameters()
-            if value.dtype.is_floating_point
-        }
+        with settings.device.computing():
+            self._shards = shards_of(modules, self._group, cut=settings.shard)
+        self._weights = self._shards.held
         decayed = [value for value in self._weights.values() if value.dim() > 1]
         plain = [value for value in self._weights.values() if value.dim() <= 1]
         groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": plain, "weight_decay": 0.0}]
@@ -135,12 +136,17 @@ class Trainer:
         """
         saved = time.monotonic()
         while self.step < until:
-            with self._settings.device.computing():
+            with self._settings.device.computing(), self._shards.computing():
                 self._take_step(draw)
             tell(self.step, float(np.mean(self.losses[-20:])))
-            if self._group.rank == 0 and time.monotonic() - saved > self._settings.checkpoint_s:
+            if self._due(saved):
                 self.save()
                 saved = time.monotonic()
+
+    def _due(self, saved: float) -> bool:
+        """Say whether it is time for a checkpoint, which all processes write together where each holds parts."""
+        due = self._group.rank == 0 and time.monotonic() - saved > self._settings.checkpoint_s
+        return self._group.total(float(due)) > 0 if self._shards.several else due
 
     def _take_step(self, draw: Draw) -> None:
         self._optimizer.zero_grad()
@@ -148,7 +154,7 @@ class Trainer:
         if isinstance(draw, Mixture) and self.step in {int(share * self._settings.steps) for share in LOOKS}:
             loss = self._look(draw, random)
         else:
-            loss = self._group.summed(self._own_loss(draw(random)), list(self._weights.values()))
+            loss = self._shards.summed(self._own_loss(draw(random)), self._group)
         if not math.isfinite(loss):
             raise DataError(
                 f"The loss is {loss} in step {self.step + 1} of {self._settings.steps}.",
@@ -156,7 +162,8 @@ class Trainer:
             )
         for group in self._optimizer.param_groups:
             group["lr"] = self._settings.rate(self.step)
-        require("torch", "build").nn.utils.clip_grad_norm_(list(self._weights.values()), CLIP)
+        norm = self._shards.norm(self._group)
+        require("torch", "build").nn.utils.clip_grads_with_norm_(list(self._weights.values()), CLIP, norm)
         with self._constraint.step(self.step + 1):
             self._optimizer.step()
         self._follow()
@@ -169,9 +176,8 @@ class Trainer:
         sums: list[Tensor | None] = [None] * len(weights)
         for term in mixture.terms:
             self._optimizer.zero_grad()
-            total += self._group.summed(self._own_loss(term(random)), weights)
-            norms.append(math.sqrt(sum(float(value.grad.double().square().sum()) for value in weights
-                                       if value.grad is not None)))  # fmt: skip
+            total += self._shards.summed(self._own_loss(term(random)), self._group)
+            norms.append(float(self._shards.norm(self._group)))
             sums = [value.grad if before is None else before if value.grad is None else before + value.grad
                     for before, value in zip(sums, weights, strict=True)]  # fmt: skip
         for value, gradient in zip(weights, sums, strict=True):
@@ -211,30 +217,71 @@ class Trainer:
                 value.copy_(self._average[name])
                 self._average[name].copy_(kept)
 
+    @contextlib.contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Let the averaged weights be the weights within the block."""
+        self.swap()
+        try:
+            with self._shards.computing():
+                yield
+        finally:
+            self.swap()
+
+    def whole(self) -> contextlib.AbstractContextManager[None]:
+        """Return a context in which the modules of the first process hold all weights; all processes must come."""
+        return self._shards.in_modules(keep=self._group.rank == 0)
+
+    def look(self, look: Callable[[], None]) -> None:
+        """Let programs find out together whether their modules take batches, where processes hold parts of weights."""
+        if self._shards.several:
+            with self._settings.device.computing(), self._shards.computing(), self._shards.looking():
+                look()
+
     def finish(self) -> None:
-        """Put the average in the place of the weights, the best one where that is known; ask for no gradients more."""
+        """Put the average in the place of the weights, the best one where that is known; ask for no gradients more.
+
+        The modules of the first process hold all of them from now on; all processes must come.
+        """
         self._average.update(self.best.weights)
         self.swap()
         for value in self._weights.values():
             value.requires_grad_(False)
+        if self._shards.several:  # no step follows, and no checkpoint
+            for kept in (self._optimizer.state, self._average, self.best.weights):
+                kept.clear()
+        self._shards.gather(keep=self._group.rank == 0)
 
     def save(self) -> None:
-        """Write a checkpoint, whole or not at all.
+        """Write a checkpoint, whole or not at all; the first process does, with the parts of all.
 
         Raises:
             OSError: when it cannot be written.
         """
-        tensors = {f"weight.{name}": value.detach().contiguous() for name, value in self._weights.items()}
-        tensors |= {f"average.{name}": value for name, value in self._average.items()}
-        for name, value in self._weights.items():
-            for key, held in self._optimizer.state[value].items():
-                tensors[f"{key}.{name}"] = held.contiguous()
-        tensors |= {f"best.{name}": value for name, value in self.best.weights.items()}
-        about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text()}
-        about["looks"] = json.dumps(self.looks)
-        about["seconds"] = f"{self.seconds:.3f}"
+        shards, tensors = self._shards, sorted(self._kept(), key=lambda each: -each[2].dtype.itemsize)
+        if self._group.rank:
+            for _, name, held in tensors if shards.several else ():
+                shards.whole(name, held)
+            return
+        about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text(),
+                 "looks": json.dumps(self.looks), "seconds": f"{self.seconds:.3f}"}  # fmt: skip
         with whole_file(self._file) as draft:
-            save_tensors(draft, tensors, about)
+            if not shards.several:
+                save_tensors(
+                    draft, {f"{kind}.{name}": held.detach().contiguous() for kind, name, held in tensors}, about
+                )
+                return
+            forms = {f"{kind}.{name}": (held.dtype, shards.size(name, held)) for kind, name, held in tensors}
+            stream_tensors(draft, forms, (shards.whole(name, held) for _, name, held in tensors), about)
+
+    def _kept(self) -> Iterator[tuple[str, str, Tensor]]:
+        """Yield what a checkpoint holds: kind, name of the weight, and tensor, or this process's part of it."""
+        for name, value in self._weights.items():
+            yield "weight", name, value
+            yield "average", name, self._average[name]
+            for kind, held in self._optimizer.state[value].items():
+                yield kind, name, held
+        for name, held in self.best.weights.items():
+            yield "best", name, held
 
     def _resume(self) -> None:
         """Go on from the checkpoint, if there is one.
@@ -259,15 +306,19 @@ class Trainer:
         self.step, self.losses = int(about["step"]), json.loads(about["losses"])
         self.looks = json.loads(about["looks"])
         self._start -= float(about["seconds"])
-        best = {name: opened.get_tensor(f"best.{name}") for name in self._weights if f"best.{name}" in names}
+
+        def part(kind: str, name: str) -> Tensor:
+            return self._shards.part(name, opened.get_tensor(f"{kind}.{name}"))
+
+        best = {name: part("best", name).clone() for name in self._weights if f"best.{name}" in names}
         self.best = Best.of(about["best"], best)
         for name, value in self._weights.items():
-            value.copy_(opened.get_tensor(f"weight.{name}"))
-            self._average[name].copy_(opened.get_tensor(f"average.{name}"))
+            value.copy_(part("weight", name))
+            self._average[name].copy_(part("average", name))
             state: dict[str, Any] = {
-                key: opened.get_tensor(f"{key}.{name}").to("cpu" if key == "step" else value.device)
-                for key in ("step", "exp_avg", "exp_avg_sq")
-                if f"{key}.{name}" in names
+                kind: part(kind, name).to("cpu" if kind == "step" else value.device, copy=True)
+                for kind in ("step", "exp_avg", "exp_avg_sq")
+                if f"{kind}.{name}" in names
             }
             if state:
                 self._optimizer.state[value] = state

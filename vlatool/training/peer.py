@@ -1,70 +1,137 @@
-"""Another process of a training: what it is called to do, one call after the other; see ``crew``."""
+"""One of the other processes of a training: what the first one calls in it, see ``crew``."""
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, require
+from vlatool.errors import DataError, RecipeError, require
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.base import build_stage
 from vlatool.training.batches import Batches, draw_of
-from vlatool.training.crew import MEETING
 from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group, joined_group
+from vlatool.training.held_out import HeldOut
+from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Draw, Trainer
 from vlatool.training.stage import TrainingStage
+from vlatool.training.torchrun import check_shared, launched, meeting_of
 
 Tell = Callable[[str, float | None], None]
+PATIENCE_S = 120.0
+"""Seconds in which a shared file system shows what the first process wrote."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Peer:
     """What a process has loaded, and keeps between calls."""
 
-    meeting: Path
+    stage: TrainingStage
+    place: Path
     group: Group
     frames: Frames
-    trainer: Trainer
-    batches: Draw
-    opened: contextlib.ExitStack
     expert: Expert
+    lesson: Lesson
+    batches: Draw
+    opened: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    trainer: Trainer | None = None
+
+    @property
+    def training(self) -> Trainer:
+        """Return what trains, after ``prepare``."""
+        if self.trainer is None:
+            raise RuntimeError("prepare() comes first")
+        return self.trainer
 
 
 _peer: list[Peer] = []
 
 
 def load(job: Mapping[str, Any], _tell: Tell) -> None:
-    """Load the student, and where its training stands; ``join`` follows."""
-    stage = build_stage(job["stage"], job["options"])
+    """Load the student; ``join`` follows."""
+    stage, place = build_stage(job["stage"], job["options"]), Path(job["place"])
     if not isinstance(stage, TrainingStage):
         raise RecipeError(f"The stage {job['stage']} trains nothing.")
+    check_shared(job)
     require("torch", "build").set_num_threads(job["threads"])
-    source, place = Bundle.open(Path(job["source"]), verify=False), Path(job["place"])
-    group, frames = Group(job["rank"], job["size"]), Frames(place)
-    _, lesson = stage.prepared(load_modules(source), source)
-    trainer = Trainer(lesson.trained, stage.settings(), place, group, lesson.constraint)
+    source, opened = Bundle.open(Path(job["source"]), verify=False), contextlib.ExitStack()
+    group, frames, expert = Group(job["rank"], job["size"]), Frames(place), Expert(place)
+    teacher, lesson = stage.prepared(load_modules(source), source)
+    device, launch = stage.settings().device, launched()
+    if device.name != "cpu":  # else nothing keeps the teacher, unless the lesson does
+        device.choose(launch.local_rank if launch else job["rank"])
+        opened.enter_context(device.holding(lesson.trained, teacher.program.modules))
     batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
-    expert = Expert(place)
     draw = draw_of(batches, stage.supervision().alpha, lesson.expert, expert.frames)
-    _peer[:] = [Peer(place / MEETING, group, frames, trainer, draw, contextlib.ExitStack(), expert)]
+    _peer[:] = [Peer(stage, place, group, frames, expert, lesson, draw, opened)]
 
 
-def join(_job: Mapping[str, Any], _tell: Tell) -> None:
+def join(job: Mapping[str, Any], _tell: Tell) -> None:
     """Become one of the group, whose other processes do so at the same time."""
+    peer, (store, here) = _peer[0], meeting_of(job)
+    peer.opened.enter_context(joined_group(store, peer.group, peer.stage.settings().device.name, here=here))
+
+
+def prepare(_job: Mapping[str, Any], _tell: Tell) -> None:
+    """Find out where the training stands, and hold a part of the weights where that is asked for."""
     peer = _peer[0]
-    peer.opened.enter_context(joined_group(peer.meeting, peer.group))
+    peer.trainer = Trainer(peer.lesson.trained, peer.stage.settings(), peer.place, peer.group, peer.lesson.constraint)
 
 
 def train(job: Mapping[str, Any], _tell: Tell) -> None:
     """Take the steps until one of them, on so many rounds of rows."""
     peer = _peer[0]
     for number in range(peer.frames.count, job["rounds"]):
-        peer.frames.read(number)
+        if _seen(peer.frames, number):
+            peer.frames.read(number)
     peer.expert.read()
-    peer.trainer.train(job["until"], peer.batches, lambda _step, _loss: None)
+    if len(peer.frames) != job["rows"]:
+        raise DataError(
+            f"The first process trains on {job['rows']} rows, process {peer.group.rank + 1} sees {len(peer.frames)} "
+            f"of them in {peer.place}.",
+            "let all processes see the same folder (VLATOOL_CACHE)",
+        )
+    peer.training.look(partial(peer.lesson.look, peer.frames, peer.expert.frames))
+    peer.training.train(job["until"], peer.batches, lambda _step, _loss: None)
+    peer.training.save()
+
+
+def _seen(frames: Frames, number: int) -> bool:
+    """Wait until a round is seen that the first process has written; say whether it is."""
+    end = time.monotonic() + PATIENCE_S
+    while not frames.has(number) and time.monotonic() < end:
+        time.sleep(0.1)
+    return frames.has(number)
+
+
+def show(_job: Mapping[str, Any], _tell: Tell) -> None:
+    """Give this process's part of the averaged weights, which are about to act."""
+    with _peer[0].training.averaged(), _peer[0].training.whole():
+        pass
+
+
+def examine(_job: Mapping[str, Any], _tell: Tell) -> None:
+    """Compute the held-out loss, as the first process does."""
+    peer, held_out = _peer[0], HeldOut(_peer[0].place)
+    held_out.read()
+    with peer.training.averaged():
+        terms = peer.stage.supervision().alpha, peer.lesson.examined, peer.lesson.expert
+        held_out.mixed(*terms, peer.stage.batch, peer.stage.settings().device)
+
+
+def judge(job: Mapping[str, Any], _tell: Tell) -> None:
+    """Remember how well the averaged weights did."""
+    _peer[0].training.judge(job["score"])
+    _peer[0].training.save()
+
+
+def finish(_job: Mapping[str, Any], _tell: Tell) -> None:
+    """Give this process's part of the result."""
+    _peer[0].training.finish()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,6 @@ from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.batches import Batches, draw_of
-from vlatool.training.constraint import Constraint
 from vlatool.training.control import exchange_labels
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
@@ -27,6 +27,7 @@ from vlatool.training.expert import Expert, at_most
 from vlatool.training.forecast import Forecast
 from vlatool.training.frames import Frames, joined
 from vlatool.training.held_out import HeldOut
+from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
@@ -34,7 +35,7 @@ from vlatool.training.teacher import Teacher
 from vlatool.training.yielded import write_yielded
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    pass
 
 ROUND = "round-{:03d}.json"
 """File that says who acted in a round, and how well."""
@@ -79,39 +80,6 @@ class Plan:
         return self.first_seed + sum(-(-self.asked(before) // tasks) for before in range(number))
 
 
-@dataclass(frozen=True)
-class Lesson:
-    """What a student is trained to make small.
-
-    Args:
-        name: Of the loss.
-        modules: The student's, which are trained in place.
-        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
-            computed in parts.
-        judged: What of it says how good the student is on rows that it has not seen; all of it when None.
-        along: Name -> module that is trained along, and no part of the student.
-        about: What else is to be known of the training, as JSON values.
-        constraint: What holds of the weights after each step.
-        expert: The same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
-        turns: Whether the teacher also shows single turns of its loop (``rounds.label``).
-    """
-
-    name: str
-    modules: Mapping[str, nn.Module]
-    loss: Callable[[Mapping[str, Any]], Tensor]
-    judged: Callable[[Mapping[str, Any]], Tensor] | None = None
-    along: Mapping[str, nn.Module] = field(default_factory=dict)
-    about: Mapping[str, Any] = field(default_factory=dict)
-    constraint: Constraint | None = None
-    expert: Callable[[Mapping[str, Any]], Tensor] | None = None
-    turns: bool = False
-
-    @property
-    def trained(self) -> dict[str, nn.Module]:
-        """Everything that is trained."""
-        return {**self.modules, **self.along}
-
-
 class Session:
     """Trains a student; what was done is kept in a folder, from which a run that was killed goes on.
 
@@ -146,7 +114,8 @@ class Session:
         self._encode = ObservationEncoder(self._spec, source)
         self._frames = Frames(place)
         self._held_out = HeldOut(place) if plan.patience and not self._plays else None
-        self._trainer = Trainer(lesson.trained, settings, place, self._crew.group, lesson.constraint)
+        with self._crew.calling("prepare", {}):
+            self._trainer = Trainer(lesson.trained, settings, place, self._crew.group, lesson.constraint)
         self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
         self._expert = Expert(place)
         self._draw = draw_of(self._batches, plan.supervision.alpha, lesson.expert, self._expert.frames)
@@ -171,7 +140,8 @@ class Session:
         else:
             if self._plan.patience:
                 self._paused(len(pauses) + 1)
-        self._trainer.finish()
+        with self._all("finish"):
+            self._trainer.finish()
         self._events.close()
         return self._about()
 
@@ -187,9 +157,14 @@ class Session:
         self._held_out.expert.prepare(self._held_out.recording, self._source, *chosen, self._encode)
 
     def _train(self, end: int) -> None:
-        with self._crew.training(self._frames.count, end):
+        with self._crew.training(self._frames.count, len(self._frames), end):
+            self._trainer.look(partial(self._lesson.look, self._frames, self._expert.frames))
             self._trainer.train(end, self._draw, self._tell)
-        self._trainer.save()
+            self._trainer.save()
+
+    def _all(self, function: str, **job: Any) -> contextlib.AbstractContextManager[None]:
+        """Let the other processes do the same within the block, where each holds a part of the weights."""
+        return self._crew.calling(function, job) if self._settings.shard else contextlib.nullcontext()
 
     def _paused(self, number: int) -> bool:
         """Let the student play, and say whether it has stopped getting better."""
@@ -201,8 +176,10 @@ class Session:
         if not patience:
             return False
         if len(best.scores) < number:
-            self._trainer.judge(self._score(number))
-            self._trainer.save()
+            score = self._score(number)
+            with self._all("judge", score=score):
+                self._trainer.judge(score)
+                self._trainer.save()
         return best.unimproved(number) >= patience
 
     def _score(self, number: int) -> float:
@@ -210,13 +187,9 @@ class Session:
         if self._held_out is None:
             about = self._round(number)
             return float(about["successes"] / about["episodes"])
-        self._trainer.swap()
-        try:
-            judged = self._lesson.judged or self._lesson.loss
-            terms = self._plan.supervision.alpha, judged, self._lesson.expert
+        with self._all("examine"), self._trainer.averaged():
+            terms = self._plan.supervision.alpha, self._lesson.examined, self._lesson.expert
             loss = self._held_out.mixed(*terms, self._plan.batch, self._settings.device)
-        finally:
-            self._trainer.swap()
         self._events.add(self._trainer.step, {"held-out loss": loss})
         self._success = f"held-out loss {loss:.4g}"
         return -loss
@@ -276,11 +249,8 @@ class Session:
 
     def _students(self, number: int, target: Path) -> None:
         """Write a round of the student's episodes; its averaged weights act."""
-        self._trainer.swap()
-        try:
+        with self._trainer.averaged():
             self._play(target, number)
-        finally:
-            self._trainer.swap()
 
     def _play(self, target: Path, number: int) -> None:
         folder, episodes = target / "episodes", self._plan.asked(number)
@@ -319,7 +289,8 @@ class Session:
         place.mkdir()
         source, teacher = self._source, self._teacher
         if number:
-            return write_changed(source, place, read_edits(source), self._lesson.modules, source.manifest.made_by)
+            with self._all("show"), self._trainer.whole():
+                return write_changed(source, place, read_edits(source), self._lesson.modules, source.manifest.made_by)
         modules = teacher.program.modules
         program = teacher.program.steps
         return write_changed(teacher.bundle, place, teacher.edits, modules, source.manifest.made_by, program=program)

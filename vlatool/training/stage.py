@@ -22,14 +22,16 @@ from vlatool.module.stage import TRAINING, Changed, ModuleStage
 from vlatool.stage.base import Context, source_of
 from vlatool.stage.cache import STREAMS
 from vlatool.training.crew import crew_of
-from vlatool.training.device import Asked, device_of
+from vlatool.training.device import Asked, Device, device_of
 from vlatool.training.events import check_events
+from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, seconds_of
 from vlatool.training.report import write_training_report
 from vlatool.training.rounds import scene_of
-from vlatool.training.session import Lesson, Plan, Session
+from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
 from vlatool.training.teacher import Teacher, check_teacher, teacher_source
+from vlatool.training.torchrun import launched
 from vlatool.training.yielded import rows_asked
 from vlatool.user_code import trust
 
@@ -79,6 +81,9 @@ class TrainingStage(ModuleStage):
     device: Asked = Field("auto", description="what computes: a GPU where torch finds one, else the processor")
     threads: int = Field(0, ge=0, description="of torch, over all processes; all cores of this process when 0")
     processes: int = Field(1, ge=1, le=64, description="that share each batch, and the threads")
+    shard: bool = Field(
+        False, description="let each of several processes hold a part of weights, gradients and moments alone (FSDP2)"
+    )
     accumulate: int = Field(1, ge=1, description="parts of a batch that follow each other: less memory, the same loss")
     patience: int = Field(
         0, ge=0, description="stop when so many rounds in a row were no better (success, or held-out loss); 0 for never"
@@ -106,7 +111,7 @@ class TrainingStage(ModuleStage):
         """No episode of the training is one of the evaluation's, and the teacher is another policy."""
         super().check(source, profile)
         if self.device == "cuda":
-            device_of(self.device, self.precision, self.processes)
+            self._device()
         if self.teacher:
             check_teacher(self.teacher)
         parts = self.processes * self.accumulate
@@ -116,6 +121,7 @@ class TrainingStage(ModuleStage):
                 f"{self.accumulate}).",
                 "take a larger --batch, or fewer parts",
             )
+        self._check_shard(parts)
         rounds = len(self.pauses()) + bool(self.patience)
         last = self.first_seed + self.episodes + rounds * self.student_episodes
         if max(self.first_seed + 1, last) > EVALUATION_SEEDS:
@@ -130,6 +136,20 @@ class TrainingStage(ModuleStage):
                 f"{source.manifest.name} is as its factory makes it: without --teacher it would be its own teacher.",
                 "let a part of it be the student (vlatool distill policy --student depth=0.5,width=0.75), prune it "
                 "first (vlatool prune structured), or name a --teacher",
+            )
+
+    def _check_shard(self, parts: int) -> None:
+        """Refuse parts of weights where nobody holds the others, or where processes would not gather equally often."""
+        if self.shard and self.processes == 1:
+            raise RecipeError(
+                "--shard lets several processes hold a part of the weights each; there is one.",
+                "take --processes 2 or more (or torchrun), or leave --shard out",
+            )
+        if self.shard and self.batch % parts:
+            raise RecipeError(
+                f"With --shard all processes take equally many rows; a batch of {self.batch} makes no {parts} equal "
+                f"parts (processes {self.processes}, accumulate {self.accumulate}).",
+                f"take --batch {self.batch - self.batch % parts} or {self.batch + -self.batch % parts}",
             )
 
     def pauses(self) -> list[int]:
@@ -164,8 +184,9 @@ class TrainingStage(ModuleStage):
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Train the modules in place."""
         torch = require("torch", "build")
-        before = torch.get_num_threads()
-        torch.set_num_threads(max(1, (self.threads or before) // self.processes))
+        before, launch = torch.get_num_threads(), launched()
+        here = launch.local_size if launch and not self.threads else self.processes
+        torch.set_num_threads(max(1, (self.threads or before) // here))
         try:
             with work_directory(self._place(source)) as place:
                 return self._trained(modules, source, place, context)
@@ -185,10 +206,9 @@ class TrainingStage(ModuleStage):
         plan = replace(self.plan(), yielded=asked)
         teacher, lesson = self.prepared(modules, source)
         settings, programs = self.settings(), (lesson.trained, teacher.program.modules)
-        with (
-            settings.device.holding(*programs),
-            crew_of(self._job(source), self.processes, place, self.runs(source)) as crew,
-        ):
+        settings.device.choose(0)
+        crew_asked = self._job(source), self.processes, place, self.runs(source), settings.device.name
+        with settings.device.holding(*programs), crew_of(*crew_asked) as crew:
             session = Session(plan, settings, lesson, source, teacher, place, context, crew)
             return Changed(training=session.run())
 
@@ -199,8 +219,13 @@ class TrainingStage(ModuleStage):
 
     def settings(self) -> Settings:
         """Return how long and how fast is trained."""
-        device = device_of(self.device, self.precision, self.processes)
-        return Settings(self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, device)
+        return Settings(
+            self.steps, self.learning_rate, self.weight_decay, self.average, self.seed, self._device(), shard=self.shard
+        )
+
+    def _device(self) -> Device:
+        launch = launched()
+        return device_of(self.device, self.precision, self.processes, launch.local_size if launch else None)
 
     def supervision(self) -> Supervision:
         """Return who says what is right: the teacher, unless a stage asks somebody else, too."""

@@ -1,0 +1,64 @@
+"""What a student is trained to make small."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.training.constraint import Constraint
+from vlatool.training.frames import Frames
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What a student is trained to make small.
+
+    Args:
+        name: Of the loss.
+        modules: The student's, which are trained in place.
+        loss: Rows of a batch, name -> (B, ...), as ``label`` wrote them -> the mean of their losses: a batch may be
+            computed in parts.
+        judged: What of it says how good the student is on rows that it has not seen; all of it when None.
+        along: Name -> module that is trained along, and no part of the student.
+        about: What else is to be known of the training, as JSON values.
+        constraint: What holds of the weights after each step.
+        expert: The same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
+        turns: Whether the teacher also shows single turns of its loop (``rounds.label``).
+    """
+
+    name: str
+    modules: Mapping[str, nn.Module]
+    loss: Callable[[Mapping[str, Any]], Tensor]
+    judged: Callable[[Mapping[str, Any]], Tensor] | None = None
+    along: Mapping[str, nn.Module] = field(default_factory=dict)
+    about: Mapping[str, Any] = field(default_factory=dict)
+    constraint: Constraint | None = None
+    expert: Callable[[Mapping[str, Any]], Tensor] | None = None
+    turns: bool = False
+
+    @property
+    def examined(self) -> Callable[[Mapping[str, Any]], Tensor]:
+        """What says how good the student is."""
+        return self.judged or self.loss
+
+    @property
+    def trained(self) -> dict[str, nn.Module]:
+        """Everything that is trained."""
+        return {**self.modules, **self.along}
+
+    def look(self, frames: Frames, shown: Frames) -> None:
+        """Let the programs find out whether their modules take batches, with rows that all processes agree on.
+
+        Args:
+            frames: What the teacher labelled.
+            shown: What the expert did.
+        """
+        for loss, rows in ((self.loss, frames), (self.expert, shown)):
+            if loss is not None and len(rows):
+                loss(rows.batch(np.arange(2) % len(rows)))
