@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 import typer
 
 from vlatool.cli._document import document, put, report_document
-from vlatool.errors import GateFailed, Inconclusive, OutputError
+from vlatool.errors import GateFailed, Inconclusive, OutputError, UsageError
 from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
 from vlatool.files.printable import one_line, printable, without_password
 from vlatool.files.writing import writing
@@ -26,7 +26,7 @@ from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
 from vlatool.stage.base import Context, Tell
 
-PLACES = ("-o", "--output", "--cache", "--junit")
+PLACES = ("-o", "--output", "--cache", "--junit", "--video")
 """Options that name a place to write to: paths are not recorded."""
 
 
@@ -137,6 +137,32 @@ def refuse_existing(
     refuse_replacing(out, force=force, further={"the cache": cache_directory()}, kind=kind)
     if not os.path.lexists(out):
         _refuse_unwritable(out)
+
+
+def refuse_video(
+    video: Path | None, force: bool, out: Path | None, inputs: Iterable[str | os.PathLike[str] | None]
+) -> None:
+    """Refuse a video that cannot be written before the work, not after it.
+
+    Args:
+        video: The file, None when there is none.
+        force: Whether one that vlatool wrote there may be replaced.
+        out: The directory of the report.
+        inputs: What the command reads.
+
+    Raises:
+        UsageError: when its suffix names no format, or it is in the directory of the report.
+        MissingExtra: when nothing is installed that writes the format.
+        OutputError: when it lies in an input, exists (and not ``force``), or cannot be written.
+    """
+    from vlatool.render.video import check_video
+
+    if video is None:
+        return
+    if out is not None and out.absolute() in (video.absolute(), *video.absolute().parents):
+        raise UsageError(f"--video {video} is in the output {out}, which appears whole or not at all.")
+    refuse_inputs(video, inputs)
+    check_video(video, force=force)
 
 
 def file_or_none(named: str | None) -> str | None:

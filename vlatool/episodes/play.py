@@ -22,6 +22,7 @@ from vlatool.episodes.body import Body, series_of
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.disturbed import OWN, Seen
 from vlatool.episodes.environment import GUIDE, World
+from vlatool.episodes.film import world_of
 from vlatool.episodes.frames import KeepingEncoder, Noisy
 from vlatool.episodes.late import Late
 from vlatool.errors import DataError, VlatoolError, require
@@ -63,6 +64,7 @@ class EpisodesJob:
         strength: Of the disturbance; 1 is what an ordinary day brings.
         latency_ms: How late actions come; 0 for at once.
         show: Whether the outcomes hold the path and the actions of each step.
+        film: Folder for pictures of the episode, of which there is one then; none are taken when empty.
     """
 
     environment: str
@@ -77,6 +79,7 @@ class EpisodesJob:
     strength: float = 1.0
     latency_ms: float = 0.0
     show: bool = False
+    film: str = ""
 
 
 @dataclass(frozen=True)
@@ -217,7 +220,7 @@ class Worker:
     def play(self, job: EpisodesJob, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
         spec = self.queue.policy.spec
-        world = World(self.environment(job), job.task, spec)
+        world = world_of(self.environment(job), job.task, spec, job.film)
         with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
             return [_episode(world, self._actor(job, seed), spec, job, seed, limit) for seed in job.seeds]
 

@@ -33,7 +33,7 @@ def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any
     return {
         "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
-        "events": context.events,
+        "events": context.events, "video": context.video,
     }  # fmt: skip
 
 
@@ -65,4 +65,4 @@ def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     if not isinstance(stage, Measure):
         raise RecipeError(f"The stage {job['stage']} makes a bundle; it measures nothing.")
     source = Bundle.open(Path(job["source"]), verify=False)
-    return stage.run(source, Context(tell, job["workers"], job["command"])).to_json()
+    return stage.run(source, Context(tell, job["workers"], job["command"], video=job["video"])).to_json()

@@ -52,6 +52,7 @@ class Context:
         elsewhere: Measures on another machine: a job, the bundles that it names, and ``tell`` -> what was found there.
             Here when None.
         events: Folder into which a training writes events that TensorBoard reads; none when empty.
+        video: File into which an evaluation writes a video of an episode; none when empty.
     """
 
     tell: Tell = field(default=_silent)
@@ -59,6 +60,7 @@ class Context:
     command: str = ""
     elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
     events: str = ""
+    video: str = ""
 
 
 class SampleSet:
@@ -240,6 +242,8 @@ class Measure(Stage):
 
     remotely: ClassVar[bool] = False
     """Whether it can measure on another machine (``Context.elsewhere``)."""
+    films: ClassVar[bool] = False
+    """Whether it can write a video of what it measured (``Context.video``)."""
 
     def on(self, profile: Profile) -> Measure:
         """Return the stage as it is for a board."""
