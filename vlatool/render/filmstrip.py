@@ -162,8 +162,9 @@ class _Pen:
         return long
 
     def _length(self, text: str) -> int:
-        length: float = self._lines.textlength(text, font=self._font)
-        return math.ceil(length)
+        """Return how wide a text is in pixels: how far its last letter reaches, which may be beyond its advance."""
+        right: float = self._lines.textbbox((0, 0), text, font=self._font)[2]
+        return math.ceil(right)
 
     def end(self) -> Picture:
         """Return the sheet."""

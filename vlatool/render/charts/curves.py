@@ -9,7 +9,9 @@ from vlatool.render._format import tick
 from vlatool.render.charts.shares import Share, percent
 from vlatool.render.charts.svg import Axis, Canvas, shorten
 
-TALL, HEAD, FOOT, LEFT, GAP = 118.0, 24.0, 20.0, 40.0, 14.0
+TALL, HEAD, FOOT, LEFT, GAP = 118.0, 30.0, 20.0, 42.0, 14.0
+TOP = 24.0
+"""Of the line that names the variants."""
 APART = 3.0
 """Pixels between the variants at one strength, so that no interval covers another."""
 
@@ -41,7 +43,7 @@ def curves(groups: Sequence[tuple[str, Sequence[Curve]]], title: str, width: int
     wide = (width - GAP * (columns - 1)) / columns
     named = {curve.variant: curve.css for _, group in groups for curve in group}
     rows = -(-len(groups) // columns)
-    height = HEAD + rows * (HEAD + TALL + FOOT + GAP) + 8
+    height = TOP + rows * (HEAD + TALL + FOOT + GAP) + 10
     told = (f"{name} at strength {tick(strength)}: {share.told}"
             for name, group in groups for curve in group for strength, share in curve.points)  # fmt: skip
     canvas = Canvas(f"curves-{width}", width, round(height), title, "; ".join(told))
@@ -50,7 +52,7 @@ def curves(groups: Sequence[tuple[str, Sequence[Curve]]], title: str, width: int
     least = min(share.value if share.low is None else share.low for _, share in every)
     across = (min(strength for strength, _ in every), max(strength for strength, _ in every))
     for number, (name, group) in enumerate(groups):
-        left, top = (number % columns) * (wide + GAP), HEAD + number // columns * (HEAD + TALL + FOOT + GAP)
+        left, top = (number % columns) * (wide + GAP), TOP + number // columns * (HEAD + TALL + FOOT + GAP)
         _panel(canvas, name, group, (left, top, wide), across, max(0.0, min(0.9, least - 0.02)))
     canvas.text(width, height - 2, "strength of the disturbance", "note", "end")
     return canvas
@@ -69,7 +71,7 @@ def _panel(
     across = Axis(*strengths, left + LEFT + 6, left + wide - 10)
     up = Axis(least, 1.0, base, top + HEAD)
     canvas.text(left, top + 14, shorten(name, wide), "name")
-    canvas.up(up, left + LEFT, left + wide, {value: f"{percent(value)} %" for value in up.ticks(3)})
+    canvas.up(up, left + LEFT, left + wide, {value: f"{percent(value)} %" for value in up.ticks(4)})
     canvas.line(left + LEFT, base, left + wide, base, "axis")
     for strength in sorted({strength for curve in group for strength, _ in curve.points}):
         canvas.text(across(strength), base + 15, tick(strength), "tick", "middle")
