@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -134,6 +133,7 @@ class _Pen:
     def __init__(self) -> None:
         self._image, self._draw = require("PIL.Image", EXTRA), require("PIL.ImageDraw", EXTRA)
         self._font = require("PIL.ImageFont", EXTRA).load_default(TEXT)
+        self._lengths: dict[str, int] = {}
         self._sheet: Any = None
         self._lines: Any = None
 
@@ -154,17 +154,19 @@ class _Pen:
             right: Whether it ends at ``x``.
         """
         if self._length(text) > width:
-            while text and self._length(f"{text}…") > width:
-                text = text[:-1]
-            text = f"{text}…" if text else ""
+            fits = (f"{text[:most]}…" for most in range(min(len(text), width), 0, -1))
+            text = next((cut for cut in fits if self._length(cut) <= width), "")
         long = self._length(text)
         self._lines.text((x - long if right else x, y), text, fill=colour, font=self._font)
         return long
 
     def _length(self, text: str) -> int:
-        """Return how wide a text is in pixels: how far its last letter reaches, which may be beyond its advance."""
-        right: float = self._lines.textbbox((0, 0), text, font=self._font)[2]
-        return math.ceil(right)
+        """Return how wide a text is in pixels: without shades, letters stand further apart than the font says."""
+        if text not in self._lengths:
+            sheet = self._image.new("1", (2 * round(self._font.getlength(text)) + TEXT, 2 * TEXT))
+            self._draw.Draw(sheet).text((0, 0), text, fill=1, font=self._font)
+            self._lengths[text] = (sheet.getbbox() or (0, 0, 0, 0))[2]
+        return self._lengths[text]
 
     def end(self) -> Picture:
         """Return the sheet."""
