@@ -18,7 +18,7 @@ from vlatool.render.video import HOLD_S, Picture, Video
 EXTRA = "video"
 FASTEST_HZ = 50.0
 """Pictures a second that viewers show: a delay of less than 2/100 s is one of 10/100 s to them."""
-ATTEMPTS = ((240, 1), (64, 1), (24, 1), (24, 2))
+ATTEMPTS = ((240, 1), (64, 1), (24, 1), (24, 2), (24, 4))
 """Colours, and the share of the pictures that is left out, until the file is small enough."""
 PICTURE_BYTES, LEAST_BYTES = 15_000, 1_000_000
 """Small enough: 3 MB for 200 pictures."""
