@@ -6,6 +6,7 @@ The bundles are made once in a session and must not be changed; copy one (``copi
 from __future__ import annotations
 
 import csv
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,9 @@ from _tiny import observations, write_policy
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+"""Of torch, here and in all children: two threads that meet at barriers on busy cores are ten times slower than one."""
 
 COLUMNS = (
     "device", "power_mode", "runtime", "model", "params_m", "gflops_or_gmacs", "input", "precision", "batch", "metric",

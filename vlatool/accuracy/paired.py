@@ -12,7 +12,8 @@ from vlatool.accuracy.moved import BY_INSTRUCTION, BY_TASK, MOTION, compare_moti
 from vlatool.errors import DataError
 from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
-from vlatool.stats.intervals import mcnemar_exact, paired_drop, wilson
+from vlatool.stats.intervals import mcnemar_exact, wilson
+from vlatool.stats.success_sequential import exact_drop
 
 ABSENT = "unmeasured"
 """The table of a row that says what could not be had."""
@@ -127,7 +128,7 @@ def compare_success(baseline: Row, row: Row) -> Row:
     pairs = list(zip(baseline.raw["success"], row.raw["success"], strict=True))
     lost = sum(before > after for before, after in pairs)
     won = sum(before < after for before, after in pairs)
-    drop, low, high = paired_drop(lost, won, len(pairs))
+    drop, low, high = exact_drop(lost, won, len(pairs))
     p = mcnemar_exact(lost, won)
     test = Measurement("mcnemar_p", p, "1", samples=len(pairs), note="exact, two-sided")
     note = f"paired: {lost} lost, {won} won of {len(pairs)} episodes"

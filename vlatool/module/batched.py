@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 
+Run = Callable[[Mapping[str, "Tensor"], Mapping[str, "Tensor"]], dict[str, "Tensor"]]
+PATH, TURN = "path.", "turn."
+"""Prefix of the names of what a loop carries, all turns of it; name of the number of a turn."""
 SAME = 1e-3
 """Relative and absolute difference that the order of additions makes."""
 
@@ -34,6 +38,10 @@ class BatchedProgram:
     Args:
         steps: As in the manifest.
         modules: Graph name -> module.
+
+    Attributes:
+        noise: What the program draws, value name -> shape and distribution.
+        loop: The first step that runs several times and carries values from turn to turn; None where there is none.
     """
 
     def __init__(self, steps: Iterable[ProgramStep], modules: Mapping[str, nn.Module]) -> None:
@@ -42,6 +50,7 @@ class BatchedProgram:
         self._batches: bool | None = None
         self._retraced: dict[tuple[str, int], nn.Module] = {}
         self.noise = {name: wanted for step in self.steps for name, wanted in step.noise.items()}
+        self.loop = next((step for step in self.steps if step.repeat > 1 and step.carry), None)
 
     def run(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Run all steps.
@@ -56,13 +65,39 @@ class BatchedProgram:
         Raises:
             SourceError: when a module fails, or gives another number of outputs than the program says.
         """
-        torch = require("torch", "build")
-        size = len(next(iter(inputs.values())))
         self.look(inputs, noise)
+        return self._by_rows(self._run, inputs, noise)
+
+    def path(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Run all steps, as ``run`` does; what the turns of ``loop`` carry is kept, too.
+
+        Returns:
+            Every value, and under ``PATH + name`` what a carried value was before each turn and after the last one,
+            (B, turns + 1, ...).
+        """
+        self.look(inputs, noise)
+        return self._by_rows(partial(self._run, keeps_path=True), inputs, noise)
+
+    def turn(self, inputs: Mapping[str, Tensor], start: Mapping[str, Tensor], turns: Tensor) -> dict[str, Tensor]:
+        """Run what comes before ``loop``, and one of its turns, each row its own; ``look`` at a batch first.
+
+        Args:
+            inputs: Encoded inputs, value name -> (B, ...).
+            start: What the turn is given of the carried values, value name -> (B, ...).
+            turns: Number of the turn of each row, from 0, (B,) int64.
+
+        Returns:
+            Every value after that turn.
+        """
+        return self._by_rows(self._turn, inputs, {**start, TURN: turns})
+
+    def _by_rows(self, run: Run, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Run a batch at once where the modules take batches, and row by row where they do not."""
+        size = len(next(iter(inputs.values())))
         if size == 1 or self._batches:
-            return self._run(inputs, noise)
-        rows = [self._run(_rows(inputs, row, row + 1), _rows(noise, row, row + 1)) for row in range(size)]
-        return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+            return run(inputs, others)
+        rows = [run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(size)]
+        return {name: require("torch", "build").cat([row[name] for row in rows]) for name in rows[0]}
 
     def look(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> None:
         """Find out with a first batch whether the modules take batches; where runs are changed, look before that."""
@@ -92,21 +127,48 @@ class BatchedProgram:
             for name, value in wanted.items()
         )
 
-    def _run(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        torch = require("torch", "build")
-        size = len(next(iter(inputs.values())))
-        values = {**inputs, **noise}
+    def _run(
+        self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor], *, keeps_path: bool = False
+    ) -> dict[str, Tensor]:
+        values = {**inputs, **noise, **self._zeros(len(next(iter(inputs.values()))))}
         for step in self.steps:
-            for name, kept in step.keep.items():
-                dtype = getattr(torch, kept.get("dtype", "float32"))
-                values[name] = torch.zeros((size, *kept["shape"][1:]), dtype=dtype)
-        for step in self.steps:
+            carried = tuple(step.carry.values()) if keeps_path and step is self.loop else ()
+            path = {name: [values[name]] for name in carried}
             for turn in range(step.repeat):
-                for name, numbers in step.schedule.items():
-                    whole = all(isinstance(number, int) for number in numbers)
-                    values[name] = torch.full((size,), numbers[turn], dtype=torch.int64 if whole else torch.float32)
+                values |= self._scheduled(step, turn, values)
                 values |= self._step(step, values)
+                for name, before in path.items():
+                    before.append(values[name])
+            values |= {PATH + name: require("torch", "build").stack(points, 1) for name, points in path.items()}
         return values
+
+    def _turn(self, inputs: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        torch = require("torch", "build")
+        turns, values = start[TURN], {**inputs, **start, **self._zeros(len(start[TURN]))}
+        for step in self.steps:
+            if step is self.loop:
+                for name, numbers in step.schedule.items():
+                    values[name] = torch.tensor(numbers, dtype=_dtype_of(numbers))[turns]
+                return values | self._step(step, values)
+            for turn in range(step.repeat):
+                values |= self._scheduled(step, turn, values)
+                values |= self._step(step, values)
+        raise ValueError("the program has no loop")
+
+    def _zeros(self, size: int) -> dict[str, Tensor]:
+        """Return what is kept, as it is after ``reset``."""
+        torch = require("torch", "build")
+        return {
+            name: torch.zeros((size, *kept["shape"][1:]), dtype=getattr(torch, kept.get("dtype", "float32")))
+            for step in self.steps
+            for name, kept in step.keep.items()
+        }
+
+    def _scheduled(self, step: ProgramStep, turn: int, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the numbers of one turn for each row."""
+        torch, size = require("torch", "build"), len(next(iter(values.values())))
+        return {name: torch.full((size,), numbers[turn], dtype=_dtype_of(numbers))
+                for name, numbers in step.schedule.items()}  # fmt: skip
 
     def _module(self, graph: str, size: int) -> nn.Module:
         """Return the module of a graph for a batch of that size: a traced one may be made for one size alone."""
@@ -125,6 +187,12 @@ class BatchedProgram:
         for source, target in step.carry.items():
             changed[target] = changed[source] if source in changed else values[source]
         return changed
+
+
+def _dtype_of(numbers: Sequence[float]) -> Any:
+    """Return the dtype in which numbers of a schedule are given."""
+    torch = require("torch", "build")
+    return torch.int64 if all(isinstance(number, int) for number in numbers) else torch.float32
 
 
 def _rows(values: Mapping[str, Tensor], start: int, end: int) -> dict[str, Tensor]:

@@ -23,7 +23,7 @@ from vlatool.stage.base import Context, Transform, build_stage
 CALLS, SECONDS = 200, 3.0
 """Of each policy in a run, at least."""
 UNDISTURBED = 25
-"""Percentile of the calls that is compared: where other programs run, more of them than half may be held up."""
+"""Percentile of the calls whose ratios are compared: where other programs run, more than half may be held up."""
 
 
 class Clock:
@@ -47,12 +47,16 @@ class Clock:
         self._whole = self._export(())
 
     def times(self, pruned: Sequence[Sequence[Edit]]) -> tuple[float, list[float]]:
-        """Return the milliseconds of the whole policy, and of it with each list of edits, from one interleaved run."""
+        """Return the milliseconds of the whole policy, and of it with each list of edits, from one interleaved run.
+
+        They are medians of the whole policy's calls times ratios of lower percentiles, which other programs move less.
+        """
         paths = [self._whole, *(self._export(edits) for edits in pruned)]
         job = LatencyJob(tuple(map(str, paths)), self._engine, self._threads, CALLS, SECONDS, check=False)
         measured = agent.measure(job, self._context.tell)
-        whole, *others = (float(np.percentile(policy.samples, UNDISTURBED)) for policy in measured.policies)
-        return whole, others
+        low, *others = (float(np.percentile(policy.samples, UNDISTURBED)) for policy in measured.policies)
+        whole = float(np.median(measured.policies[0].samples))
+        return whole, [ms / low * whole for ms in others]
 
     def _export(self, edits: Sequence[Edit]) -> Path:
         """Return the place of a bundle in ONNX of the policy after edits."""

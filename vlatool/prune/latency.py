@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from pydantic import Field, model_validator
@@ -47,6 +48,8 @@ ROUNDS = 8
 """Of choosing and measuring, at most."""
 LEAST_GONE = 0.999
 """Share of the latency of the whole policy that is left at most: something goes."""
+HELD_UP = 1.1
+"""Times the least latency of the whole policy from which on a run is taken to have been slowed by other programs."""
 MOST_AT_ONCE = 1.5
 """Factor by which a result may change what is aimed at: one that was disturbed is corrected by the next."""
 
@@ -193,14 +196,13 @@ class LatencyPruning(ModuleStage):
         whole, prices = measured_prices(groups, blocks, work, clock)
         self._refuse_met(whole)
         choice = _Choice(groups, blocks, work, prices, self.least)
-        undisturbed, wanted, tried = whole, 1.0, list[float]()
+        wholes, wanted, tried = [whole], 1.0, list[float]()
         for number in range(ROUNDS):
-            goal = min(wanted * AIM * self.target_ms / undisturbed, LEAST_GONE) * whole
+            goal = min(wanted * AIM * self.target_ms / undisturbed(wholes), LEAST_GONE) * whole
             edits = choice.until(whole, goal, self.target_ms)
-            ms, undisturbed = _undisturbed(clock, edits, undisturbed)
+            ms = _share(clock, edits, wholes) * undisturbed(wholes)
             if self._is_met(ms):  # once may be luck
-                again, undisturbed = _undisturbed(clock, edits, undisturbed)
-                ms = (ms + again) / 2
+                ms = (ms + _share(clock, edits, wholes) * undisturbed(wholes)) / 2
             tried.append(ms)
             context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
             if self._is_met(ms):
@@ -217,14 +219,22 @@ class LatencyPruning(ModuleStage):
         return (1 - CLOSE) * self.target_ms <= ms <= self.target_ms
 
 
-def _undisturbed(clock: Clock, edits: Sequence[Edit], undisturbed: float) -> tuple[float, float]:
-    """Return what edits leave of the latency, and the least that the whole policy ever took, in ms.
+def _share(clock: Clock, edits: Sequence[Edit], wholes: list[float]) -> float:
+    """Return what edits leave of the latency, a share; add what the whole policy took meanwhile to the others.
 
     Both take turns in one run, so that other programs slow both down: their ratio says what it is without them.
     """
     whole, (ms,) = clock.times([edits])
-    undisturbed = min(undisturbed, whole)
-    return ms / whole * undisturbed, undisturbed
+    wholes.append(whole)
+    return ms / whole
+
+
+def undisturbed(wholes: Sequence[float]) -> float:
+    """Return what the whole policy takes where nothing else runs, in ms: the median of the runs that were not held up.
+
+    The least of several runs would be one on which chance smiled, and what is pruned by it would miss its target.
+    """
+    return median(ms for ms in wholes if ms <= HELD_UP * min(wholes))
 
 
 def _edits_chosen(text: str) -> tuple[Edit, ...]:

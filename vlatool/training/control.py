@@ -13,27 +13,27 @@ from vlatool.training.frames import BLOCK, Array, new_array
 from vlatool.training.rounds import LABEL
 
 
-def exchange_labels(frames: Path, outputs: Sequence[str], seed: Sequence[int]) -> None:
+def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) -> None:
     """Give each row of a round what the teacher said of another row; every label is used once.
 
     Inputs and noise stay where they are, and the labels have the distribution that they had.
 
     Args:
         frames: Folder of the round, labelled.
-        outputs: Outputs of the policy.
+        labels: Names of what the teacher said.
         seed: Of the exchange.
 
     Raises:
         DataError: when there is no other row.
     """
-    files = [file_of(frames, LABEL + name) for name in outputs]
+    files = [file_of(frames, LABEL + name) for name in labels]
     others = other_rows(len(np.load(files[0], mmap_mode="r")), seed)
     for file in files:
-        labels: Array = np.load(file, mmap_mode="r")
+        said: Array = np.load(file, mmap_mode="r")
         draft = file.with_name(f"exchanged-{file.name}")
-        exchanged = new_array(draft, labels.dtype, labels.shape)
-        for start in range(0, len(labels), BLOCK):
-            exchanged[start : start + BLOCK] = labels[others[start : start + BLOCK]]
+        exchanged = new_array(draft, said.dtype, said.shape)
+        for start in range(0, len(said), BLOCK):
+            exchanged[start : start + BLOCK] = said[others[start : start + BLOCK]]
         draft.replace(file)
 
 

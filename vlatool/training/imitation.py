@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -13,6 +13,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, nearest
 from vlatool.module.batched import BatchedProgram
+from vlatool.training.flow import CHUNK, check_loops, flow_loss
 from vlatool.training.hinted import with_hints
 from vlatool.training.rounds import LABEL, NOISE, tensors
 from vlatool.training.session import Lesson
@@ -31,6 +32,11 @@ class ImitationStage(TrainingStage):
     loss: str = Field("auto", description="kl (discrete actions), l1, l2 or huber; kl or l1 when auto")
     temperature: float = Field(2.0, gt=0, le=100, description="of kl")
     delta: float = Field(0.1, gt=0, le=1000, description="of huber")
+    targets: Literal["chunk", "flow"] = Field(
+        "chunk",
+        description="what is compared: the action at the end of all denoising steps, or one step of each observation, "
+        "from where the teacher stood (flow)",
+    )
     features: float = Field(
         0.0, ge=0, le=1e6, description="weight in the loss of what blocks give, compared with the teacher's; 0 for none"
     )
@@ -46,6 +52,14 @@ class ImitationStage(TrainingStage):
         super().check(source, profile)
         if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":
             raise RecipeError("The loss kl compares discrete actions; the policy's are continuous.", "try --loss l1")
+        hints = [f"--{name}" for name, weight in self.hints().items() if weight]
+        if self.targets == "flow" and hints:
+            raise RecipeError(
+                f"--targets flow runs single denoising steps, and {hints[0]} compares what blocks give in all of them.",
+                "leave one of them out",
+            )
+        if self.targets == "flow" and source is not None and source.manifest.spec.action.kind == "discrete":
+            raise RecipeError("--targets flow compares continuous actions; the policy's are discrete.", CHUNK)
 
     def computed(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the student computes."""
@@ -65,6 +79,10 @@ class ImitationStage(TrainingStage):
             far: Tensor = distance(values[action.name].float(), tensors(rows, LABEL)[action.name])
             return far
 
+        if self.targets == "flow":
+            check_loops(student, teacher.program, action.name, source.manifest.name)
+            turn = flow_loss(student, distance, self.computed)
+            return Lesson(f"flow {name}", modules, turn, judged=loss, turns=True)
         return with_hints(Lesson(name, modules, loss), self.hints(), student, source, teacher, self.seed)
 
     def hints(self) -> dict[str, float]:

@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.frames import file_of
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched import PATH, BatchedProgram, drawn
 from vlatool.module.origin import origin_of
 from vlatool.stage.base import Context
 from vlatool.training.device import on_device
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 LABEL, NOISE, EXPERT = "teacher.", "noise.", "expert."
 """Prefixes of what is kept beside the inputs: the teacher's outputs, the noise that they were made from, and what an
 expert did."""
+NUMBER, BEFORE, AFTER = "turn", "before.", "after."
+"""Further labels where turns of a loop are learnt: the number of a turn, what was carried before it and after."""
 ROWS = 32
 """Rows that the teacher labels at a time."""
 
@@ -55,7 +57,7 @@ def write_recorded(encode: Callable[[Any], Mapping[str, Array]], observations: C
 
 
 def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram, seed: Sequence[int],
-          context: Context) -> None:  # fmt: skip
+          context: Context, *, turns: bool = False) -> list[str]:  # fmt: skip
     """Write what the teacher gives for every row of a round, and the noise that it drew, beside the inputs.
 
     Args:
@@ -65,6 +67,10 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
         teacher: Its program.
         seed: Of the noise.
         context: For progress.
+        turns: Also write one turn of the teacher's loop for each row, drawn at random.
+
+    Returns:
+        Names of the labels.
 
     Raises:
         DataError: when the teacher gives something that is not finite.
@@ -78,8 +84,11 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
         for start in range(0, count, ROWS):
             rows = {name: on_device(np.array(values[start : start + ROWS])) for name, values in inputs.items()}
             noise = drawn(teacher.noise, len(next(iter(rows.values()))), np.random.default_rng((*seed, start)))
-            values = teacher.run(rows, noise)
-            given = {LABEL + name: values[name] for name in outputs} | {NOISE + name: noise[name] for name in noise}
+            values = teacher.path(rows, noise) if turns else teacher.run(rows, noise)
+            labels = {name: values[name] for name in outputs}
+            labels |= _turns(teacher, values, np.random.default_rng((*seed, start, 1))) if turns else {}
+            given = {LABEL + name: value for name, value in labels.items()}
+            given |= {NOISE + name: noise[name] for name in noise}
             for name, value in given.items():
                 if name not in kept:
                     kept[name] = new_array(file_of(frames, name), value.cpu().numpy().dtype, (count, *value.shape[1:]))
@@ -87,6 +96,19 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
                 kept[name][start : start + len(value)] = value.cpu().numpy()
             context.tell(f"the teacher labels {count} observations", (start + 1) / count)
+    return [name.removeprefix(LABEL) for name in kept if name.startswith(LABEL)]
+
+
+def _turns(teacher: BatchedProgram, values: Mapping[str, Tensor], random: np.random.Generator) -> dict[str, Tensor]:
+    """Return for each row the number of a turn, and what the teacher carried into and out of it."""
+    if teacher.loop is None:
+        raise ValueError("a program with a loop has turns")
+    paths = {name: values[PATH + name] for name in teacher.loop.carry.values()}
+    size = len(next(iter(paths.values())))
+    number = on_device(random.integers(teacher.loop.repeat, size=size))
+    rows = on_device(np.arange(size))
+    before = {BEFORE + name: path[rows, number] for name, path in paths.items()}
+    return {NUMBER: number, **before, **{AFTER + name: path[rows, number + 1] for name, path in paths.items()}}
 
 
 def tensors(rows: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:

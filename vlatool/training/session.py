@@ -93,6 +93,7 @@ class Lesson:
         about: What else is to be known of the training, as JSON values.
         constraint: What holds of the weights after each step.
         expert: The same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
+        turns: Whether the teacher also shows single turns of its loop (``rounds.label``).
     """
 
     name: str
@@ -103,6 +104,7 @@ class Lesson:
     about: Mapping[str, Any] = field(default_factory=dict)
     constraint: Constraint | None = None
     expert: Callable[[Mapping[str, Any]], Tensor] | None = None
+    turns: bool = False
 
     @property
     def trained(self) -> dict[str, nn.Module]:
@@ -306,9 +308,11 @@ class Session:
         names = [tensor.name for tensor in self._spec.inputs]
         outputs = [tensor.name for tensor in self._spec.outputs]
         with self._settings.device.computing():
-            label(target, names, outputs, self._teacher.program, (self._settings.seed, *seed), self._context)
+            seeds = (self._settings.seed, *seed)
+            teacher, turns = self._teacher.program, self._lesson.turns
+            labels = label(target, names, outputs, teacher, seeds, self._context, turns=turns)
         if self._plan.supervision.control == "noise":
-            exchange_labels(target, outputs, (self._settings.seed, *seed))
+            exchange_labels(target, labels, seeds)
 
     def _actor(self, place: Path, number: int) -> Bundle:
         """Write who plays as a bundle, which the processes that play open."""
