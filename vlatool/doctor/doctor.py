@@ -33,6 +33,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "text": ("tokenizers",),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),
+    "ray": ("ray",),
     "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
 }
 """Extra -> the distributions that it installs, as in ``pyproject.toml``."""
