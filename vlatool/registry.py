@@ -27,6 +27,7 @@ NOUNS = {
     "quantize": "quantization method", "prune": "pruning method", "distill": "distillation method",
     "evaluate": "evaluation", "export": "export target", "sources": "kind of source", "data": "format of recordings",
     "render": "report format", "motion": "metric of motion", "videos": "format of videos",
+    "workers": "launcher of workers",
 }  # fmt: skip
 _FOREIGN: dict[type, str] = {}
 """Class of another package -> ``kind.name``, once it was loaded."""

@@ -10,8 +10,9 @@ import pytest
 from tests._reach import EAGER, GOOD, TREMBLES, bundle_of, folder_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.play import EpisodesJob
+from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, RecipeError, UsageError
-from vlatool.evaluate import closed_loop
+from vlatool.evaluate import _player
 from vlatool.evaluate._told import told
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
@@ -198,14 +199,14 @@ def test_an_option_that_would_do_nothing_is_refused(bundles: dict[str, Bundle], 
 def test_an_episode_that_cannot_be_played_again_costs_its_picture_alone(
     bundles: dict[str, Bundle], monkeypatch: pytest.MonkeyPatch
 ):
-    real = closed_loop.run_jobs
+    real = _player.run_jobs
 
-    def run(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context):
+    def run(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, *more: Tally):
         if jobs[0].show:
             raise DataError("the environment is gone")
-        return real(bundle, jobs, engine, context)
+        return real(bundle, jobs, engine, context, *more)
 
-    monkeypatch.setattr(closed_loop, "run_jobs", run)
+    monkeypatch.setattr(_player, "run_jobs", run)
     row = evaluated(bundles, "trembles", 4).rows[-1]
     assert row.value("success") == 1.0
     assert not any(name.startswith("episode.") for name in row.raw)

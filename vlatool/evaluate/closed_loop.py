@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -18,18 +17,22 @@ from vlatool.accuracy.paired import Outcome, compare_success, success_row, with_
 from vlatool.accuracy.shown import with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, disturbances_of, jobs_for, run_jobs
+from vlatool.episodes.jobs import disturbances_of, run_jobs
+from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
+from vlatool.evaluate._player import Player
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
-from vlatool.machine.host import fingerprint
+from vlatool.files.work import Store
+from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import Report, Row
 from vlatool.stage.base import Context, Measure
+from vlatool.stage.cache import STREAMS
 from vlatool.user_code import trust
 
 if TYPE_CHECKING:
@@ -120,7 +123,22 @@ class ClosedLoop(Measure):
         return self.model_copy(update={"board": profile.name}) if self.latency_in_the_loop and not self.board else self
 
     def run(self, source: Bundle, context: Context) -> Report:
-        """Run all episodes of the bundle, and of the baseline when there is one."""
+        """Run all episodes of the bundle, and of the baseline when there is one.
+
+        What is finished is kept until the result is written, where somebody will see to that (``Context.unfinished``).
+        """
+        if context.unfinished is None:
+            return self._measured(source, context)
+        place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+        context.unfinished.append(place)
+        with Store.open(place) as kept:
+            report = self._measured(source, replace(context, kept=kept))
+        taken = f"{kept.taken} of the {kept.asked} episodes are of an interrupted run of the same command."
+        notes = [*([taken] if kept.taken else []), *([kept.problem] if kept.problem else [])]
+        context.notes.extend(notes)
+        return replace(report, warnings=(*report.warnings, *notes))
+
+    def _measured(self, source: Bundle, context: Context) -> Report:
         jobs = self._jobs(source)
         self._may_run(jobs[0])
         kinds = self._disturbances(source, jobs[0], context)
@@ -128,7 +146,10 @@ class ClosedLoop(Measure):
         check_video_of(bundles, jobs[0], context)
         waits = [latency_of(one, self.board, self.engine, context) if self.latency_in_the_loop else None
                  for one in bundles]  # fmt: skip
-        plays = [partial(self._play, one, wait, context) for one, wait in zip(bundles, waits, strict=True)]
+        plays: list[Player] = []
+        for one, wait in zip(bundles, waits, strict=True):
+            most = sum(len(job.seeds) for job in jobs)
+            plays.append(Player(one, wait, self.engine, context, most, plays[0] if plays else None))
         rows: list[Row] = []
         believed, decision = Credibility("unknown"), None
         if self.baseline and self.limit is not None:
@@ -161,13 +182,8 @@ class ClosedLoop(Measure):
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
         decided = (sentence(decision),) if decision else ()
         summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
-        warnings = (*believed.warnings, *found_wrong(source), *again.warnings)
+        warnings = (*believed.warnings, *found_wrong(source), *again.warnings, *dict.fromkeys(context.notes))
         return Report("evaluate", title, verdict, summary, tuple(rows), environment=fingerprint(), warnings=warnings)
-
-    def _play(
-        self, bundle: Bundle, wait: Measurement | None, context: Context, jobs: list[EpisodesJob]
-    ) -> list[Outcome]:
-        return run_jobs(bundle, late(jobs, wait), self.engine, context)
 
     def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
         """Return the disturbances that are asked for.
