@@ -11,7 +11,7 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   ├── ProfileError             a hardware profile
 │   ├── RecipeError              a recipe or stage options
 │   ├── OutputError              the place to write to: exists, read-only, full
-│   ├── TargetError              the machine that a benchmark should run on: unreachable, or it ends
+│   ├── TargetError              the machine that something should run on: unreachable, or it ends
 │   ├── InstallationError        two distributions of vlatool in one environment
 │   └── PluginError              another package that adds something to vlatool
 ├── MissingExtra              4  an optional dependency is absent; names the extra
@@ -102,7 +102,7 @@ class OutputError(InputError):
 
 
 class TargetError(InputError):
-    """The machine that a benchmark should run on cannot be reached or used, or what runs there ends."""
+    """The machines that something should run on cannot be reached or used, or what runs there ends."""
 
 
 class InstallationError(InputError):

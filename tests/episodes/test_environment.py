@@ -10,7 +10,8 @@ import pytest
 from tests._flow import write_flow
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.episodes.environment import World
-from vlatool.episodes.play import EpisodesJob, run_jobs
+from vlatool.episodes.jobs import run_jobs
+from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.export.onnx import ExportOnnx

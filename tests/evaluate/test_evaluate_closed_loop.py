@@ -7,7 +7,8 @@ import pytest
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.data import observations_for
 from vlatool.episodes import controls, play
-from vlatool.episodes.play import EpisodesJob, run_jobs
+from vlatool.episodes.jobs import run_jobs
+from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, GraphError, MissingExtra, SourceError, UsageError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.report import Row
@@ -138,7 +139,10 @@ def test_progress_tells_episodes_and_success(int8_bundle, policy_template):
     told = []
     context = Context(lambda what, share: told.append((what, share)))
     ClosedLoop(policy=policy_template, episodes=20, first_seed=0).run(int8_bundle, context)
-    assert told == [("10 episodes, 80.0% succeed", 0.5), ("20 episodes, 80.0% succeed", 1.0)]
+    assert told == [
+        ("10 of 20 episodes: 80.0 % succeed (49.0 to 94.3)", 0.5),
+        ("20 of 20 episodes: 80.0 % succeed (58.4 to 91.9)", 1.0),
+    ]
 
 
 def test_a_bundle_that_names_its_environment_needs_no_description(int8_bundle, policy_template):

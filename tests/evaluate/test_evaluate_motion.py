@@ -10,14 +10,15 @@ import pytest
 from tests._reach import EAGER, GOOD, TREMBLES, bundle_of, folder_of
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.play import EpisodesJob
-from vlatool.errors import DataError, UsageError
-from vlatool.evaluate import closed_loop
+from vlatool.episodes.progress import Tally
+from vlatool.errors import DataError, RecipeError, UsageError
+from vlatool.evaluate import _player
 from vlatool.evaluate._told import told
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import load_profile
 from vlatool.report import Measurement, Report, Row
-from vlatool.stage.base import Context
+from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import cached_measure
 
 
@@ -198,14 +199,14 @@ def test_an_option_that_would_do_nothing_is_refused(bundles: dict[str, Bundle], 
 def test_an_episode_that_cannot_be_played_again_costs_its_picture_alone(
     bundles: dict[str, Bundle], monkeypatch: pytest.MonkeyPatch
 ):
-    real = closed_loop.run_jobs
+    real = _player.run_jobs
 
-    def run(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context):
+    def run(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, *more: Tally):
         if jobs[0].show:
             raise DataError("the environment is gone")
-        return real(bundle, jobs, engine, context)
+        return real(bundle, jobs, engine, context, *more)
 
-    monkeypatch.setattr(closed_loop, "run_jobs", run)
+    monkeypatch.setattr(_player, "run_jobs", run)
     row = evaluated(bundles, "trembles", 4).rows[-1]
     assert row.value("success") == 1.0
     assert not any(name.startswith("episode.") for name in row.raw)
@@ -220,3 +221,25 @@ def test_a_ratio_that_would_be_printed_as_one_is_worth_no_sentence():
         "int8", measurements=(ratio("path_length_ratio", 1.003), ratio("jerk_ratio", 1.04), ratio("steps_ratio", 1.004))
     )
     assert list(told([row], "")) == ["Where both succeed, more than the baseline's: jerk 1.04x."]
+
+
+def test_several_strengths_are_played_one_after_the_other(bundles: dict[str, Bundle]):
+    report = evaluated(bundles, "eager", 20, disturb=("delay", "push"), strength="2,0,1,1")
+    row = report.rows[-1]
+    table = row.details["under disturbances"]
+    assert [(line["disturbance"], line["strength"]) for line in table] == [
+        (kind, strength) for kind in ("delay", "push") for strength in (0.0, 1.0, 2.0)
+    ]
+    undisturbed, *disturbed = (line["success"] for line in table if line["disturbance"] == "delay")
+    assert undisturbed == row.value("success"), "strength 0 is no disturbance"
+    assert max(disturbed) < undisturbed
+    assert row.get("success_disturbed").samples == 120
+    assert "under delay at strength " in " ".join(report.summary)
+    alone = evaluated(bundles, "eager", 20, disturb=("delay",), strength=2.0).rows[-1]
+    assert alone.raw["disturbed.delay"] == row.raw["disturbed.delay at 2"]
+
+
+@pytest.mark.parametrize("strength", ["", "0.5,", "1,x", (), (-1.0,), (11.0,), (float("nan"),), (True,), "1;2", None])
+def test_a_strength_that_is_none_is_refused(strength: object):
+    with pytest.raises(RecipeError, match="strength"):
+        build_stage("evaluate.closed_loop", {"strength": strength})

@@ -10,7 +10,10 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from vlatool.bundle.bundle import Bundle
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
@@ -38,6 +41,9 @@ acme = acme_robotics.hello
 
 [vlatool.sections]
 acme = acme_robotics.section
+
+[vlatool.videos]
+strip = acme_robotics.strip
 """
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -113,6 +119,14 @@ def test_its_method_its_source_and_its_engine_run(run: Run, onnx_file: Path, tmp
     assert (made["stage"], made["options"]) == ("quantize.rounded", {"bits": 8})
     told = ok(run("benchmark", str(tmp_path / "out"), "--engine", "acme", "--iterations", "20"))
     assert "latency_p50" in told or "p50" in told
+
+
+def test_its_format_of_videos_is_found_by_the_suffix(run: Run, float_bundle: Bundle, policy_dir: Path, tmp_path: Path):
+    line = ["evaluate", "closed-loop", str(float_bundle.path), "--policy", str(policy_dir), "--episodes", "2"]
+    assert "worst.strip shows" in ok(run(*line, "--video", str(tmp_path / "worst.strip"))).replace("\n", " ")
+    assert np.load(tmp_path / "worst.strip").shape[0] == 6, "of the reset, and after each of five steps"
+    ok(run(*line, "--video", str(tmp_path / "worst.strip"), "--force"))
+    assert "known: gif, mp4, strip" in run(*line, "--video", str(tmp_path / "worst.avi")).stderr
 
 
 def test_optimize_chooses_its_method(run: Run, policy_dir: Path, tmp_path: Path):

@@ -64,3 +64,17 @@ def row(name: str, role: str, series: dict[str, list[float]]) -> Row:
 def test_an_episode_that_cannot_be_drawn_is_left_out(own: dict[str, list[float]], shown: bool):
     report = Report("evaluate", "t", rows=(row("float32", "baseline", played()), row("int8", "subject", own)))
     assert bool(list(Motion().build(report))) == shown
+
+
+def test_a_discrete_action_is_drawn_as_steps_between_its_indices():
+    series = {"fresh": [1.0] * 6, "action": [0.0, 0.0, 2.0, 1.0, 1.0, 2.0]}
+    svg = drawn(series, series)
+    assert len(re.findall(r'd="M[\d.]+ [\d.]+(?:H[\d.]+V[\d.]+)+"', svg)) == 2
+    assert all(f">{index}</text>" in svg for index in (0, 1, 2))
+
+
+def test_an_action_that_hardly_changes_has_two_ticks():
+    series = {"fresh": [1.0] * 4, "action.grip": [0.97, 1.0, 1.02, 1.01]}
+    svg = drawn(series, series)
+    ticks = re.findall(r'class="tick" text-anchor="end">([^<]+)<|text-anchor="end"[^>]*class="tick">([^<]+)<', svg)
+    assert len(ticks) > 1, svg

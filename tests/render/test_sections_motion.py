@@ -26,7 +26,7 @@ def played(jerk: float, lost: int) -> list[Outcome]:
 def report() -> Report:
     base = success_row("baseline", "baseline", played(10.0, 1))
     row = compare_success(base, success_row("int8", "subject", played(14.0, 3)))
-    row = with_disturbed(row, {"delay": played(1.0, 9)}, {"delay": played(1.0, 4)}, 2.0)
+    row = with_disturbed(row, {("delay", 2.0): played(1.0, 9)}, {("delay", 2.0): played(1.0, 4)})
     return Report("evaluate", "a title", rows=(base, row))
 
 

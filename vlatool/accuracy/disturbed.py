@@ -13,6 +13,8 @@ from vlatool.stats.intervals import wilson
 from vlatool.stats.success_sequential import exact_drop
 
 Played = Sequence[Outcome]
+Disturbance = tuple[str, float]
+"""Kind and strength."""
 DISTURBED = "disturbed."
 """What the names of raw samples begin with that say which episodes succeeded under a disturbance."""
 OF_BASELINE = ", baseline"
@@ -23,33 +25,58 @@ SHOWN = {"task_time": "task time", "path_length": "path", "jerk": "jerk", "actio
 
 
 def with_disturbed(
-    row: Row, played: Mapping[str, Played], reference: Mapping[str, Played] | None, strength: float
+    row: Row, played: Mapping[Disturbance, Played], reference: Mapping[Disturbance, Played] | None
 ) -> Row:
-    """Return the row with how it does under each disturbance, the worst first.
+    """Return the row with how it does under each disturbance, the worst kind first, and its strengths in their order.
 
     Args:
         row: Of the variant, undisturbed.
         played: Disturbance -> episodes of the variant.
         reference: The same of what it is held against; None where there is nothing.
-        strength: Of all of them.
     """
     records, raw = [], dict[str, list[float]]()
     wins = count = 0
-    for kind, own in played.items():
-        base = reference[kind] if reference else None
+    kinds = dict.fromkeys(kind for kind, _ in played)
+    strengths = dict.fromkeys(strength for _, strength in played)
+    for (kind, strength), own in played.items():
+        name = f"{DISTURBED}{kind} at {strength:g}" if len(strengths) > 1 else f"{DISTURBED}{kind}"
+        base = reference[kind, strength] if reference else None
         disturbed = success_row(kind, "subject", own)
         if base is not None:
             disturbed = compare_success(success_row("baseline", "baseline", base), disturbed)
-            raw[f"{DISTURBED}{kind}{OF_BASELINE}"] = [float(outcome.success) for outcome in base]
-        raw[f"{DISTURBED}{kind}"] = disturbed.raw["success"]
+            raw[f"{name}{OF_BASELINE}"] = [float(outcome.success) for outcome in base]
+        raw[name] = disturbed.raw["success"]
         wins, count = wins + int(sum(disturbed.raw["success"])), count + len(own)
         records.append(_record(kind, strength, disturbed, base))
-    records.sort(key=lambda record: (-record.get("drop", 0.0), record["success"]))
+    first = sorted(records, key=_badness)
+    order = list(dict.fromkeys(record["disturbance"] for record in first))
+    records.sort(key=lambda record: (order.index(record["disturbance"]), record["strength"]))
     low, high = wilson(wins, count)
-    note = f"under {', '.join(played)}; strength {strength:g}"
+    listed = ", ".join(f"{strength:g}" for strength in strengths)
+    note = f"under {', '.join(kinds)}; strength {listed}"
     rate = Measurement("success_disturbed", wins / count, "1", samples=count, low=low, high=high, note=note)
     measurements, details = (*row.measurements, rate), {**row.details, TABLE: records}
     return replace(row, measurements=measurements, raw={**row.raw, **raw}, details=details)
+
+
+def worst_record(row: Row) -> tuple[Mapping[str, Any], str] | None:
+    """Return the line of the table under which most is lost, and its disturbance in words; None without a table.
+
+    Args:
+        row: Of ``with_disturbed``.
+    """
+    table = row.details.get(TABLE)
+    if not table:
+        return None
+    worst = min(table, key=_badness)
+    several = len({record["strength"] for record in table}) > 1
+    strength = f" at strength {worst['strength']:g}" if several else ""
+    return worst, f"{worst['disturbance']}{strength}"
+
+
+def _badness(record: Mapping[str, Any]) -> tuple[float, float]:
+    """Return what sorts the disturbance first under which most is lost."""
+    return -record.get("drop", 0.0), record["success"]
 
 
 def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measurement]:

@@ -25,6 +25,16 @@ def differs_most(base: Sequence[Outcome], own: Sequence[Outcome]) -> int:
     return max(range(len(base)), key=difference)
 
 
+def stands_out(outcomes: Sequence[Outcome]) -> int:
+    """Return the place of the first episode that fails; of the longest one where none does."""
+    return max(range(len(outcomes)), key=lambda place: (not outcomes[place].success, _length(outcomes[place]), -place))
+
+
+def _length(outcome: Outcome) -> int:
+    """Return how much the length of an episode counts: nothing where it fails."""
+    return outcome.steps if outcome.success else 0
+
+
 def with_episode(row: Row, outcome: Outcome) -> Row:
     """Return the row with the steps of an episode, and a line on how it ended."""
     raw = {f"{EPISODE}{name}": list(values) for name, values in outcome.series.items()}

@@ -72,17 +72,19 @@ class Bundle:
         check("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
         return bundle
 
-    def verify(self, prefix: str = "") -> None:
+    def verify(self, prefix: str = "", but: str = "") -> None:
         """Check every file that was not verified by reading it, and that nothing else is there.
 
         Args:
             prefix: Check the content only of files whose names start with it.
+            but: Leave out those whose names start with this; none when empty.
 
         Raises:
             BundleError: when a file is missing, changed, a link, or not in the manifest.
         """
         self.check_tree()
-        for name in [name for name in self.manifest.files if name.startswith(prefix) and name not in self._verified]:
+        names = [name for name in self.manifest.files if name.startswith(prefix) and not (but and name.startswith(but))]
+        for name in [name for name in names if name not in self._verified]:
             verify_sealed(self.path, name, *self._record(name))
 
     def check_tree(self) -> None:

@@ -14,7 +14,7 @@ import typer
 
 from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
-from vlatool.cli._document import Output, lost, output
+from vlatool.cli._document import Output, forget_kept, lost, output
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
 from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
@@ -133,7 +133,9 @@ def main(arguments: list[str] | None = None) -> None:
     for_good = arguments is None
     with output(words, for_good=for_good) as document:
         code = _run(words, document, for_good=for_good)
-    if unprinted := lost():
+    unprinted = lost()
+    forget_kept(printed=unprinted is None)
+    if unprinted:
         _say(str(unprinted), unprinted.fix)
         code = code or unprinted.exit_code
     _flush_streams()

@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -16,8 +16,8 @@ from typing import Any
 
 import typer
 
-from vlatool.cli._document import document, put, report_document
-from vlatool.errors import GateFailed, Inconclusive, OutputError
+from vlatool.cli._document import document, put, report_document, written
+from vlatool.errors import GateFailed, Inconclusive, OutputError, UsageError
 from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
 from vlatool.files.printable import one_line, printable, without_password
 from vlatool.files.writing import writing
@@ -25,8 +25,9 @@ from vlatool.machine.host import cache_directory
 from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
 from vlatool.stage.base import Context, Tell
+from vlatool.workers import PROCESSES, asked_for, launcher
 
-PLACES = ("-o", "--output", "--cache", "--junit")
+PLACES = ("-o", "--output", "--cache", "--junit", "--video")
 """Options that name a place to write to: paths are not recorded."""
 
 
@@ -56,11 +57,26 @@ def default_workers() -> int:
     return len(os.sched_getaffinity(0))
 
 
+def crew(workers: str | None) -> tuple[int, str]:
+    """Return how many workers were asked for, 0 for as many as there is place for, and who starts them.
+
+    Raises:
+        UsageError: when it is none of what ``--workers`` takes.
+        MissingExtra, TargetError: when there is nobody to compute: better before the work than in the midst of it.
+    """
+    if workers is None:
+        return default_workers(), PROCESSES
+    name, count = asked_for(workers)
+    launcher(name, count).check()
+    return count or default_workers() if name == PROCESSES else count, name
+
+
 @contextlib.contextmanager
-def progress(workers: int = 1) -> Iterator[Context]:
+def progress(workers: int = 1, launched_by: str = PROCESSES) -> Iterator[Context]:
     """Yield a context whose progress is shown on stderr: a live bar on a terminal, plain lines elsewhere."""
+    common: dict[str, Any] = {"command": command_line(), "launcher": launched_by, "unfinished": []}
     if not sys.stderr.isatty():
-        yield Context(_plain_lines(), workers, command_line())
+        yield Context(_plain_lines(), workers, **common)
         return
     from rich.console import Console
     from rich.markup import escape
@@ -80,7 +96,7 @@ def progress(workers: int = 1) -> Iterator[Context]:
             text, whole = escape(one_line(what)), None if share is None else 1.0
             bar.update(task, description=text, total=whole, completed=share or 0.0)
 
-        yield Context(tell, workers, command_line())
+        yield Context(tell, workers, **common)
 
 
 def _plain_lines() -> Tell:
@@ -139,6 +155,32 @@ def refuse_existing(
         _refuse_unwritable(out)
 
 
+def refuse_video(
+    video: Path | None, force: bool, out: Path | None, inputs: Iterable[str | os.PathLike[str] | None]
+) -> None:
+    """Refuse a video that cannot be written before the work, not after it.
+
+    Args:
+        video: The file, None when there is none.
+        force: Whether one that vlatool wrote there may be replaced.
+        out: The directory of the report.
+        inputs: What the command reads.
+
+    Raises:
+        UsageError: when its suffix names no format, or it is in the directory of the report.
+        MissingExtra: when nothing is installed that writes the format.
+        OutputError: when it lies in an input, exists (and not ``force``), or cannot be written.
+    """
+    from vlatool.render.video import check_video
+
+    if video is None:
+        return
+    if out is not None and out.absolute() in (video.absolute(), *video.absolute().parents):
+        raise UsageError(f"--video {video} is in the output {out}, which appears whole or not at all.")
+    refuse_inputs(video, inputs)
+    check_video(video, force=force)
+
+
 def file_or_none(named: str | None) -> str | None:
     """Return what names a file rather than a thing by its name, such as a profile."""
     return named if named and os.path.isfile(named) else None
@@ -153,7 +195,15 @@ def _refuse_unwritable(out: Path) -> None:
         raise OutputError(f"Cannot write {out}: this user may not write to {above}.", "choose another output")
 
 
-def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool = False, raw: bool = False) -> None:
+def show(
+    report: Report,
+    *,
+    as_json: bool,
+    out: Path | None = None,
+    force: bool = False,
+    raw: bool = False,
+    unfinished: Sequence[Path] = (),
+) -> None:
     """Print a report on stdout, write it to a directory where wanted, and exit with the verdict's code.
 
     Args:
@@ -162,6 +212,7 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
         out: Directory for the report, None for none.
         force: Replace a report that exists there.
         raw: Print raw samples, too, as JSON.
+        unfinished: Folders of what is kept until the report is written.
 
     Raises:
         GateFailed: for the verdict ``fail``.
@@ -178,6 +229,7 @@ def show(report: Report, *, as_json: bool, out: Path | None = None, force: bool 
     if out is not None:
         with writing(out, force=force) as draft:
             write_reports(report, draft)
+    written(unfinished)
     if out is not None and not as_json:
         put(f"report: {out / 'report.html'}\n")
     raise_verdict(report)

@@ -20,6 +20,7 @@ from typing import Any
 import typer
 
 from vlatool.cli._failure import INPUT, Failure
+from vlatool.files.work import forget_all
 from vlatool.report import Report, without_nan
 
 FLAG = "--json"
@@ -62,6 +63,8 @@ _now: list[Output] = []
 """The output of the command line that runs, when it asks for JSON."""
 _lost: list[str] = []
 """Why results could not be printed."""
+_kept: list[Path] = []
+"""Folders of what is kept of a run until its result is printed."""
 
 
 def document(value: Any, text: str = "") -> None:
@@ -160,6 +163,18 @@ def put(text: str) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
             _lost.append(error.strerror or str(error))
+
+
+def written(unfinished: Sequence[Path]) -> None:
+    """Note that a result was written as far as files go: what was kept of its run goes once it is printed, too."""
+    _kept.extend(unfinished)
+
+
+def forget_kept(*, printed: bool) -> None:
+    """Remove what was kept of runs whose results were written and printed; what was not printed can be asked again."""
+    if printed:
+        forget_all(_kept)
+    _kept.clear()
 
 
 def lost() -> Failure | None:

@@ -17,6 +17,13 @@ Force = Annotated[bool, typer.Option("--force", help="replace an output that exi
 Raw = Annotated[bool, typer.Option("--raw", help="keep every raw sample in the JSON of --json")]
 ReportFolder = Annotated[Path | None, typer.Option("-o", "--output", help="directory for the report")]
 BundlePath = Annotated[Path, typer.Argument(help="a bundle", show_default=False, autocompletion=_complete.bundles)]
+Workers = Annotated[
+    str | None,
+    typer.Option(
+        "--workers", metavar="N|ray", help="processes for closed-loop episodes, all cores if unset; or ray (ray:N): "
+        "workers of a Ray cluster (N at most)",
+    ),
+]  # fmt: skip
 ProfileName = Annotated[
     str, typer.Argument(help="name of a profile, or a YAML file", show_default=False, autocompletion=_complete.profiles)
 ]

@@ -14,9 +14,9 @@ import typer
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._board_summary import board_summary
-from vlatool.cli._console import default_workers, file_or_none, progress, refuse_existing, show
+from vlatool.cli._console import crew, file_or_none, progress, refuse_existing, refuse_video, show
 from vlatool.cli._document import document
-from vlatool.cli._options import AsJson, Force, Raw
+from vlatool.cli._options import AsJson, Force, Raw, Workers
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
 from vlatool.machine.host import MAX_CPU_ISA
@@ -48,9 +48,11 @@ SOURCE = typer.Argument(
 SOURCE_FLAG = _flag("source", Annotated[str, SOURCE])
 NEW_BUNDLE = typer.Option("-o", "--output", help="directory of the new bundle", show_default=False)
 REPORTS = typer.Option("-o", "--output", help="directory for report.html, report.md and report.json")
-WORKERS = typer.Option("--workers", min=1, help="processes for closed-loop episodes; all cores if unset")
 EVENTS = typer.Option("--events", help="directory for events that TensorBoard reads: loss, learning rate, success")
 TARGET = typer.Option("--target", help="run there, through ssh: user@host, or a Host of your ssh config")
+VIDEO = typer.Option(
+    "--video", help="file for a video of the episode that differs most (alone: of a failed one): .gif, .mp4"
+)
 REMOTE_PYTHON = typer.Option("--remote-python", help="Python of the target, such as ~/venv/bin/python")
 COMMON_FLAGS = (_flag("force", Force, False), _flag("as_json", AsJson, False))
 TRANSFORM_FLAGS = (
@@ -64,10 +66,11 @@ MEASURE_FLAGS = (
     _board_flag(
         "add predictions for this board (see: vlatool profiles list); evaluate OpenVINO in its instruction set"
     ),
-    _flag("workers", Annotated[int | None, WORKERS], None),
+    _flag("workers", Workers, None),
     *COMMON_FLAGS,
     _flag("raw", Raw, False),
 )
+VIDEO_FLAGS = (_flag("video", Annotated[Path | None, VIDEO], None),)
 REMOTE_FLAGS = (
     _flag("target", Annotated[str | None, TARGET], None),
     _flag("remote_python", Annotated[str | None, REMOTE_PYTHON], None),
@@ -206,23 +209,27 @@ def measure(
     source: str,
     out: Path | None,
     profile: str | None,
-    workers: int | None,
+    workers: str | None,
     force: bool,
     as_json: bool,
     raw: bool = False,
     target: str | None = None,
     remote_python: str | None = None,
+    video: Path | None = None,
 ) -> None:
     """Measure a bundle, or a policy that is exported first; here, or on a target."""
     if remote_python is not None and target is None:
         raise UsageError("--remote-python is the Python of a target.", "name it: --target user@host")
-    refuse_existing(out, force, source, file_or_none(profile), *named_files(stage))
+    inputs = (source, file_or_none(profile), *named_files(stage))
+    refuse_existing(out, force, *inputs)
+    refuse_video(video, force, out, inputs)
     board = None
     if profile:
         from vlatool.hardware.profile import load_profile
 
         board = load_profile(profile)
-    with progress(workers or default_workers()) as context:
+    with progress(*crew(workers)) as context:
+        context = replace(context, video=str(video.absolute()) if video else "")
         bundle = opened(source, context)
         stage.check(bundle, board)
         if target is not None:
@@ -232,7 +239,7 @@ def measure(
         report = _measured(stage if board is None else stage.on(board), bundle, board, context)
     if board is not None:
         report = with_predictions(report, board, bundle)
-    show(report, as_json=as_json, out=out, force=force, raw=raw)
+    show(report, as_json=as_json, out=out, force=force, raw=raw, unfinished=context.unfinished or ())
 
 
 def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Context) -> Report:

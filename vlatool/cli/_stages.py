@@ -97,6 +97,8 @@ def stage_function(stage: type[Stage]) -> Callable[..., None]:
 
     if issubclass(stage, Measure) and stage.remotely:
         common = (*common, *_run.REMOTE_FLAGS)
+    if issubclass(stage, Measure) and stage.films:
+        common = (*common, *_run.VIDEO_FLAGS)
     if issubclass(stage, Transform) and stage.trains:
         common = (*common, *_run.TRAINING_FLAGS)
     typed = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
@@ -114,7 +116,9 @@ def registry_name(stage: type[Stage]) -> str:
 def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
     annotation: Any = field.annotation
     default = field.get_default()
-    if typing.get_origin(annotation) is tuple:
+    if _are_numbers(annotation):  # as 0.5,1,2
+        annotation, default = str, ",".join(f"{number:g}" for number in default)
+    elif typing.get_origin(annotation) is tuple:
         annotation = list.__class_getitem__(typing.get_args(annotation)[0])
         default = list(default or ())
     elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
@@ -131,6 +135,11 @@ def _parameter(name: str, field: FieldInfo) -> inspect.Parameter:
         autocompletion=_complete.OF_FIELDS.get(name),
     )
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=option, annotation=annotation)
+
+
+def _are_numbers(annotation: Any) -> bool:
+    """Say whether a field takes one number or several."""
+    return typing.get_origin(annotation) is tuple and typing.get_args(annotation)[0] is float
 
 
 def _typed(context: typer.Context, name: str) -> bool:

@@ -15,10 +15,10 @@ import typer
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
-from vlatool.cli._console import command_line, default_workers, progress, refuse_existing, show
+from vlatool.cli._console import command_line, crew, progress, refuse_existing, show
 from vlatool.cli._default import group_with
 from vlatool.cli._document import document, put
-from vlatool.cli._options import AsJson, Force, Raw, ReportFolder
+from vlatool.cli._options import AsJson, Force, Raw, ReportFolder, Workers
 from vlatool.cli._run import opened
 from vlatool.errors import BundleError, OutputError, UsageError
 from vlatool.files.edited import refuse_file, write_own
@@ -59,7 +59,7 @@ def run(
     ] = None,
     output: ReportFolder = None,
     junit: Annotated[Path | None, typer.Option(help="also write JUnit XML to this file")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="processes for closed-loop episodes")] = None,
+    workers: Workers = None,
     force: Force = False,
     as_json: AsJson = False,
     raw: Raw = False,
@@ -81,14 +81,14 @@ def run(
     refuse_existing(output, force, candidate, *_read_by(gate, base), config)
     if junit is not None:
         _place(junit, candidate, *_read_by(gate, base), config)
-    with progress(workers or default_workers()) as context:
+    with progress(*crew(workers)) as context:
         bundle = opened(candidate, context)
         report = run_gate(bundle, Bundle.open(base), gate, context, seed)
     report = replace(report, command=command_line(), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     if os.environ.get("GITHUB_ACTIONS") == "true" and not as_json:
         _tell_github(report)
     try:
-        show(report, as_json=as_json, out=output, force=force, raw=raw)
+        show(report, as_json=as_json, out=output, force=force, raw=raw, unfinished=context.unfinished or ())
     finally:  # after the directory of reports: the file may be in it
         if junit is not None:
             _write_junit(report, junit)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlatool.cli import _complete
-from vlatool.cli._console import default_workers, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
+from vlatool.cli._console import crew, file_or_none, progress, raise_verdict, refuse_existing, terminal_text
 from vlatool.cli._document import document, put, report_document
-from vlatool.cli._options import Force
+from vlatool.cli._options import Force, Workers
 from vlatool.cli._plan import plan_document
 from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
@@ -81,7 +81,7 @@ def optimize(
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
     iterations: Annotated[int | None, typer.Option(min=20, help="timed inferences of each candidate (200)")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="threads while timing (1)")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="processes for episodes; all cores if unset")] = None,
+    workers: Workers = None,
     cache: Annotated[Path | None, typer.Option(help="where finished stages are kept")] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="measure again, even what was measured before")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="print the plan and stop")] = False,
@@ -117,7 +117,7 @@ def optimize(
     if dry_run:
         _show_plan(plan, as_json)
         return
-    with progress(workers or default_workers()) as context:
+    with progress(*crew(workers)) as context:
         report = pipeline.optimize(plan, output, context, force=force)
     if as_json:
         document(report_document(report, raw=raw, file=output / "reports" / REPORT))

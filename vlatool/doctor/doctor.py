@@ -33,6 +33,9 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "text": ("tokenizers",),
     "search": ("optuna",),
     "tensorboard": ("tensorboard",),
+    "video": ("pillow",),
+    "mp4": ("pillow", "imageio-ffmpeg"),
+    "ray": ("ray",),
     "dev": ("pytest", "pytest-cov", "ruff", "mypy", "import-linter"),
 }
 """Extra -> the distributions that it installs, as in ``pyproject.toml``."""

@@ -1,4 +1,4 @@
-"""Play episodes, spread over child processes; each opens the bundle once.
+"""Play episodes, in a child process that opens the bundle once; ``jobs`` spreads them over several.
 
 The environment is a user's code: it runs in children alone, however many, and one that ends its process, prints or
 changes the directory does that there (see ``vlatool.user_code.children``).
@@ -22,6 +22,7 @@ from vlatool.episodes.body import Body, series_of
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.disturbed import OWN, Seen
 from vlatool.episodes.environment import GUIDE, World
+from vlatool.episodes.film import world_of
 from vlatool.episodes.frames import KeepingEncoder, Noisy
 from vlatool.episodes.late import Late
 from vlatool.errors import DataError, VlatoolError, require
@@ -31,8 +32,6 @@ from vlatool.module.factory import call_factory, exits_caught
 from vlatool.motion.measure import measured
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
-from vlatool.stage.base import Context
-from vlatool.user_code.children import call, spread
 
 SLICE = 10
 """Episodes of one task that a worker plays at a time."""
@@ -41,6 +40,8 @@ LONGEST = 200
 """Characters of an instruction that are kept."""
 EVALUATION_SEEDS = 5_000_000
 """First seed of the episodes that policies are judged by; those that they are trained on have smaller ones."""
+RECORDINGS = "data/"
+"""What of a bundle no episode needs."""
 PRELOAD = ("numpy", "onnxruntime", __name__)
 
 
@@ -63,6 +64,7 @@ class EpisodesJob:
         strength: Of the disturbance; 1 is what an ordinary day brings.
         latency_ms: How late actions come; 0 for at once.
         show: Whether the outcomes hold the path and the actions of each step.
+        film: Folder for pictures of the episode, of which there is one then; none are taken when empty.
     """
 
     environment: str
@@ -77,6 +79,7 @@ class EpisodesJob:
     strength: float = 1.0
     latency_ms: float = 0.0
     show: bool = False
+    film: str = ""
 
 
 @dataclass(frozen=True)
@@ -114,57 +117,6 @@ def jobs_for(job: EpisodesJob, tasks: Sequence[str], episodes: int, first_seed: 
     ]
 
 
-def run_jobs(bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context) -> list[Outcome]:
-    """Play all episodes and return their outcomes in the order of the jobs, whatever the number of workers.
-
-    Raises:
-        DataError: when the environment fails or does not fit the policy's spec.
-        SourceError: when it ends the process that it runs in.
-    """
-    path = str(bundle.path.absolute())
-    requests = [to_json(Request(path, engine, STEP_LIMIT, job)) for job in jobs]
-    about = jobs[0].environment.rpartition(":")[0] if jobs else ""
-    here = f"{__name__}:"
-    answers = spread(f"{here}play", requests, context.workers, context.tell, about, PRELOAD, last=f"{here}close")
-    with contextlib.closing(answers):
-        played = (_outcomes(answer, job) for answer, job in zip(answers, jobs, strict=True))
-        return _collect(played, len(jobs), context)
-
-
-def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
-    """Return the disturbances that can be played: those that need no environment, and its own.
-
-    Raises:
-        DataError: when the environment does not say properly which they are.
-        SourceError: when it ends the process that it runs in.
-    """
-    request = to_json(Request(str(bundle.path.absolute()), "", STEP_LIMIT, job))
-    own = call(f"{__name__}:disturbances", request, context.tell, job.environment.rpartition(":")[0])
-    if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
-        raise DataError("The process that asked the environment for its disturbances did not answer with names.")
-    return (*OWN, *(kind for kind in own if kind not in OWN))
-
-
-def _outcomes(answer: Any, job: EpisodesJob) -> tuple[Outcome, ...]:
-    """Return what a child says of the episodes of a job."""
-    try:
-        outcomes = from_json(Played, answer).outcomes
-    except ValueError as error:
-        raise DataError(f"The process that played '{job.task}' did not answer with episodes: {error}.") from error
-    if [(outcome.task, outcome.seed) for outcome in outcomes] != [(job.task, seed) for seed in job.seeds]:
-        raise DataError(f"The process that played '{job.task}' answered with other episodes.")
-    return outcomes
-
-
-def _collect(results: Any, count: int, context: Context) -> list[Outcome]:
-    outcomes: list[Outcome] = []
-    for number, part in enumerate(results):
-        outcomes += part
-        done = sum(outcome.success for outcome in outcomes) / len(outcomes)
-        context.tell(f"{len(outcomes)} episodes, {done:.1%} succeed", (number + 1) / count)
-    return outcomes
-
-
 class Actor(Protocol):
     """Who acts in an episode."""
 
@@ -196,7 +148,7 @@ class Worker:
     """What a child process keeps between jobs: the policy and the environment of the current task."""
 
     def __init__(self, path: str, engine: str) -> None:
-        policy = _opened(Bundle.open(Path(path)), engine)
+        policy = _opened(Bundle.described(path), engine)
         self._frames = KeepingEncoder(policy.encode)
         policy.encode = self._frames
         self.queue = BoundedQueue(policy)
@@ -217,7 +169,7 @@ class Worker:
     def play(self, job: EpisodesJob, limit: int = STEP_LIMIT) -> list[Outcome]:
         """Play the episodes of a job."""
         spec = self.queue.policy.spec
-        world = World(self.environment(job), job.task, spec)
+        world = world_of(self.environment(job), job.task, spec, job.film)
         with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
             return [_episode(world, self._actor(job, seed), spec, job, seed, limit) for seed in job.seeds]
 
@@ -241,7 +193,8 @@ class Worker:
 
 
 def _opened(bundle: Bundle, engine: str) -> Policy:
-    """Open a bundle; one that is not exported yet runs in torch."""
+    """Verify and open a bundle, without its recordings; one that is not exported yet runs in torch."""
+    bundle.verify(but=RECORDINGS)
     if bundle.manifest.graphs:
         policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
         policy.warm_up(1)
@@ -268,7 +221,7 @@ def play(request: Mapping[str, Any], _tell: Callable[[str, float | None], None])
 def disturbances(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
-    spec = Bundle.open(Path(asked.bundle)).manifest.spec
+    spec = Bundle.described(asked.bundle).manifest.spec
     environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
     try:
         return list(World(environment, asked.job.task, spec).disturbances())

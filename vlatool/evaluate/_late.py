@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from statistics import median
 
@@ -27,7 +28,7 @@ def latency_of(bundle: Bundle, board: str, engine: str, context: Context) -> Mea
         bundle: With graphs.
         board: Profile that it is predicted for; measured on this machine with one thread when empty.
         engine: Of the runtime; the bundle's own when empty.
-        context: For progress.
+        context: For progress, and what is kept of an interrupted run.
 
     Raises:
         ProfileError: when there is no such board.
@@ -38,9 +39,21 @@ def latency_of(bundle: Bundle, board: str, engine: str, context: Context) -> Mea
         if not latency.known:
             raise DataError(f"The latency on {board} cannot be predicted: {latency.note}.", "name another board")
         return replace(latency, name=LATE)
+    calls = _calls(bundle, engine, context)
+    return Measurement(LATE, median(calls), "ms", samples=len(calls), note="median, one thread")
+
+
+def _calls(bundle: Bundle, engine: str, context: Context) -> Sequence[float]:
+    """Measure the latencies of calls in ms; a run that was interrupted goes on with those that it had measured."""
+    key, kept = f"latency of {bundle.hash} in {engine or 'its engine'}", context.kept
+    known = kept.get(key) if kept else None
+    if isinstance(known, list) and known and all(isinstance(call, float) and call > 0 for call in known):
+        return known
     job = LatencyJob((str(bundle.path.absolute()),), engine, 1, CALLS, SECONDS, check=False)
     calls = agent.measure(job, context.tell).policies[0].samples
-    return Measurement(LATE, median(calls), "ms", samples=len(calls), note="median, one thread")
+    if kept:
+        kept.put(key, list(calls))
+    return calls
 
 
 def late(jobs: list[EpisodesJob], latency: Measurement | None) -> list[EpisodesJob]:

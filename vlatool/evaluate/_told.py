@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from vlatool.accuracy.disturbed import TABLE
+from vlatool.accuracy.disturbed import worst_record
 from vlatool.accuracy.moved import RATIO, STEPS, WORST
 from vlatool.evaluate._late import LATE
 from vlatool.report import Measurement, Row
@@ -30,10 +30,10 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
         yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
     if steps and _is_more(steps):
         yield f"Over all episodes, it needs {_times(steps.value)} the steps."
-    if table := row.details.get(TABLE):
-        first = table[0]
+    if found := worst_record(row):
+        first, name = found
         drop = f", {100 * first['drop']:.3g} points fewer than of the baseline" if first.get("drop", 0) > 0 else ""
-        yield f"It succeeds least{' beside the baseline' if 'drop' in first else ''} under {first['disturbance']}: " \
+        yield f"It succeeds least{' beside the baseline' if 'drop' in first else ''} under {name}: " \
               f"{first['success']:.1%}{drop}."  # fmt: skip
     latencies = {one.name: item.value for one in rows for item in one.measurements if item.name == LATE}
     if latencies:

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
+from pydantic_core import PydanticCustomError
 
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.disturbed import with_disturbed
 from vlatool.accuracy.paired import Outcome, compare_success, success_row, with_chance
-from vlatool.accuracy.shown import differs_most, with_episode
+from vlatool.accuracy.shown import with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, disturbances_of, jobs_for, run_jobs
+from vlatool.episodes.jobs import disturbances_of, run_jobs
+from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
+from vlatool.evaluate._player import Player
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
+from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
-from vlatool.machine.host import fingerprint
+from vlatool.files.work import Store
+from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
-from vlatool.report import Measurement, Report, Row
+from vlatool.report import Report, Row
 from vlatool.stage.base import Context, Measure
+from vlatool.stage.cache import STREAMS
 from vlatool.user_code import trust
 
 if TYPE_CHECKING:
@@ -34,6 +40,8 @@ if TYPE_CHECKING:
 
 ALL = "all"
 """Every disturbance that there is."""
+STRONGEST = 10
+"""The largest strength of a disturbance."""
 CONTROL_EPISODES = 20
 """Episodes of each control, or a tenth of the policy's where that is more."""
 
@@ -44,6 +52,8 @@ class ClosedLoop(Measure):
     With a baseline, actions that do not look at the observation are played, too: it must succeed more often than they.
     Episode ``k`` of a task has the seed ``first_seed + k`` for every bundle, so that outcomes are paired.
     """
+
+    films: ClassVar[bool] = True
 
     policy: Path | None = Field(None, description="policy.yaml (or its directory) that names environment and tasks")
     environment: str = Field("", description="path.py:make or package.module:make; the one in policy.yaml when empty")
@@ -65,12 +75,29 @@ class ClosedLoop(Measure):
     disturb: tuple[str, ...] = Field(
         (), description="disturbances to play as well: all, or some of delay, dropped_frames and the environment's own"
     )
-    strength: float = Field(1.0, ge=0, le=10, description="of the disturbances; 1 is what an ordinary day brings")
+    strength: tuple[float, ...] = Field(
+        (1.0,),
+        min_length=1,
+        description="of the disturbances, or several, such as 0.5,1,2; 1: what an ordinary day brings",
+    )
     latency_in_the_loop: bool = Field(False, description="let actions come as late as inferences take")
     board: str = Field(
         "",
         description="profile whose predicted latency that is; --profile sets it; measured here when empty",
     )
+
+    @field_validator("strength", mode="before")
+    @classmethod
+    def _split(cls, value: Any) -> Any:
+        parts = value.split(",") if isinstance(value, str) else value
+        return [parts] if isinstance(parts, int | float) else parts
+
+    @field_validator("strength")
+    @classmethod
+    def _in_order(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if not all(0 <= strength <= STRONGEST for strength in value):
+            raise PydanticCustomError("strength", f"Each strength must be from 0 to {STRONGEST}")
+        return tuple(sorted(set(value)))
 
     def inputs(self) -> tuple[Path, ...]:
         """The baseline's manifest, and the environment's file with its neighbours, which it may import."""
@@ -87,7 +114,7 @@ class ClosedLoop(Measure):
             raise UsageError("--limit is the largest drop against a baseline, and none is named.", "add --baseline DIR")
         if self.board and not self.latency_in_the_loop:
             raise UsageError("--board says whose latency counts, and none does.", "add --latency-in-the-loop")
-        if self.strength != 1.0 and not self.disturb:
+        if "strength" in self.options() and not self.disturb:
             raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
         self._may_run(self._jobs(source)[0])
 
@@ -96,14 +123,33 @@ class ClosedLoop(Measure):
         return self.model_copy(update={"board": profile.name}) if self.latency_in_the_loop and not self.board else self
 
     def run(self, source: Bundle, context: Context) -> Report:
-        """Run all episodes of the bundle, and of the baseline when there is one."""
+        """Run all episodes of the bundle, and of the baseline when there is one.
+
+        What is finished is kept until the result is written, where somebody will see to that (``Context.unfinished``).
+        """
+        if context.unfinished is None:
+            return self._measured(source, context)
+        place = cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+        context.unfinished.append(place)
+        with Store.open(place) as kept:
+            report = self._measured(source, replace(context, kept=kept))
+        taken = f"{kept.taken} of the {kept.asked} episodes are of an interrupted run of the same command."
+        notes = [*([taken] if kept.taken else []), *([kept.problem] if kept.problem else [])]
+        context.notes.extend(notes)
+        return replace(report, warnings=(*report.warnings, *notes))
+
+    def _measured(self, source: Bundle, context: Context) -> Report:
         jobs = self._jobs(source)
         self._may_run(jobs[0])
         kinds = self._disturbances(source, jobs[0], context)
         bundles = [*([Bundle.open(self.baseline)] if self.baseline else []), source]
+        check_video_of(bundles, jobs[0], context)
         waits = [latency_of(one, self.board, self.engine, context) if self.latency_in_the_loop else None
                  for one in bundles]  # fmt: skip
-        plays = [partial(self._play, one, wait, context) for one, wait in zip(bundles, waits, strict=True)]
+        plays: list[Player] = []
+        for one, wait in zip(bundles, waits, strict=True):
+            most = sum(len(job.seeds) for job in jobs)
+            plays.append(Player(one, wait, self.engine, context, most, plays[0] if plays else None))
         rows: list[Row] = []
         believed, decision = Credibility("unknown"), None
         if self.baseline and self.limit is not None:
@@ -121,9 +167,10 @@ class ClosedLoop(Measure):
         if kinds:
             played = [self._disturbed(kinds, late(jobs, wait), one, context)
                       for one, wait in zip(bundles, waits, strict=True)]  # fmt: skip
-            row = with_disturbed(row, played[-1], played[0] if self.baseline else None, self.strength)
-        if rows and (shown := self._shown(jobs[0], reference[0], outcomes, plays)):
-            rows, row = [with_episode(rows[0], shown[0])], with_episode(row, shown[1])
+            row = with_disturbed(row, played[-1], played[0] if self.baseline else None)
+        again = played_again(jobs[0], [*reference, outcomes], plays, bundles, context)
+        if again.outcomes:
+            rows, row = [with_episode(rows[0], again.outcomes[0])], with_episode(row, again.outcomes[1])
         rows = [replace(row, measurements=(*row.measurements, wait)) if wait else row
                 for row, wait in zip([*rows, row], waits, strict=True)]  # fmt: skip
         row = rows[-1]
@@ -134,29 +181,9 @@ class ClosedLoop(Measure):
         text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
         decided = (sentence(decision),) if decision else ()
-        return Report(
-            "evaluate", title, verdict, (*believed.sentences, *decided, text, *told(rows, self.board)), tuple(rows),
-            environment=fingerprint(), warnings=(*believed.warnings, *found_wrong(source)),
-        )  # fmt: skip
-
-    def _shown(
-        self, job: EpisodesJob, base: list[Outcome], own: list[Outcome], plays: Sequence[Callable[..., list[Outcome]]]
-    ) -> list[Outcome]:
-        """Return the episode in which both differ most, played again by each and kept step by step.
-
-        Nothing where that fails: all that is measured was measured before.
-        """
-        most = own[differs_most(base, own)]
-        again = replace(job, task=most.task, seeds=(most.seed,), show=True)
-        try:
-            return [play([again])[0] for play in plays]
-        except (DataError, SourceError):
-            return []
-
-    def _play(
-        self, bundle: Bundle, wait: Measurement | None, context: Context, jobs: list[EpisodesJob]
-    ) -> list[Outcome]:
-        return run_jobs(bundle, late(jobs, wait), self.engine, context)
+        summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
+        warnings = (*believed.warnings, *found_wrong(source), *again.warnings, *dict.fromkeys(context.notes))
+        return Report("evaluate", title, verdict, summary, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
         """Return the disturbances that are asked for.
@@ -173,13 +200,13 @@ class ClosedLoop(Measure):
 
     def _disturbed(
         self, kinds: Sequence[str], jobs: list[EpisodesJob], bundle: Bundle, context: Context
-    ) -> dict[str, list[Outcome]]:
-        """Return disturbance -> the episodes of a bundle under it."""
+    ) -> dict[tuple[str, float], list[Outcome]]:
+        """Return disturbance and strength -> the episodes of a bundle under it."""
         played = {}
-        for kind in kinds:
-            context.tell(f"episodes under {kind}", None)
-            disturbed = [replace(job, disturb=kind, strength=self.strength) for job in jobs]
-            played[kind] = run_jobs(bundle, disturbed, self.engine, context)
+        for kind, strength in product(kinds, self.strength):
+            context.tell(f"episodes under {kind}, strength {strength:g}", None)
+            disturbed = [replace(job, disturb=kind, strength=strength) for job in jobs]
+            played[kind, strength] = run_jobs(bundle, disturbed, self.engine, context)
         return played
 
     def _reference(self, baseline: Bundle, outcomes: list[Outcome], context: Context) -> Row:

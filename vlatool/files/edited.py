@@ -59,6 +59,18 @@ def stamped(text: str, comment: str = "# {}") -> str:
     return f"{text}{comment.format(STAMP + _digest(text.encode()))}\n"
 
 
+def stamp_of(content: bytes) -> bytes:
+    """Return what a binary file says after ``content``, which ends in a line feed, so that ``is_own`` knows it again.
+
+    Nothing but bytes without a line feed may follow.
+
+    Example:
+        >>> len(stamp_of(b"GIF89a"))
+        112
+    """
+    return (STAMP + _digest(content)).encode()
+
+
 def unstamped(text: str) -> str:
     """Return a text without the lines that ``stamped`` adds."""
     return "".join(line for line in text.splitlines(keepends=True) if STAMP not in line)

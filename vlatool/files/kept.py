@@ -24,7 +24,7 @@ SIGNATURE = "Signature: 8a477f597d28d172789f06886806bc55"
 TAGGED = (
     f"{SIGNATURE}\n# This directory is vlatool's cache: 'vlatool cache size' and 'vlatool cache prune' look after it.\n"
 )
-STAGES, FILES = "stages", "files"
+STAGES, FILES, SHIPPED = "stages", "files", "shipped"
 SHARED = 1 << 20
 """Bytes from which a file is shared."""
 DIGEST = re.compile("[0-9a-f]{64}")

@@ -1,30 +1,42 @@
-"""Work that takes long, kept in the cache so that a run that is killed goes on: one folder, one run at a time."""
+"""Work that takes long, kept in the cache so that a run that is killed goes on."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
+import json
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
+
+from vlatool.files.edited import is_own, stamped, whole_file
 
 LOCK = "lock"
 FORGOTTEN_S = 7 * 24 * 3600
 """Age in seconds from which unfinished work that nobody continues is removed."""
+ANSWER = "answer-{}.json"
 
 
 @contextlib.contextmanager
 def work_directory(place: Path) -> Iterator[Path]:
     """Yield the directory of unfinished work, locked: one run at a time continues it, others wait."""
+    with _locked(place, fcntl.LOCK_EX):
+        yield place
+
+
+@contextlib.contextmanager
+def _locked(place: Path, how: int) -> Iterator[None]:
     place.mkdir(parents=True, exist_ok=True)
     _sweep(place)
     handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        fcntl.flock(handle, how)
         os.utime(place / LOCK)
-        yield place
+        yield
     finally:
         os.close(handle)
 
@@ -40,9 +52,88 @@ def _sweep(place: Path) -> None:
         with contextlib.suppress(OSError):
             if other == place or time.time_ns() / 1e9 - (other / LOCK).stat().st_mtime < FORGOTTEN_S:
                 continue
-            handle = os.open(other / LOCK, os.O_RDWR)
+            forget_unused(other)
+
+
+def forget_unused(place: Path) -> None:
+    """Remove a work directory, unless another run uses it, which then removes it itself.
+
+    Raises:
+        OSError: when it is used, or there is none.
+    """
+    handle = os.open(place / LOCK, os.O_RDWR)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        forget(place)
+    finally:
+        os.close(handle)
+
+
+def forget_all(places: Iterable[Path]) -> None:
+    """Remove the work directories of a result that was written, as far as no other run uses them."""
+    for place in places:
+        with contextlib.suppress(OSError):
+            forget_unused(place)
+
+
+class Store:
+    """Finished parts of a run: key -> JSON value, each in a file that is written whole or not at all.
+
+    Several runs may use one at a time. What cannot be written is not kept, and ``problem`` says so: it is there for a
+    run that is killed, and this one does without.
+
+    Args:
+        place: Its folder.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        self.problem = ""
+        self.taken = 0
+        """How many things (episodes, say) were taken from an earlier run; counted by whoever takes them."""
+        self.asked = 0
+        """How many there are in all."""
+
+    @classmethod
+    @contextlib.contextmanager
+    def open(cls, place: Path) -> Iterator[Store]:
+        """Yield the store of a folder, which no other process removes meanwhile."""
+        store = cls(place)
+        with contextlib.ExitStack() as opened:
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                forget(other)
-            finally:
-                os.close(handle)
+                opened.enter_context(_locked(place, fcntl.LOCK_SH))
+            except OSError as error:
+                store._failed(error)
+            yield store
+
+    def get(self, key: str) -> Any:
+        """Return what is kept under a key, None for nothing; what was damaged or changed counts as nothing."""
+        try:
+            path = self._file(key)
+            if not is_own(path):
+                return None
+            kept = json.loads(path.read_text(encoding="utf-8").partition("\n")[0])
+        except (OSError, ValueError, RecursionError):
+            return None
+        return kept["value"] if isinstance(kept, dict) and kept.get("key") == key else None
+
+    def put(self, key: str, value: Any) -> None:
+        """Keep a value that is not None."""
+        if self.problem:
+            return
+        try:
+            self.place.mkdir(parents=True, exist_ok=True)
+            with whole_file(self._file(key)) as draft:
+                draft.write_text(stamped(json.dumps({"key": key, "value": value}) + "\n"), encoding="utf-8")
+        except OSError as error:
+            self._failed(error)
+
+    def _file(self, key: str) -> Path:
+        return self.place / ANSWER.format(hashlib.sha256(key.encode()).hexdigest()[:32])
+
+    def _failed(self, error: OSError) -> None:
+        where = error.filename or self.place
+        self.problem = (
+            f"What is finished cannot be kept, so a run that is interrupted would begin again: {where}: "
+            f"{error.strerror or error}; make room there, or name another cache (VLATOOL_CACHE)."
+        )

@@ -80,7 +80,8 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     rows = (_row("baseline", baseline, timed, results), row)
     return Report(KIND, f"Gate of {name}", worst(result.verdict for result in results),
                   (*_summary(name, results), f"{inputs.told()}."), rows,
-                  command=context.command, environment=host, validity=validity(seen), findings=seen)  # fmt: skip
+                  command=context.command, environment=host, warnings=tuple(dict.fromkeys(context.notes)),
+                  validity=validity(seen), findings=seen)  # fmt: skip
 
 
 def _of_episodes(episodes: Episodes, gate: Gate) -> Iterator[ClaimResult]:

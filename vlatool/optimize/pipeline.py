@@ -64,6 +64,7 @@ class OptimizeJob:
         fresh: Measure again, even what was measured before.
         workers: Processes for episodes.
         command: The command line.
+        launcher: Who starts these processes.
     """
 
     source: str
@@ -74,6 +75,7 @@ class OptimizeJob:
     fresh: bool
     workers: int
     command: str
+    launcher: str = "processes"
 
 
 def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) -> Report:
@@ -97,7 +99,7 @@ def _confined(plan: Plan, profile: Profile, confine: str, draft: Path, context: 
     """Run a plan in a child whose OpenVINO, and that of its own children, is confined to an instruction set."""
     job = OptimizeJob(
         plan.typed, profile.model_dump(mode="json"), plan.recipe.model_dump(mode="json", by_alias=True),
-        str(plan.cache), str(draft), plan.fresh, context.workers, context.command,
+        str(plan.cache), str(draft), plan.fresh, context.workers, context.command, context.launcher,
     )  # fmt: skip
     about = f"optimize, confined to {confine},"
     here = "vlatool.optimize.pipeline:optimize_here"
@@ -110,7 +112,7 @@ def optimize_here(request: Mapping[str, Any], tell: Tell) -> None:
     job = from_json(OptimizeJob, request)
     profile, recipe = Profile.model_validate(job.profile), Recipe.model_validate(job.recipe)
     plan = make_plan(job.source, profile, recipe, Path(job.cache), fresh=job.fresh)
-    _optimized(plan, Path(job.draft), Context(tell, job.workers, job.command))
+    _optimized(plan, Path(job.draft), Context(tell, job.workers, job.command, launcher=job.launcher))
 
 
 def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
@@ -214,6 +216,7 @@ def _measured(
     rows = {name: with_task_speedup(row) for name, row in rows.items()}
     rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
+    warnings = (*warnings, *dict.fromkeys(context.notes))
     if plan.profile:
         predicted = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *predicted[name])) for name, row in rows.items()}

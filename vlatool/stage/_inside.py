@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,9 @@ def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any
     """Return what a child needs to know of a stage."""
     return {
         "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
+        "launcher": context.launcher,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
-        "events": context.events,
+        "events": context.events, "video": context.video,
     }  # fmt: skip
 
 
@@ -43,7 +45,7 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
     if not isinstance(stage, Transform):
         raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
-    bundle = stage.run(source, Path(job["out"]), Context(tell, job["workers"], job["command"], events=job["events"]))
+    bundle = stage.run(source, Path(job["out"]), _context(job, tell))
     return {"hash": bundle.hash}
 
 
@@ -55,14 +57,26 @@ def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle
     """
     job, settings = _job(stage, source, context), " ".join(f"{name}={value}" for name, value in environment.items())
     about = f"{stage.name()} with {settings}"
-    report = children.call("vlatool.stage._inside:measure", job, context.tell, about, environment=environment)
-    return Report.from_json(str(report))
+    job["keeps"] = context.unfinished is not None
+    answer = children.call("vlatool.stage._inside:measure", job, context.tell, about, environment=environment)
+    if context.unfinished is not None:
+        context.unfinished.extend(map(Path, answer["unfinished"]))
+    context.notes.extend(map(str, answer["notes"]))
+    return Report.from_json(str(answer["report"]))
 
 
-def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
-    """Run the measuring stage of a job in this process; return its report as JSON."""
+def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+    """Run the measuring stage of a job in this process; return its report as JSON, and what it kept and noted."""
     stage = build_stage(job["stage"], job["options"])
     if not isinstance(stage, Measure):
         raise RecipeError(f"The stage {job['stage']} makes a bundle; it measures nothing.")
     source = Bundle.open(Path(job["source"]), verify=False)
-    return stage.run(source, Context(tell, job["workers"], job["command"])).to_json()
+    unfinished: list[Path] = []
+    context = replace(_context(job, tell), unfinished=unfinished if job["keeps"] else None)
+    report = stage.run(source, context).to_json()
+    return {"report": report, "unfinished": list(map(str, unfinished)), "notes": context.notes}
+
+
+def _context(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> Context:
+    return Context(tell, job["workers"], job["command"], events=job["events"], launcher=job["launcher"],
+                   video=job["video"])  # fmt: skip

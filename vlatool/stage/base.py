@@ -19,6 +19,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import PluginError, RecipeError, nearest
 from vlatool.files.numbers import Numeric
+from vlatool.files.work import Store
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.version import VERSION
 from vlatool.report import Report
@@ -47,11 +48,17 @@ class Context:
 
     Args:
         tell: Called with what is being done and the share that is done (0-1, or None when it is not known).
-        workers: Processes that a stage may start.
+        workers: Processes that a stage may start; 0 for as many as the launcher has place for.
         command: The command line, for reports.
         elsewhere: Measures on another machine: a job, the bundles that it names, and ``tell`` -> what was found there.
             Here when None.
         events: Folder into which a training writes events that TensorBoard reads; none when empty.
+        video: File into which an evaluation writes a video of an episode; none when empty.
+        launcher: Who starts the workers that play episodes: an entry of the kind ``workers``.
+        unfinished: Gets the folders of what is kept until the result is written (``files.work.Store``): whoever writes
+            it forgets them. Nothing is kept when None.
+        kept: What is kept of this run, once a stage has opened it.
+        notes: Gets sentences on how it was computed that belong into the report.
     """
 
     tell: Tell = field(default=_silent)
@@ -59,6 +66,11 @@ class Context:
     command: str = ""
     elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
     events: str = ""
+    video: str = ""
+    launcher: str = "processes"
+    unfinished: list[Path] | None = None
+    kept: Store | None = None
+    notes: list[str] = field(default_factory=list)
 
 
 class SampleSet:
@@ -240,6 +252,8 @@ class Measure(Stage):
 
     remotely: ClassVar[bool] = False
     """Whether it can measure on another machine (``Context.elsewhere``)."""
+    films: ClassVar[bool] = False
+    """Whether it can write a video of what it measured (``Context.video``)."""
 
     def on(self, profile: Profile) -> Measure:
         """Return the stage as it is for a board."""

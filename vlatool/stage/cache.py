@@ -1,7 +1,8 @@
 """What the cache holds, how large it is, and how it is made smaller.
 
 Only what is recognisably vlatool's own is counted as an entry and ever removed: a finished stage by its name and the
-list of its files, unfinished work by its lock, a count by its content, a shared recording by its hash.
+list of its files, so what another machine sent, unfinished work by its lock, a count by its content, a shared
+recording by its hash.
 Everything else there is listed and left alone. What a running process uses is locked, and stays.
 """
 
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from vlatool.files.kept import DIGEST, FILES, STAGES, TAG
+from vlatool.files.kept import DIGEST, FILES, SHIPPED, STAGES, TAG
 from vlatool.files.locks import alone
 from vlatool.files.work import LOCK
 from vlatool.files.writing import sweep
@@ -30,9 +31,10 @@ NAMES = {
     STAGES: re.compile(r"(?P<what>[a-z]+\.[a-z0-9_]+)-[0-9a-f]{16}"),
     STREAMS: re.compile(r"[\w.-]+"),
     WORKLOADS: re.compile(r"[0-9a-f]{32}\.json"),
+    SHIPPED: DIGEST,
 }
 STREAM_FILES = re.compile(
-    r"lock|data|journal|checkpoint\.safetensors|\.checkpoint\.safetensors\.\d+\.part|meeting|round-\d{3}\.json"
+    r"lock|data|journal|answer-[0-9a-f]{32}\.json|\.answer-[0-9a-f]{32}\.json\.\d+\.part|checkpoint\.safetensors|\.checkpoint\.safetensors\.\d+\.part|meeting|round-\d{3}\.json"
     r"|(held-out/)?(expert/)?(round|draft)-\d{3}/.+|trials\.db(-journal)?"
 )
 """What unfinished work is made of: a file that is written part by part, training, or the trials of ``optimize``."""
@@ -52,7 +54,8 @@ class Entry:
 
     Args:
         name: Below the cache.
-        what: The stage's name; ``unfinished work`` or ``count of a policy`` where it is not a stage.
+        what: The stage's name; ``unfinished work``, ``count of a policy`` or ``files of another machine`` where it is
+            not a stage.
         used: When it was last made or used, in seconds since 1970.
         files: Relative name -> inode and bytes of the files that vlatool wrote.
     """
@@ -108,7 +111,7 @@ class Removed:
 
 def is_cache(place: Path) -> bool:
     """Return whether a directory is empty, or holds one of the folders of a cache."""
-    return not any(place.iterdir()) or any((place / name).exists() for name in (STAGES, STREAMS, WORKLOADS, FILES, TAG))
+    return not any(place.iterdir()) or any((place / name).exists() for name in (*NAMES, FILES, TAG))
 
 
 def contents(cache: Path) -> Contents:
@@ -118,7 +121,7 @@ def contents(cache: Path) -> Contents:
         OSError: when it cannot be read.
     """
     entries, unknown = [], []
-    for folder in (STAGES, STREAMS, WORKLOADS):
+    for folder in NAMES:
         for path in _below(cache / folder):
             try:
                 entry = _entry(cache, folder, path)
@@ -130,7 +133,7 @@ def contents(cache: Path) -> Contents:
                 unknown.append(path.relative_to(cache).as_posix())
     kept, others = _kept(cache)
     unknown += others
-    known = (STAGES, STREAMS, WORKLOADS, FILES, TAG)
+    known = (*NAMES, FILES, TAG)
     unknown += [path.name for path in _below(cache) if path.name not in known]
     return Contents(cache, tuple(sorted(entries, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
 
@@ -205,9 +208,10 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
     if named is None or stat.S_ISLNK(status.st_mode):
         return None
     name = path.relative_to(cache).as_posix()
-    if folder == STAGES:
+    if folder in (STAGES, SHIPPED):
+        what = named["what"] if folder == STAGES else "files of another machine"
         files = _stage_files(path)
-        return Entry(name, named["what"], status.st_mtime, files) if files else None
+        return Entry(name, what, status.st_mtime, files) if files else None
     if folder == STREAMS:
         files = _own_files(path, STREAM_FILES.fullmatch) if (path / LOCK).is_file() else {}
         used = (path / LOCK).stat().st_mtime if files else 0.0
@@ -278,8 +282,9 @@ def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
 
 def _drafts(cache: Path) -> Iterator[Path]:
     """Remove drafts of stages whose writers are gone; yield unfinished shared files of such writers."""
-    for final in {match["final"] for path in _below(cache / STAGES) if (match := DRAFT.fullmatch(path.name))}:
-        sweep(cache / STAGES / final)
+    for folder in (STAGES, SHIPPED):
+        for final in {match["final"] for path in _below(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
+            sweep(cache / folder / final)
     for path in _below(cache / FILES):
         match = PART.fullmatch(path.name)
         with contextlib.suppress(FileNotFoundError):

@@ -13,6 +13,7 @@ from vlatool.errors import BundleError, DataError, VlatoolError
 from vlatool.files.kept import tag
 from vlatool.files.locks import hold
 from vlatool.files.outputs import BUNDLE, refuse_replacing
+from vlatool.files.work import forget_all
 from vlatool.files.writing import writing
 from vlatool.machine.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
@@ -109,8 +110,11 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
             return report
         except DataError:
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
-    report = replace(stage.run(source, context), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    own = replace(context, unfinished=[], notes=[])
+    report = replace(stage.run(source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     tag(cache)
     with writing(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
+    context.notes.extend(own.notes)
+    forget_all(own.unfinished or ())
     return report

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.episodes.play import jobs_for, run_jobs
+from vlatool.episodes.jobs import run_jobs
+from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
 from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed

@@ -21,6 +21,10 @@ ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, e
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
 
 
+class Killed(SourceError):
+    """The process that runs a user's code was killed: what it was asked for may be asked of another one."""
+
+
 def read(line: bytes, about: str) -> dict[str, Any]:
     """Return one thing that a child says.
 
@@ -68,7 +72,7 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         raise MemoryError
     message = plain(answer["message"])
     if "error" in answer:
-        kind = getattr(errors, answer["error"], None)
+        kind = Killed if answer["error"] == Killed.__name__ else getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, InputError | MissingExtra):
             raise kind(answer["message"], answer["fix"])
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
@@ -121,7 +125,7 @@ def ended(status: bytes, about: str) -> BaseException:
     except ValueError:
         name = f"signal {-code}"
     if code == -signal.SIGKILL:
-        return SourceError(
+        return Killed(
             f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
             "where memory ran out, use a machine with more of it",
         )

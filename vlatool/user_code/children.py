@@ -27,8 +27,10 @@ from vlatool.errors import SourceError
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.processes import SINGLE, import_path, python_command
 from vlatool.user_code import trust
-from vlatool.user_code._answers import ended, plain, read, result
+from vlatool.user_code._answers import Killed as Killed
+from vlatool.user_code._answers import ended, plain, read
 from vlatool.user_code._answers import left as left
+from vlatool.user_code._answers import result as result
 
 Tell = Callable[[str, float | None], None]
 LONGEST_ANSWER = 1 << 28
@@ -239,27 +241,32 @@ def spread(
     about: str,
     preload: Sequence[str] = (),
     last: str = "",
+    done: Callable[[int, Any], None] | None = None,
 ) -> Generator[Any, None, None]:
     """Yield the result of every job, in order, computed in several children; close the iterator to end them.
 
     Args:
         last: Called in every child when all is done, with an empty job.
+        done: Called with the number of a job and its result as soon as it is there, in a thread of its own.
     """  # fmt: skip
     idle: SimpleQueue[Apart] = SimpleQueue()
 
-    def run(job: Mapping[str, Any]) -> Any:
+    def run(number: int, job: Mapping[str, Any]) -> Any:
         child = idle.get()
         try:
-            return child.call(function, job, tell)
+            answer = child.call(function, job, tell)
         finally:
             idle.put(child)
+        if done is not None:
+            done(number, answer)
+        return answer
 
     with contextlib.ExitStack() as opened, ThreadPoolExecutor(processes) as threads:
         children = [opened.enter_context(Apart(about, preload)) for _ in range(max(1, min(processes, len(jobs))))]
         for child in children:
             idle.put(child)
         try:
-            yield from threads.map(run, jobs)
+            yield from threads.map(run, range(len(jobs)), jobs)
             for child in children if last else ():
                 child.call(last, {}, tell)
         except BaseException:  # Ctrl-C too: what runs ends

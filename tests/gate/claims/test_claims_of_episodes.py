@@ -44,8 +44,8 @@ def episodes(one: list[Outcome], two: list[Outcome], **under: tuple[list[Outcome
     base = success_row("baseline", "baseline", one)
     row = compare_success(base, success_row("subject", "subject", two))
     if under:
-        own, reference = ({kind: pair[place] for kind, pair in under.items()} for place in (1, 0))
-        row = with_disturbed(row, own, reference, 1.0)
+        own, reference = ({(kind, 1.0): pair[place] for kind, pair in under.items()} for place in (1, 0))
+        row = with_disturbed(row, own, reference)
     return SimpleNamespace(rows=(base, row))
 
 

@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from vlatool.render._format import fixed, tick
-from vlatool.render.charts.svg import Axis, Canvas, shorten
+from vlatool.render.charts.svg import Axis, Canvas
 
 ROW, GAP, LEFT, RIGHT, HEAD = 74.0, 18.0, 54.0, 14.0, 22.0
 MOST_ACTIONS, MOST_POINTS = 6, 400
+DISCRETE = "action"
+"""The series of a discrete action: its index, of each step."""
 VIEWS = (("x", "y", "from above"), ("x", "z", "from the side"))
 Points = list[tuple[float, float]]
 
@@ -52,12 +54,7 @@ def episode(played: Sequence[Played], title: str, width: int) -> Canvas:
     height = top + (ROW + GAP) * len(actions) + 22
     steps = "; ".join(f"{one.variant}: {fixed(one.steps, 0)} steps" for one in played)
     canvas = Canvas(f"episode-{width}", width, round(height), title, f"{steps}.")
-    x = 0.0
-    for one in played:
-        name = shorten(one.variant, 150)
-        canvas.add("circle", f"dot {one.css}", cx=x + 5, cy=9, r=4)
-        canvas.text(x + 15, 13, name, "name")
-        x += 34 + 7 * len(name)
+    canvas.legend({one.variant: one.css for one in played})
     for number, view in enumerate(views):
         corner = (number * (side + GAP), HEAD) if beside else (0.0, HEAD + number * (tall + GAP))
         _paths(canvas, played, view, corner, (side, tall))
@@ -98,14 +95,23 @@ def _action(canvas: Canvas, played: Sequence[Played], name: str, across: Axis, t
     low, high = min(values), max(values)
     room = 0.06 * (high - low) or abs(high) * 0.1 or 1.0
     up = Axis(low - room, high + room, top + ROW, top + 12)
-    canvas.up(up, LEFT, across.end, {value: tick(value) for value in up.ticks(2)})
+    discrete = name == DISCRETE
+    canvas.up(up, LEFT, across.end, {value: tick(value) for value in _ticks(up, low, high, discrete)})
     for one in played:
         own = one.series.get(name, ())
         if own:
-            _line(canvas, _thin([(across(float(step)), up(value)) for step, value in enumerate(own, 1)]), one.css)
+            points = _thin([(across(float(step)), up(value)) for step, value in enumerate(own, 1)])
+            canvas.steps(points, f"line {one.css}") if discrete else _line(canvas, points, one.css)
         for step in _seams(one):
             canvas.line(across(float(step)), top + ROW - 5, across(float(step)), top + ROW, f"mark {one.css}")
     canvas.text(0, top + 8, name.partition(".")[2] or "action", "note")
+
+
+def _ticks(up: Axis, low: float, high: float, discrete: bool) -> list[float]:
+    """Return two round numbers or more; the indices themselves where they are few."""
+    if discrete and high - low < MOST_ACTIONS:
+        return [float(index) for index in range(round(low), round(high) + 1)]
+    return next((found for most in (2, 3, 4) if len(found := up.ticks(most)) > 1), [])
 
 
 def _seams(one: Played) -> list[int]:

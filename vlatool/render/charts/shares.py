@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from vlatool.render._format import number
 from vlatool.render.charts.svg import Axis, Canvas, shorten
 
-LINE, GAP, TOP, FOOT = 13.0, 12.0, 8.0, 34.0
+LINE, GAP, TOP, FOOT, HEAD = 13.0, 12.0, 8.0, 34.0, 16.0
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Share:
     @property
     def told(self) -> str:
         """The share in words."""
-        span = "" if self.low is None or self.high is None else f" ({_percent(self.low)} to {_percent(self.high)} %)"
-        return f"{self.variant}: {_percent(self.value)} %{span} of {self.count} episodes"
+        span = "" if self.low is None or self.high is None else f" ({percent(self.low)} to {percent(self.high)} %)"
+        return f"{self.variant}: {percent(self.value)} %{span} of {self.count} episodes"
 
 
 def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, width: int) -> Canvas:
@@ -46,17 +46,21 @@ def shares(groups: Sequence[tuple[str, Sequence[Share]]], title: str, key: str, 
         width: In pixels.
     """
     left = min(0.34 * width, 12.0 + 6.2 * max(len(name) for name, _ in groups))
-    height = TOP + sum(GAP + LINE * len(group) for _, group in groups) + FOOT
+    named = {share.variant: share.css for _, group in groups for share in group}
+    top = TOP + (HEAD if len(named) > 1 else 0.0)
+    height = top + sum(GAP + LINE * len(group) for _, group in groups) + FOOT
     words = "; ".join(f"{name}: {', '.join(share.told for share in group)}" for name, group in groups)
     canvas = Canvas(f"shares-{key}-{width}", width, round(height), title, words)
     least = min(share.value if share.low is None else share.low for _, group in groups for share in group)
     across = Axis(max(0.0, min(0.9, least - 0.02)), 1.0, left + 8, width - 24.0)
     base = height - FOOT
     for value in across.ticks(6 if width > 500 else 4):
-        canvas.line(across(value), TOP, across(value), base, "grid")
-        canvas.text(across(value), base + 15, f"{_percent(value)} %", "tick", "middle")
+        canvas.line(across(value), top, across(value), base, "grid")
+        canvas.text(across(value), base + 15, f"{percent(value)} %", "tick", "middle")
     canvas.line(across.start, base, across.end, base, "axis")
-    y = TOP + GAP
+    y = top + GAP
+    if len(named) > 1:
+        canvas.legend(named)
     for name, group in groups:
         canvas.text(0, y + LINE * (len(group) - 1) / 2 + 4, shorten(name, left), "name")
         for share in group:
@@ -73,5 +77,6 @@ def _draw(canvas: Canvas, across: Axis, y: float, share: Share) -> None:
     canvas.add("circle", f"dot {share.css}", share.told, cx=across(share.value), cy=y, r=3.5)
 
 
-def _percent(value: float) -> str:
+def percent(value: float) -> str:
+    """Return a share in per cent, without the sign."""
     return number(round(100 * value, 1))

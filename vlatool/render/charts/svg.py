@@ -154,6 +154,15 @@ class Canvas:
         self.text(0, y, shorten(name, self.width - len(numbers) * 6.2 - 20), css)
         self.text(right, y, numbers, "tick halo", "end")
 
+    def legend(self, named: Mapping[str, str]) -> None:
+        """Add a line at the top that says which colour a variant has, name -> class; names share the width."""
+        x, room = 0.0, self.width / max(1, len(named)) - 40
+        for name, css in named.items():
+            shown = shorten(name, min(150.0, room / 7 * CHARACTER))
+            self.add("circle", f"dot {css}", cx=x + 5, cy=9, r=4)
+            self.text(x + 15, 13, shown, "name")
+            x += 34 + 7 * len(shown)
+
     def svg(self) -> str:
         """Return the drawing."""
         top = (

@@ -1,0 +1,174 @@
+"""Spread episodes over workers, take what an interrupted run left, and put all outcomes in order."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from vlatool.accuracy.paired import Outcome
+from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
+from vlatool.episodes import play
+from vlatool.episodes.content import circumstances, key_of
+from vlatool.episodes.disturbed import OWN
+from vlatool.episodes.play import PRELOAD, RECORDINGS, EpisodesJob, Played, Request
+from vlatool.episodes.progress import Tally
+from vlatool.errors import DataError
+from vlatool.files.messages import from_json, to_json
+from vlatool.module.factory import factory_file
+from vlatool.stage.base import Context
+from vlatool.workers import PROCESSES, Folder, Work, launcher
+
+HERE = play.__name__
+Outcomes = tuple[Outcome, ...]
+
+
+def run_jobs(
+    bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, tally: Tally | None = None
+) -> list[Outcome]:
+    """Play all episodes and return their outcomes in the order of the jobs, whoever plays them.
+
+    Args:
+        bundle: Who acts.
+        jobs: What is played.
+        engine: Of the runtime; the bundle's own when empty.
+        context: Progress, workers, and what is kept of an interrupted run.
+        tally: Counts successes for the progress; one of these jobs alone when None.
+
+    Raises:
+        DataError: when the environment fails or does not fit the policy's spec.
+        SourceError: when it ends the process that it runs in.
+        TargetError: when the machines of other workers cannot be used.
+    """
+    if not jobs:
+        return []
+    tally = tally or Tally(sum(len(job.seeds) for job in jobs))
+    kept = _Kept(bundle, engine, jobs, context)
+    missing = [number for number in range(len(jobs)) if number not in kept.found]
+    played = _played(bundle, [jobs[number] for number in missing], engine, context, kept, missing)
+    outcomes: list[Outcome] = []
+    with contextlib.closing(played):
+        for number in range(len(jobs)):
+            part = kept.found[number] if number in kept.found else next(played)
+            outcomes += part
+            tally.add(part)
+            context.tell(tally.sentence(), tally.share)
+        next(played, None)  # what is open is closed
+    kept.say()
+    return outcomes
+
+
+def _played(
+    bundle: Bundle, jobs: list[EpisodesJob], engine: str, context: Context, kept: _Kept, numbers: Sequence[int]
+) -> Generator[Outcomes, None, None]:
+    """Yield the outcomes of jobs in order; each is kept as soon as it is there."""
+    if not jobs:
+        return
+    alone = jobs[0].record or not bundle.manifest.graphs  # what is written, or imported, is on this machine
+    name, count = (PROCESSES, 1) if alone and context.launcher != PROCESSES else (context.launcher, context.workers)
+
+    def done(at: int, answer: Any) -> None:
+        kept.put(numbers[at], _outcomes(answer, jobs[at]))
+
+    work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
+    answers = launcher(name, count).answers(work, context.tell, done, context.notes.append)
+    with contextlib.closing(answers):
+        for job, answer in zip(jobs, answers, strict=True):
+            yield _outcomes(answer, job)
+
+
+def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
+    """Return the disturbances that can be played: those that need no environment, and its own.
+
+    Raises:
+        DataError: when the environment does not say properly which they are.
+        SourceError: when it ends the process that it runs in.
+    """
+    work = _work("disturbances", bundle, [job], "", away=context.launcher != PROCESSES)
+    who = launcher(context.launcher, context.workers)
+    (own,) = who.answers(work, context.tell, lambda _number, _answer: None, context.notes.append)
+    if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
+        raise DataError("The process that asked the environment for its disturbances did not answer with names.")
+    return (*OWN, *(kind for kind in own if kind not in OWN))
+
+
+def _work(
+    function: str,
+    bundle: Bundle,
+    jobs: Sequence[EpisodesJob],
+    engine: str,
+    preload: Sequence[str] = (),
+    last: str = "",
+    *,
+    away: bool = False,
+) -> Work:
+    path = str(bundle.path.absolute())
+    folders: tuple[Folder, ...] = ()
+    about = jobs[0].environment.rpartition(":")[0]
+    if away:
+        recorded = sorted(name for name in bundle.manifest.files if not name.startswith(RECORDINGS))
+        folders = (Folder(path, (MANIFEST, DIGEST, *recorded)), *_placed(jobs[0])[1])
+        jobs = [_placed(job)[0] for job in jobs]
+    requests = [to_json(Request(path, engine, play.STEP_LIMIT, job)) for job in jobs]
+    return Work(f"{HERE}:{function}", requests, about, preload, last and f"{HERE}:{last}", folders)
+
+
+def _placed(job: EpisodesJob) -> tuple[EpisodesJob, tuple[Folder, ...]]:
+    """Return a job that names its environment wherever it runs, and the folder that this lies in.
+
+    A policy's folder is needed as a whole; where the file alone was named, the one that it is in.
+    """
+    folder = Path(job.folder)
+    file = factory_file(job.environment, folder)
+    if file is None:
+        return job, ()
+    if job.folder not in ("", ".") and file.is_relative_to(folder.resolve()):
+        whole = folder.resolve()
+        return replace(job, folder=str(whole)), (Folder(str(whole)),)
+    function = job.environment.rpartition(":")[2]
+    return replace(job, environment=f"{file}:{function}"), (Folder(str(file.parent)),)
+
+
+def _outcomes(answer: Any, job: EpisodesJob) -> Outcomes:
+    """Return what a child says of the episodes of a job."""
+    try:
+        outcomes = from_json(Played, answer).outcomes
+    except ValueError as error:
+        raise DataError(f"The process that played '{job.task}' did not answer with episodes: {error}.") from error
+    if [(outcome.task, outcome.seed) for outcome in outcomes] != [(job.task, seed) for seed in job.seeds]:
+        raise DataError(f"The process that played '{job.task}' answered with other episodes.")
+    return outcomes
+
+
+class _Kept:
+    """The outcomes of an interrupted run of the same command, as far as nothing that decides them has changed."""
+
+    def __init__(self, bundle: Bundle, engine: str, jobs: Sequence[EpisodesJob], context: Context) -> None:
+        self.found: dict[int, Outcomes] = {}
+        self._context = context
+        self._store = None if context.kept is None or jobs[0].record else context.kept
+        if self._store is None:
+            return
+        around = circumstances(bundle, engine, jobs[0])
+        self._keys = [key_of(around, job) for job in jobs]
+        for number, job in enumerate(jobs):
+            with contextlib.suppress(DataError):  # not what that job gives: played again
+                if (value := self._store.get(self._keys[number])) is not None:
+                    self.found[number] = _outcomes(value, job)
+        taken = sum(map(len, self.found.values()))
+        self._store.taken += taken
+        self._store.asked += sum(len(job.seeds) for job in jobs)
+        if taken:
+            context.tell(f"{taken} episodes are of an interrupted run", None)
+
+    def put(self, number: int, outcomes: Outcomes) -> None:
+        """Keep the outcomes of a job."""
+        if self._store is not None:
+            self._store.put(self._keys[number], to_json(Played(outcomes)))
+
+    def say(self) -> None:
+        """Say it where outcomes cannot be kept."""
+        if self._store is not None and self._store.problem:
+            self._context.tell(self._store.problem, None)

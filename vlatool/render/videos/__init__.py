@@ -1,0 +1,1 @@
+"""Formats of videos: one file each, its name is the suffix."""

@@ -1,0 +1,118 @@
+"""Who computes jobs: children of this process, or the workers of an existing engine on several machines; a file each.
+
+A launcher knows nothing of episodes: it calls a function of vlatool with one request after the other, each in a child
+process (``vlatool.user_code.children``), and hands the answers back in the order of the requests, whoever gave them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vlatool import registry
+from vlatool.errors import PluginError, UsageError, nearest
+
+KIND = "workers"
+PROCESSES = "processes"
+"""The launcher that is there without any other package."""
+Tell = Callable[[str, float | None], None]
+Done = Callable[[int, Any], None]
+Note = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Folder:
+    """A folder whose path requests name; a worker on another machine is sent its files.
+
+    Args:
+        path: Absolute.
+        names: Of the files below it that are needed; all but hidden ones when empty.
+    """
+
+    path: str
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Work:
+    """Jobs for several workers.
+
+    Args:
+        function: ``module:function`` of vlatool, called with each request, and ``tell``.
+        requests: JSON values. A text that is the path of one of the folders, or begins with it, is that of the copy
+            where the worker has one.
+        about: Whose code runs, for messages: ``environment.py``.
+        preload: Modules that the function needs.
+        last: Called in every child when all is done, with an empty request; nothing when empty.
+        folders: What the requests name.
+    """
+
+    function: str
+    requests: Sequence[Mapping[str, Any]]
+    about: str
+    preload: Sequence[str] = ()
+    last: str = ""
+    folders: tuple[Folder, ...] = ()
+
+
+class Workers:
+    """Base of every launcher.
+
+    Args:
+        count: How many workers at most; 0 for as many as there is place for.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def check(self) -> None:
+        """Raise a user error when there is nobody to compute; cheap."""
+
+    def answers(self, work: Work, tell: Tell, done: Done, note: Note) -> Generator[Any, None, None]:
+        """Yield the answer to every request, in order; close the iterator to end the workers.
+
+        Args:
+            work: What is to be done.
+            tell: For progress.
+            done: Called with the number of a request and its answer as soon as there is one, from any thread.
+            note: Called with what a reader of the results must know of the workers, a sentence.
+
+        Raises:
+            VlatoolError: what the function raises for a request, once all before it are answered.
+        """
+        raise PluginError(f"The launcher {type(self).__name__} has no method answers().", "define it")
+
+
+def launcher(name: str, count: int) -> Workers:
+    """Return the launcher of a name.
+
+    Raises:
+        UsageError: when there is none.
+    """
+    made: Workers = registry.load(KIND, name)(count)
+    return made
+
+
+def asked_for(text: str) -> tuple[str, int]:
+    """Read what a person wrote for workers: ``4`` processes, ``ray``, or ``ray:8``; return launcher and number.
+
+    Raises:
+        UsageError: for anything else.
+
+    Example:
+        >>> asked_for("4")
+        ('processes', 4)
+    """
+    name, _, count = text.partition(":") if not text.isdecimal() else (PROCESSES, "", text)
+    if name not in registry.names(KIND):
+        raise UsageError(f"--workers is '{text}'; it takes a number of processes, or {nearest(name, _others())}.")
+    if ":" in text or count:
+        if not count.isdecimal() or int(count) < 1:
+            raise UsageError(f"--workers is '{text}'; the number of workers is 1 or more.", f"--workers {name}:4")
+        return name, int(count)
+    return name, 0
+
+
+def _others() -> list[str]:
+    return [name for name in registry.names(KIND) if name != PROCESSES]

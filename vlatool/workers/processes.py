@@ -1,0 +1,17 @@
+"""Children of this process, on this machine."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+from vlatool.user_code.children import spread
+from vlatool.workers import Done, Note, Tell, Work, Workers
+
+
+class Processes(Workers):
+    """Several child processes, which a server forks that has imported the libraries once."""
+
+    def answers(self, work: Work, tell: Tell, done: Done, note: Note) -> Generator[Any, None, None]:
+        """Yield the answers in order."""
+        return spread(work.function, work.requests, max(1, self.count), tell, work.about, work.preload, work.last, done)
