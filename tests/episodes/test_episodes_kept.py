@@ -101,7 +101,10 @@ def test_it_goes_on_where_it_was_to_the_same_rows(bundles, world, cache, played)
     assert again.rows == whole.rows
     assert before >= 20
     assert played() == COUNT - 20, "what was finished is not played again"
-    assert again.warnings == (*whole.warnings, f"20 of the {COUNT} episodes are of an interrupted run of the same command.")
+    assert again.warnings == (
+        *whole.warnings,
+        f"20 of the {COUNT} episodes are of an interrupted run of the same command.",
+    )
     assert "20 episodes are of an interrupted run" in told
 
 
@@ -193,8 +196,8 @@ def test_what_another_run_uses_stays(tmp_path):
 
 
 def command(bundle: Bundle, world: Path, cache: Path) -> subprocess.Popen[str]:
-    words = ["evaluate", "closed-loop", str(bundle.path), "--environment", f"{world}/environment.py:make", "--tasks", "near",
-             "--tasks", "far", "--episodes", "400", "--workers", "1", "--json", "--raw"]  # fmt: skip
+    words = ["evaluate", "closed-loop", str(bundle.path), "--environment", f"{world}/environment.py:make", "--tasks",
+             "near", "--tasks", "far", "--episodes", "400", "--workers", "1", "--json", "--raw"]  # fmt: skip
     return subprocess.Popen(
         [sys.executable, "-m", "vlatool", *words], env={**os.environ, "VLATOOL_CACHE": str(cache)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
