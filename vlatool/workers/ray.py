@@ -12,6 +12,7 @@ import threading
 import warnings
 from collections import Counter, deque
 from collections.abc import Generator, Iterator
+from pathlib import Path
 from typing import Any
 
 from vlatool.errors import SourceError, TargetError, require, require_present
@@ -25,6 +26,7 @@ ADDRESS = "RAY_ADDRESS"
 ATTEMPTS = 3
 """How often a job is given to a worker that is lost with it, and how many workers in a row may not even begin."""
 WAIT_S = 5.0
+LOOPBACK = ("localhost", "127.0.0.1", "::1", "[::1]")
 HELLO = -1
 """In the place of a job's number: a worker that has just been asked for, or is being sent what it lacks."""
 START = "start one: ray start --head (on each other machine: ray start --address=HOST:PORT), or name it: RAY_ADDRESS"
@@ -65,7 +67,7 @@ def _connected() -> Any:
     if ray.is_initialized():
         return ray
     address = os.environ.get(ADDRESS) or "auto"
-    _refuse_unreachable(address)
+    _refuse_unreachable(address, ray.util.get_node_ip_address())
     try:
         with _undisturbed():
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
@@ -76,16 +78,27 @@ def _connected() -> Any:
     return ray
 
 
-def _refuse_unreachable(address: str) -> None:
-    """Say at once that nobody listens: Ray itself tries for a minute, and then ends the process."""
-    host, _, port = address.rpartition(":")
+def _refuse_unreachable(address: str, own: str) -> None:
+    """Say at once that nobody listens: Ray itself goes on trying for many minutes.
+
+    Args:
+        address: As Ray takes it; ``auto`` is what ``ray start`` noted on this machine.
+        own: This machine's address, which Ray takes for names of the loopback one.
+    """
+    where = address
+    if address == "auto":
+        with contextlib.suppress(OSError):
+            where = (Path(os.environ.get("RAY_TMPDIR", "/tmp")) / "ray" / "ray_current_cluster").read_text().strip()
+    host, _, port = where.rpartition(":")
     if not host or not port.isdecimal() or "/" in host:
         return
+    host = own if host in LOOPBACK else host.strip("[]")
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=WAIT_S):
+        with socket.create_connection((host, int(port)), timeout=WAIT_S):
             pass
     except (OSError, OverflowError) as error:
-        raise TargetError(f"No Ray cluster answers at {ADDRESS}={address}: {error}.", START) from error
+        told = f"No Ray cluster answers at {where} ({ADDRESS}={address}, looked for at {host}): {error}."
+        raise TargetError(told, START) from error
 
 
 @contextlib.contextmanager

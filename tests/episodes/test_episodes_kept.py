@@ -1,0 +1,224 @@
+"""A run of episodes that is interrupted goes on where it was, and believes nothing that is not what it was."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests._reach import GOOD, TREMBLES, bundle_of
+from vlatool.bundle.bundle import Bundle
+from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.files.work import Store, forget_all
+from vlatool.report import Report
+from vlatool.stage.base import Context
+from vlatool.stage.cache import contents, prune
+from vlatool.stage.run import cached_measure
+
+NOTED = """
+    def reset(self, *, seed=None):
+        with open(__import__("os").environ["PLAYED"], "a") as stream:
+            stream.write(f"{seed} ")
+"""
+COUNT = 40
+"""Episodes of an evaluation, in two tasks: four jobs."""
+
+
+@pytest.fixture(scope="module")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Bundle]:
+    folder = tmp_path_factory.mktemp("kept")
+    return {name: bundle_of(folder / name, kind) for name, kind in {"good": GOOD, "trembles": TREMBLES}.items()}
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("VLATOOL_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def world(bundles: dict[str, Bundle], tmp_path: Path) -> Path:
+    """The folder of an environment that notes each seed in a file elsewhere, see ``played``."""
+    code = (bundles["good"].path.parent / "policy/environment.py").read_text()
+    folder = tmp_path / "world"
+    folder.mkdir()
+    noted = code.replace("\n    def reset(self, *, seed=None):\n", NOTED)
+    (folder / "environment.py").write_text(noted)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def played(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+    """A function that says how many episodes were begun by processes that were started since it was asked before."""
+    places = [tmp_path / "played-0"]
+    monkeypatch.setenv("PLAYED", str(places[-1]))
+
+    def more() -> int:
+        count = len(places[-1].read_text().split()) if places[-1].exists() else 0
+        places.append(tmp_path / f"played-{len(places)}")
+        monkeypatch.setenv("PLAYED", str(places[-1]))
+        return count
+
+    return more
+
+
+def taken_of(report: Report) -> tuple[int, int]:
+    """Return how many episodes a report says are of an interrupted run, and of how many."""
+    (noted,) = [warning for warning in report.warnings if "interrupted run of the same command" in warning]
+    taken, asked = (int(word) for word in noted.split() if word.isdigit())
+    return taken, asked
+
+
+def evaluation(world: Path, **options: object) -> ClosedLoop:
+    asked = {"environment": f"{world}/environment.py:make", "tasks": ("near", "far"), "episodes": COUNT, **options}
+    return ClosedLoop(**asked)
+
+
+def interrupted_after(stage: ClosedLoop, bundle: Bundle, jobs: int) -> None:
+    """Run an evaluation until so many jobs are done."""
+    done: list[str] = []
+
+    def tell(what: str, _share: float | None) -> None:
+        done.extend([what] * (" succeed (" in what))
+        if len(done) == jobs:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stage.run(bundle, Context(tell, unfinished=[]))
+
+
+def run(stage: ClosedLoop, bundle: Bundle, told: list[str] | None = None) -> Report:
+    return stage.run(bundle, Context(lambda what, _: (told if told is not None else []).append(what), unfinished=[]))
+
+
+def test_it_goes_on_where_it_was_to_the_same_rows(bundles, world, cache, played):
+    stage = evaluation(world)
+    whole = stage.run(bundles["good"], Context())
+    assert played() == COUNT
+    interrupted_after(stage, bundles["good"], 2)
+    played()
+    told: list[str] = []
+    again = run(stage, bundles["good"], told)
+    assert again.rows == whole.rows
+    taken, asked = taken_of(again)
+    assert (taken >= 20, asked) == (True, COUNT)
+    assert played() == COUNT - taken, "what was finished is not played again"
+    assert again.warnings[:-1] == whole.warnings
+    assert f"{taken} episodes are of an interrupted run" in told
+
+
+def test_a_comparison_goes_on_with_its_controls_and_disturbances(bundles, world, cache, played):
+    stage = evaluation(world, baseline=bundles["good"].path, disturb=("delay",), latency_in_the_loop=True)
+    interrupted_after(stage, bundles["trembles"], 14)
+    played()
+    report = run(stage, bundles["trembles"])
+    taken, asked = taken_of(report)
+    assert taken > 2 * COUNT, "of both bundles and of the controls"
+    assert played() == asked - taken
+
+
+def test_without_a_place_to_forget_nothing_is_kept(bundles, world, cache, played):
+    evaluation(world).run(bundles["good"], Context())
+    assert not cache.exists()
+
+
+@pytest.mark.parametrize("what", ["code", "data", "other bundle", "another option"])
+def test_nothing_is_taken_where_something_else_decides(bundles, world, cache, played, what):
+    (world / "levels.bin").write_bytes(b"1")
+    stage, bundle = evaluation(world), bundles["good"]
+    interrupted_after(stage, bundle, 3)
+    played()
+    if what == "code":
+        (world / "environment.py").write_text((world / "environment.py").read_text() + "\n# another\n")
+    elif what == "data":
+        (world / "levels.bin").write_bytes(b"22")
+    elif what == "other bundle":
+        bundle = bundles["trembles"]
+    else:
+        stage = evaluation(world, first_seed=7)
+    report = run(stage, bundle)
+    assert played() == COUNT
+    assert not any("interrupted" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("damage", ["half", "emptied", "edited", "another's"])
+def test_what_is_damaged_is_played_again(bundles, world, cache, played, damage):
+    stage = evaluation(world)
+    whole = stage.run(bundles["good"], Context())
+    interrupted_after(stage, bundles["good"], 4)
+    first, second, *_ = sorted(cache.glob("streams/*/answer-*.json"))
+    content = first.read_bytes()
+    new = {"half": content[: len(content) // 2], "emptied": b"", "edited": content.replace(b"true", b"false"),
+           "another's": second.read_bytes()}[damage]  # fmt: skip
+    assert new != content
+    first.write_bytes(new)
+    played()
+    again = run(stage, bundles["good"])
+    assert again.rows == whole.rows
+    assert played() == 10
+
+
+def test_a_place_that_cannot_be_written_costs_nothing_but_a_sentence(bundles, world, cache):
+    cache.mkdir()
+    (cache / "streams").write_text("a file")
+    told: list[str] = []
+    report = run(evaluation(world), bundles["good"], told)
+    assert report.rows == evaluation(world).run(bundles["good"], Context()).rows
+    (noted,) = [warning for warning in report.warnings if "cannot be kept" in warning]
+    assert "VLATOOL_CACHE" in noted
+    assert noted in told
+
+
+def test_who_writes_the_result_removes_what_was_kept(bundles, world, cache):
+    report = cached_measure(evaluation(world), bundles["good"], cache, Context())
+    assert list((cache / "streams").iterdir()) == []
+    interrupted_after(evaluation(world), bundles["good"], 2)
+    (entry,) = [entry for entry in contents(cache).entries if entry.what == "unfinished work"]
+    assert contents(cache).unknown == ()
+    os.utime(cache / entry.name / "lock", (0, 0))
+    assert entry.name in {removed.name for removed in prune(cache, older_than_s=3600).entries}
+    assert cached_measure(evaluation(world), bundles["good"], cache, Context()) == report
+
+
+def test_what_another_run_uses_stays(tmp_path):
+    with Store.open(tmp_path / "work") as one:
+        one.put("a", [1.5, "x"])
+        forget_all([tmp_path / "work"])
+        assert one.get("a") == [1.5, "x"]
+        with Store.open(tmp_path / "work") as other:
+            assert other.get("a") == [1.5, "x"]
+            assert other.get("b") is None
+    forget_all([tmp_path / "work"])
+    assert not (tmp_path / "work").exists()
+
+
+def command(bundle: Bundle, world: Path, cache: Path) -> subprocess.Popen[str]:
+    words = ["evaluate", "closed-loop", str(bundle.path), "--environment", f"{world}/environment.py:make", "--tasks",
+             "near", "--tasks", "far", "--episodes", "400", "--workers", "1", "--json", "--raw"]  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-m", "vlatool", *words], env={**os.environ, "VLATOOL_CACHE": str(cache)}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+
+
+def test_a_command_that_is_killed_goes_on_to_the_same_rows(bundles, world, cache, tmp_path, played):
+    whole, errors = command(bundles["good"], world, tmp_path / "other").communicate()
+    assert json.loads(whole)["verdict"] == "info", errors
+    assert played() == 400
+    killed = command(bundles["good"], world, cache)
+    while not (kept := list(cache.glob("streams/*/answer-*.json"))) and killed.poll() is None:
+        time.sleep(0.005)
+    os.killpg(killed.pid, signal.SIGKILL)
+    killed.communicate()
+    assert 0 < len(kept) < 40
+    again, _ = command(bundles["good"], world, cache).communicate()
+    assert json.loads(again)["rows"] == json.loads(whole)["rows"]
+    assert "interrupted run" in str(json.loads(again)["warnings"])
+    assert list((cache / "streams").iterdir()) == []
