@@ -59,7 +59,7 @@ def test_the_complete_policy_runs_as_the_guide_shows_it(tmp_path: Path, monkeypa
 def test_the_environment_guide_runs_as_it_stands(tmp_path: Path, monkeypatch, vlatool):
     pytest.importorskip("gymnasium")
     monkeypatch.chdir(tmp_path)
-    *_, (line, out) = follow(vlatool, "environment.md", shown=("yaml", "python"))
+    *_, (line, out) = follow(vlatool, "environment.md", shown=("yaml", "python", "text"))
     assert "closed-loop" in line
     assert re.search(r"100\.0% of 10 episodes succeed", out), out
 

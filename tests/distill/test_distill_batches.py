@@ -91,9 +91,9 @@ def test_they_are_raw_observations(policy_dir: Path, tmp_path: Path, monkeypatch
     session = importlib.import_module("vlatool.training.session")
     seen: dict[str, Any] = {}
 
-    def label(folder: Path, names: list[str], *rest: Any) -> None:
+    def label(folder: Path, names: list[str], *rest: Any, **options: Any) -> list[str]:
         seen.update({name: np.load(folder / f"{name}.npy") for name in names})
-        written(folder, names, *rest)
+        return written(folder, names, *rest, **options)
 
     written = session.label
     monkeypatch.setattr(session, "label", label)

@@ -24,6 +24,7 @@ from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune import latency
 from vlatool.prune._clock import BoardClock, Clock
 from vlatool.prune._prices import Stack, edits_of, is_gone
+from vlatool.prune._trials import undisturbed
 from vlatool.prune._units import Group
 from vlatool.prune.latency import LatencyPruning
 from vlatool.rebuild.rebuild import rebuild
@@ -153,10 +154,29 @@ def test_the_luckiest_run_of_the_whole_policy_is_not_what_it_takes(
     assert 0.95 * target <= clock.ms(read_edits(pruned)) <= 1.01 * target
 
 
+def test_kernels_that_like_some_widths_better_do_not_end_the_search(
+    counted: None, deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """What is aimed at takes 6 % more than it should, and so does every other choice around it."""
+
+    class Choosy(Counted):
+        def ms(self, edits: Sequence[Edit]) -> float:
+            kept = sum(len(edit.keep) for edit in edits)
+            return super().ms(edits) * (1.06 if kept % 2 else 1.0)
+
+    monkeypatch.setattr(latency, "Clock", Choosy)
+    clock = Choosy(deep)
+    for share in (0.6, 0.65, 0.7, 0.75, 0.8):
+        target = share * clock.ms(())
+        stage = build_stage("prune.latency", {"target_ms": target, **FINE})
+        pruned = run_transform(stage, deep, tmp_path / f"o{share}", Context())
+        assert 0.96 * target <= clock.ms(read_edits(pruned)) <= target
+
+
 def test_runs_that_were_held_up_say_nothing_of_the_whole_policy():
-    assert latency.undisturbed([10.0]) == 10
-    assert latency.undisturbed([10.0, 9.8, 10.1, 25.0, 31.0, 40.0, 18.0]) == 10
-    assert latency.undisturbed([30.0, 10.0, 30.0]) == 10
+    assert undisturbed([10.0]) == 10
+    assert undisturbed([10.0, 9.8, 10.1, 25.0, 31.0, 40.0, 18.0]) == 10
+    assert undisturbed([30.0, 10.0, 30.0]) == 10
 
 
 def test_one_round_that_was_held_up_is_corrected_by_the_next(

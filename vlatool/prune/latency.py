@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING
 
 from pydantic import Field, model_validator
@@ -34,6 +33,7 @@ from vlatool.prune._prices import (
 )
 from vlatool.prune._ranking import Ranking
 from vlatool.prune._selection import Selection, protected_parts
+from vlatool.prune._trials import Trials
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.prune.depth import PROTECTED
 from vlatool.stage.base import Context
@@ -46,10 +46,6 @@ AIM, CLOSE = 0.98, 0.04
 """The share of the asked latency that is aimed at, and how far below it a result may stay."""
 ROUNDS = 8
 """Of choosing and measuring, at most."""
-LEAST_GONE = 0.999
-"""Share of the latency of the whole policy that is left at most: something goes."""
-HELD_UP = 1.1
-"""Times the least latency of the whole policy from which on a run is taken to have been slowed by other programs."""
 MOST_AT_ONCE = 1.5
 """Factor by which a result may change what is aimed at: one that was disturbed is corrected by the next."""
 
@@ -196,45 +192,28 @@ class LatencyPruning(ModuleStage):
         whole, prices = measured_prices(groups, blocks, work, clock)
         self._refuse_met(whole)
         choice = _Choice(groups, blocks, work, prices, self.least)
-        wholes, wanted, tried = [whole], 1.0, list[float]()
+        trials = Trials(clock, [whole])
+        wanted = 1.0
         for number in range(ROUNDS):
-            goal = min(wanted * AIM * self.target_ms / undisturbed(wholes), LEAST_GONE) * whole
-            edits = choice.until(whole, goal, self.target_ms)
-            ms = _share(clock, edits, wholes) * undisturbed(wholes)
-            if self._is_met(ms):  # once may be luck
-                ms = (ms + _share(clock, edits, wholes) * undisturbed(wholes)) / 2
-            tried.append(ms)
+            goal = AIM * self.target_ms / trials.undisturbed * whole
+            edits = trials.untried(lambda share: choice.until(whole, share, self.target_ms), wanted * goal, whole)
+            if self._is_met(trials.measured(edits)):  # once may be luck
+                trials.measured(edits)
+            ms = trials.seen(edits, wanted)
             context.tell(f"{ms:.3g} ms of {self.target_ms:g}", (number + 1) / ROUNDS)
             if self._is_met(ms):
                 return edits
-            wanted *= min(MOST_AT_ONCE, max(1 / MOST_AT_ONCE, AIM * self.target_ms / ms))
+            next_one = AIM * self.target_ms / trials.for_each
+            wanted = min(MOST_AT_ONCE * wanted, max(wanted / MOST_AT_ONCE, next_one))
         how, quiet = ("predicted", "") if self.board else ("measured", "let nothing else run meanwhile; ")
         raise DataError(
             f"The latency of {self.target_ms:g} ms was not met within {CLOSE:.0%}; {how}: "
-            f"{', '.join(f'{ms:.3g}' for ms in tried)} ms.",
+            f"{', '.join(f'{ms:.3g}' for ms in trials.tried)} ms.",
             f"{quiet}let units go one by one: --multiple 1",
         )
 
     def _is_met(self, ms: float) -> bool:
         return (1 - CLOSE) * self.target_ms <= ms <= self.target_ms
-
-
-def _share(clock: Clock, edits: Sequence[Edit], wholes: list[float]) -> float:
-    """Return what edits leave of the latency, a share; add what the whole policy took meanwhile to the others.
-
-    Both take turns in one run, so that other programs slow both down: their ratio says what it is without them.
-    """
-    whole, (ms,) = clock.times([edits])
-    wholes.append(whole)
-    return ms / whole
-
-
-def undisturbed(wholes: Sequence[float]) -> float:
-    """Return what the whole policy takes where nothing else runs, in ms: the median of the runs that were not held up.
-
-    The least of several runs would be one on which chance smiled, and what is pruned by it would miss its target.
-    """
-    return median(ms for ms in wholes if ms <= HELD_UP * min(wholes))
 
 
 def _edits_chosen(text: str) -> tuple[Edit, ...]:
