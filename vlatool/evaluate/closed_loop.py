@@ -89,8 +89,13 @@ class ClosedLoop(Measure):
     @field_validator("strength", mode="before")
     @classmethod
     def _split(cls, value: Any) -> Any:
-        parts = value.split(",") if isinstance(value, str) else value
-        return [parts] if isinstance(parts, int | float) else parts
+        if not isinstance(value, str):
+            return [value] if isinstance(value, int | float) else value
+        try:
+            return [float(part) for part in value.split(",")]
+        except ValueError:
+            message = "numbers, such as 1 or 0.5,1,2, are allowed"
+            raise PydanticCustomError("strength", message) from None
 
     @field_validator("strength")
     @classmethod

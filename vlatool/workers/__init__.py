@@ -109,7 +109,8 @@ def asked_for(text: str) -> tuple[str, int]:
         raise UsageError(f"--workers is '{text}'; it takes a number of processes, or {nearest(name, _others())}.")
     if ":" in text or count:
         if not count.isdecimal() or int(count) < 1:
-            raise UsageError(f"--workers is '{text}'; the number of workers is 1 or more.", f"--workers {name}:4")
+            raise UsageError(f"--workers is '{text}'; the number of workers is 1 or more.",
+                             "--workers 4" if name == PROCESSES else f"--workers {name}:4")  # fmt: skip
         return name, int(count)
     return name, 0
 
