@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
@@ -34,9 +34,6 @@ from vlatool.training.rounds import Counted, label, next_round, scene_of, write_
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
 from vlatool.training.teacher import Teacher
 from vlatool.training.yielded import write_yielded
-
-if TYPE_CHECKING:
-    pass
 
 ROUND = "round-{:03d}.json"
 """File that says who acted in a round, and how well."""
