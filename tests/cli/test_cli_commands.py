@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -434,6 +435,15 @@ def test_progress_is_plain_lines_away_from_a_terminal_and_one_for_each_kind(caps
     told = capsys.readouterr()
     assert told.err == "... 10 episodes, 80.0% succeed\n... measuring\n"
     assert told.out == ""
+
+
+def test_numbers_of_a_long_work_are_told_again_every_half_minute(capsys, monkeypatch):
+    seconds = iter([0.0, 29.0, 31.0, 32.0])
+    monkeypatch.setattr("vlatool.cli._console.time", SimpleNamespace(monotonic=lambda: next(seconds)))
+    with progress() as context:
+        for count in (10, 20, 30, 40):
+            context.tell(f"{count} of 100 episodes", count / 100)
+    assert capsys.readouterr().err == "... 10 of 100 episodes\n... 30 of 100 episodes\n"
 
 
 def test_progress_is_a_bar_on_a_terminal(monkeypatch):

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import sys
+import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -29,6 +30,8 @@ from vlatool.workers import PROCESSES, asked_for, launcher
 
 PLACES = ("-o", "--output", "--cache", "--junit", "--video")
 """Options that name a place to write to: paths are not recorded."""
+EVERY = 30.0
+"""Seconds between plain lines that differ in their numbers alone."""
 
 
 def command_line() -> str:
@@ -100,12 +103,14 @@ def progress(workers: int = 1, launched_by: str = PROCESSES) -> Iterator[Context
 
 
 def _plain_lines() -> Tell:
-    last = [""]
+    """Write what is new at once, and only numbers that changed every ``EVERY`` seconds."""
+    last, told = "", 0.0
 
     def tell(what: str, share: float | None) -> None:
-        kind = re.sub(r"[\d.,%]+", "", what)
-        if kind != last[0]:
-            last[0] = kind
+        nonlocal last, told
+        kind, now = re.sub(r"[\d.,%]+", "", what), time.monotonic()
+        if kind != last or now - told >= EVERY:
+            last, told = kind, now
             with contextlib.suppress(OSError):  # its reader is gone: no reason to stop
                 typer.echo(f"... {one_line(what)}", err=True)
 
