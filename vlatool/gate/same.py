@@ -8,9 +8,11 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
-from vlatool.errors import BundleError, nearest
+from vlatool.errors import BundleError, GraphError, nearest
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
+from vlatool.graph.draws import drawing
+from vlatool.graph.files import read
 
 MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode")
 """What a robot relies on; files of statistics and tokenizers may differ."""
@@ -24,6 +26,7 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
     Raises:
         BundleError: when a bundle has no graph or lacks the baseline's golden action, or the two have other inputs or
             outputs, another rate, or keep, draw or repeat something else.
+        GraphError: when a graph draws random numbers of its own, or its weights cannot be read.
         DataError: when accuracy is claimed and there is nothing to measure it on.
     """
     for bundle in (candidate, baseline):
@@ -37,8 +40,22 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
         raise BundleError(f"{candidate.path} and {baseline.path} are no versions of one policy: {differs}.")
     if theirs.golden and not mine.golden:
         raise BundleError(f"{candidate.path} has no golden action, which the baseline has.", "make the bundle again")
+    for bundle in (candidate, baseline):
+        _refuse_draws(bundle)
     if gate.accuracy:
         accuracy.data_of(baseline, gate.accuracy)
+
+
+def _refuse_draws(bundle: Bundle) -> None:
+    """Refuse graphs that draw random numbers: no two runs can be held against each other, and draws count calls."""
+    for name, graph in bundle.manifest.graphs.items():
+        if operators := drawing(read(bundle.path / graph.file, weights=False)):
+            raise GraphError(
+                f"The graph '{name}' of {bundle.path} draws random numbers ({', '.join(operators)}): what it answers "
+                "at one call says nothing about the next.",
+                "declare the noise in the program of policy.yaml, and make the bundle again with vlatool; "
+                "export refuses such graphs, too",
+            )
 
 
 def _tensors(mine: Manifest, theirs: Manifest) -> str:

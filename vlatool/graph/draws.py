@@ -15,6 +15,10 @@ DRAWING = {
     "Bernoulli": "uniform", "Multinomial": "uniform",
 }  # fmt: skip
 """ONNX operator that draws -> what a program would draw in its place."""
+DROPPING = {"Dropout": 2, "BiasDropout": 4, "BitmaskDropout": 2, "BitmaskBiasDropout": 4}
+"""Operator that draws where its input of this number, ``training_mode``, says so."""
+SAMPLING = ("Sampling",)
+"""Operators of ONNX Runtime that draw what they give."""
 GUIDE = 'see "Noise" in docs/guides/your-own-policy.md'
 
 
@@ -70,6 +74,22 @@ def refuse_drawing_file(model: Any, path: Path) -> None:
         "program: [{graph: main, gives: {...}, "
         f"{_declared(draws, [shapes.get(node.output[0], ()) for node in draws])}}}]{index}; {GUIDE}",
     )
+
+
+def drawing(model: Any) -> tuple[str, ...]:
+    """Return the operators of an ``onnx.ModelProto`` that draw random numbers, also in branches, loops and functions.
+
+    The numbers of a session follow from their seed: whoever knows them counts inferences with them.
+    """
+    nodes = [*_nodes(model.graph.node), *(node for value in model.functions for node in _nodes(value.node))]
+    return tuple(dict.fromkeys(node.op_type for node in nodes if _draws(node)))
+
+
+def _draws(node: Any) -> bool:
+    """Return whether a node draws; a dropout that may be told to counts, since what tells it may be computed."""
+    place = DROPPING.get(node.op_type)
+    dropping = place is not None and len(node.input) > place and bool(node.input[place])
+    return dropping or node.op_type in DRAWING or node.op_type in SAMPLING
 
 
 def _nodes(nodes: Sequence[Any]) -> Iterator[Any]:

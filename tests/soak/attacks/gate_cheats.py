@@ -52,6 +52,7 @@ from gate_graphs import (
     above,
     any_structure,
     any_text,
+    drawn_later,
     large_when,
     slow_when,
     text_is_none_of,
@@ -101,6 +102,7 @@ CHEATS: dict[str, Cheat] = {
     "slow after 200 inferences": Cheat("tiny", counts(200, slow_when), FAST),
     "slow until 20 inferences": Cheat("tiny", counts(20, lambda when: slow_when(when, then=False)), FAST),
     "garbage after 8 inferences": Cheat("tiny", counts(8, wrong_when), FAST),
+    "garbage after 2000 inferences, counted by drawing": Cheat("tiny", of(wrong_when(drawn_later(2000))), FAST),
     "slow after 10 inferences, in a value that is kept anyway": Cheat(
         "recurrent", of(slow_when(remembered_count(0.95))), TIMED, "latency"
     ),

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from vlatool.bundle.bundle import Bundle, seal
@@ -244,6 +245,31 @@ def counting(condition_from: float, act: Callable[[Change], Change]) -> Change:
         ])  # fmt: skip
 
     return act(count)
+
+
+def drawn_later(calls: int) -> Change:
+    """A condition that holds once a session has drawn numbers that are not among its first: a counter without a value.
+
+    The seed of a draw fixes all numbers of a session, and the first of them are in a table.
+    """
+    draw = helper.make_node("RandomUniform", [], ["drawn"], shape=[1], seed=7.0, dtype=TensorProto.FLOAT)
+    given = helper.make_tensor_value_info("drawn", TensorProto.FLOAT, [1])
+    alone = helper.make_model(helper.make_graph([draw], "draw", [], [given]), ir_version=9,
+                              opset_imports=[helper.make_opsetid("", 18)])  # fmt: skip
+    session = onnxruntime.InferenceSession(alone.SerializeToString(), providers=["CPUExecutionProvider"])
+    first = np.array([session.run(None, {})[0][0] for _ in range(calls)], np.float32)
+
+    def add(model: onnx.ModelProto) -> None:
+        constant(model, "cond_table", first)
+        model.graph.node.extend([
+            draw,
+            helper.make_node("Sub", ["cond_table", "drawn"], ["cond_difference"]),
+            helper.make_node("Abs", ["cond_difference"], ["cond_far"]),
+            helper.make_node("ReduceMin", ["cond_far"], ["cond_nearest"], keepdims=0),
+            helper.make_node("Greater", ["cond_nearest", constant(model, "cond_zero", np.float32(0))], ["cond"]),
+        ])  # fmt: skip
+
+    return add
 
 
 def counted(manifest: Manifest) -> dict[str, Any]:
