@@ -52,3 +52,20 @@ def test_what_was_measured_on_the_board_decides(float_bundle, monkeypatch, tmp_p
     assert after.note.startswith("ort_cpu, power mode default: with your own measurement on this device")
     assert after.value > 1.5 * before.value
     assert json.loads((tmp_path / "raspberry-pi-5.json").read_text())["measured"][0]["work"] == work
+
+
+def test_a_bundle_is_predicted_in_an_engine_that_runs_it(float_bundle, int8_bundle):
+    """ONNX Runtime's integer products do not run in TensorRT, which the board prefers."""
+    board = load_profile("jetson-orin-nano")
+    notes = [predictions(board, bundle)[0].note for bundle in (float_bundle, int8_bundle)]
+    assert board.engine == "ort_tensorrt"
+    assert notes[0].startswith("ort_tensorrt")
+    assert notes[1].startswith("ort_cpu")
+
+
+def test_what_no_engine_runs_is_not_predicted(int8_bundle):
+    board = load_profile("jetson-orin-nano")
+    alone = board.model_copy(update={"engines": {"ort_tensorrt": board.engines["ort_tensorrt"]}})
+    found, *_ = predictions(alone, int8_bundle)
+    assert math.isnan(found.value)
+    assert found.note == "no engine of jetson-orin-nano runs this bundle, whose graphs are int8"

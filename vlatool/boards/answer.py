@@ -20,7 +20,7 @@ from vlatool.graph.stored import digest, read_workload, refuse_other, write_work
 from vlatool.graph.workload import PRECISIONS, Workload, workload
 from vlatool.hardware.platforms import load_platform
 from vlatool.hardware.profile import Profile, load_profile, names
-from vlatool.latency_model.board import Candidate, outcomes, quantized_as
+from vlatool.latency_model.board import Candidate, engine_for, outcomes, quantized_as
 from vlatool.latency_model.measured import measured_questions
 from vlatool.latency_model.model import LatencyModel, shipped
 from vlatool.machine.host import cache_directory
@@ -198,11 +198,12 @@ def simulated(
     profile = load_profile(board)
     name = mode or profile.default_mode
     profile.mode(name)
-    candidate = Candidate(profile, name, engine or profile.engine, precision)
-    if precision and precision not in candidate.figures.dtypes:
-        raise UsageError(f"--precision is '{precision}'; {nearest(precision, candidate.figures.dtypes)}.")
+    asked = Candidate(profile, name, engine or profile.engine, precision)
+    if precision and precision not in asked.figures.dtypes:
+        raise UsageError(f"--precision is '{precision}'; {nearest(precision, asked.figures.dtypes)}.")
     bundle = opened(source, context)
     spec, load = bundle.manifest.spec, counted(bundle, context)
+    candidate = asked if engine or precision else replace(asked, engine=_engine_of(bundle, profile, load))
     model = shipped().conditioned(measured_questions())
     outcome = outcomes([candidate], load, model)[0]
     if not outcome.latency.known:
@@ -222,6 +223,21 @@ def simulated(
         "timeline": [*timeline(phases)],
         "changes": [_change(change) for change in changes(candidate, load, model)],
     }  # fmt: skip
+
+
+def _engine_of(bundle: Bundle, profile: Profile, load: Workload) -> str:
+    """Return the engine of a board that runs a bundle.
+
+    Raises:
+        DataError: when none does.
+    """
+    if engine := engine_for(profile, load, bundle.manifest.engine):
+        return engine
+    raise DataError(
+        f"No engine of {profile.name} runs {bundle.path}, whose graphs are {quantized_as(load)}; it has "
+        f"{', '.join(profile.engines)}.",
+        "quantize for the board: vlatool quantize SOURCE --profile BOARD; or name another --profile",
+    )
 
 
 FIXED_SHAPES = (

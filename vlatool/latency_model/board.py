@@ -124,6 +124,21 @@ def candidates(profile: Profile, load: Workload, modes: Iterable[str] | None = N
     ]
 
 
+def engine_for(profile: Profile, load: Workload, own: str = "") -> str:
+    """Return the engine of a board that a policy runs in: its own, the preferred one, or the first that can run it.
+
+    Args:
+        profile: The board.
+        load: The policy.
+        own: The engine that its bundle was made for, if for one.
+
+    Returns:
+        Its name; empty where no engine of the board runs these graphs.
+    """
+    able = dict.fromkeys(way.engine for way in candidates(profile, load, [profile.default_mode]))
+    return next((name for name in (own, profile.engine, *able) if name in able), "")
+
+
 def place_of(candidate: Candidate) -> Place:
     """Return what computes, at the clocks of the power mode."""
     profile, figures = candidate.profile, candidate.figures

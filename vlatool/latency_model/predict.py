@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.workload import workload
 from vlatool.hardware.profile import Profile
-from vlatool.latency_model.board import Candidate, Outcome, outcomes
+from vlatool.latency_model.board import Candidate, Outcome, engine_for, outcomes, quantized_as
 from vlatool.latency_model.measured import measured_questions
-from vlatool.latency_model.model import LEVEL, shipped
+from vlatool.latency_model.model import LEVEL, Predicted, shipped
 from vlatool.report import Measurement
 
 SHOWN = ("latency_p50", "memory", "energy")
@@ -19,12 +22,15 @@ def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Meas
     Args:
         profile: The board.
         bundle: With graphs.
-        engine: Which engine of the board runs it; the bundle's own when empty, and where the board has that.
+        engine: Which engine of the board runs it; when empty, the bundle's own, where the board has that, or the board's
+            preferred one, where it runs such graphs, or one that does.
     """
-    own = bundle.manifest.engine if bundle.manifest.engine in profile.engines else profile.engine
-    engine = engine or own
-    model = shipped().conditioned(measured_questions())
-    outcome = outcomes([Candidate(profile, profile.default_mode, engine)], workload(bundle), model)[0]
+    load, model = workload(bundle), shipped().conditioned(measured_questions())
+    engine = engine or engine_for(profile, load, bundle.manifest.engine)
+    outcome = outcomes([Candidate(profile, profile.default_mode, engine or profile.engine)], load, model)[0]
+    if not engine:
+        why = f"no engine of {profile.name} runs this bundle, whose graphs are {quantized_as(load)}"
+        outcome = replace(outcome, latency=Predicted(math.nan, why=why))
     return [measurement for measurement in numbers(outcome) if measurement.name in SHOWN]
 
 
