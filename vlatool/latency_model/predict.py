@@ -22,7 +22,7 @@ def predictions(profile: Profile, bundle: Bundle, engine: str = "") -> list[Meas
     Args:
         profile: The board.
         bundle: With graphs.
-        engine: Which engine of the board runs it; when empty, the bundle's own, where the board has that, or the board's
+        engine: Which engine of the board runs it; when empty, the bundle's own, where the board has that, or its
             preferred one, where it runs such graphs, or one that does.
     """
     load, model = workload(bundle), shipped().conditioned(measured_questions())
