@@ -59,10 +59,12 @@ class World:
     def step(self, action: Any) -> tuple[Mapping[str, Any], bool, Any]:
         """Take an action; return the next observation, whether the episode is over, and the info.
 
+        The environment gets a copy of it, and may write into that.
+
         Raises:
             DataError: when it does not give the five values of gymnasium.
         """
-        answer = self._environment.step(action)
+        answer = self._environment.step(action.copy() if isinstance(action, np.ndarray) else action)
         if not (isinstance(answer, tuple | list) and len(answer) == 5):
             raise DataError(
                 f"step() of {self._name} gives {_told(answer)}; it must give five values: observation, reward, "
