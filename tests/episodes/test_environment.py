@@ -70,6 +70,11 @@ BROKEN = {
     "nan": ("np.zeros(3)", "np.full(3, np.nan)", "'proprio' holds 3 NaN of 3 values", "sensor"),
     "no text": ('"go"', "3", "'instruction' is text; got int", "pass a str"),
     "many at once": (STEP, "return observation(), 1.0, np.zeros(2), np.zeros(2), {}", "2 episodes at once", "single"),
+    "terminated is a word": (STEP, STEP.replace("True, False", "'False', False"), "terminated of step() of the "
+                             "environment of task 'reach' is 'False'; allowed: true or false", "bool("),
+    "terminated is nan": (STEP, STEP.replace("True, False", "np.nan, True"), "terminated of step()", "bool("),
+    "truncated is None": (STEP, STEP.replace("True, False", "True, None"), "truncated of step() of the environment of task 'reach' is None", "bool("),
+    "truncated is 2": (STEP, STEP.replace("True, False", "False, np.array([2])"), "truncated of step()", "bool("),
     "raises": (STEP, "return [][1]", "failed at seed 7: IndexError: list index out of range", ""),
     "raises in reset": (RESET, "raise RuntimeError('no display')", "failed at seed 7: RuntimeError: no display", ""),
 }  # fmt: skip
@@ -101,6 +106,21 @@ def test_a_bare_observation_is_that_of_the_only_input():
     observation, over, _ = world.step(0)
     assert list(observation) == ["state"]
     assert over is True
+
+
+@pytest.mark.parametrize("value", [True, np.bool_(True), 1, 1.0, np.array(1), np.array([True]), [True]], ids=repr)
+def test_all_that_means_true_ends_an_episode_and_all_that_means_false_does_not(value):
+    class Told(Box):
+        flags = (False, False)
+
+        def step(self, action):
+            return np.arange(4.0), 0.0, *self.flags, {}
+
+    box = Told()
+    world = World(box, "any", ONE)
+    no = type(value)([0]) if isinstance(value, list) else value * 0
+    for box.flags, over in (((value, no), True), ((no, value), True), ((no, no), False)):
+        assert world.step(0)[1] is over
 
 
 def test_a_plain_gymnasium_environment_is_played_by_a_policy_with_one_input():
