@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,10 @@ from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
 from vlatool.episodes.disturbed import OWN
+from vlatool.episodes.faults import locate, under_way
 from vlatool.episodes.play import PRELOAD, RECORDINGS, EpisodesJob, Played, Request
 from vlatool.episodes.progress import Tally
-from vlatool.errors import DataError
+from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.messages import from_json, to_json
 from vlatool.module.factory import factory_file
 from vlatool.stage.base import Context
@@ -73,11 +74,34 @@ def _played(
     def done(at: int, answer: Any) -> None:
         kept.put(numbers[at], outcomes_of(answer, jobs[at]))
 
+    begun: set[str] = set()
+    ours = {under_way(job.task, seed) for job in jobs for seed in job.seeds}
+
+    def tell(what: str, share: float | None) -> None:
+        begun.add(what) if what in ours else context.tell(what, share)
+
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
-    answers = launcher(name, count).answers(work, context.tell, done, context.notes.append)
+    answers = launcher(name, count).answers(work, tell, done, context.notes.append)
     with contextlib.closing(answers):
-        for job, answer in zip(jobs, answers, strict=True):
+        for job in jobs:
+            with _located(job, begun, away=name != PROCESSES):
+                answer = next(answers)
             yield outcomes_of(answer, job)
+        next(answers, None)  # what is open is closed
+
+
+@contextlib.contextmanager
+def _located(job: EpisodesJob, begun: Set[str], *, away: bool) -> Iterator[None]:
+    """Let what comes instead of the outcomes of a job name its task, and the seed that was under way."""
+    try:
+        yield
+    except VlatoolError as error:
+        seed = next((seed for seed in reversed(job.seeds) if under_way(job.task, seed) in begun), None)
+        if seed is not None or isinstance(error, DataError | SourceError):
+            known = seed is not None or any(f"seed {other}" in str(error.message) for other in job.seeds)
+            seeds = f"(one of the seeds {job.seeds[0]} to {job.seeds[-1]})" if away and not known else ""
+            locate(error, job.task, seed, seeds)
+        raise
 
 
 def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:

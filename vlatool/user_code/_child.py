@@ -1,7 +1,7 @@
 """The other side of ``children``: ``python -m vlatool.user_code._child FD`` is the server that forks the children.
 
 The server imports what its children need once, and never runs a user's code itself. It ends with its parent, each of
-its children with it, and with each child whatever that has started: the server adopts what is left behind, and kills it.
+its children with it, and with each child whatever that has started: the server adopts what is left, and kills it.
 """
 
 from __future__ import annotations
@@ -167,6 +167,8 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
     try:
         return {"result": _function(request["call"])(request["job"], tell)}
     except VlatoolError as error:
+        if os.environ.get("VLATOOL_DEBUG") and error.__cause__ is not None:
+            traceback.print_exc()
         return {"error": type(error).__name__, "message": str(error.message), "fix": str(error.fix)}
     except MemoryError:
         return {"memory": True}
