@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -14,8 +15,14 @@ from pathlib import Path
 import pytest
 
 from tests._reach import GOOD, TREMBLES, bundle_of
+from vlatool.accuracy.paired import Outcome
 from vlatool.bundle.bundle import Bundle
+from vlatool.episodes.jobs import outcomes_of
+from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Played
+from vlatool.errors import DataError
 from vlatool.evaluate.closed_loop import ClosedLoop
+from vlatool.files.edited import is_own, stamped
+from vlatool.files.messages import to_json
 from vlatool.files.work import Store, forget_all
 from vlatool.report import Report
 from vlatool.stage.base import Context
@@ -163,6 +170,38 @@ def test_what_is_damaged_is_played_again(bundles, world, cache, played, damage):
     again = run(stage, bundles["good"])
     assert again.rows == whole.rows
     assert played() == 10
+
+
+def test_what_no_episode_is_like_is_played_again_though_its_hash_is_right(bundles, world, cache, played):
+    stage = evaluation(world)
+    whole = stage.run(bundles["good"], Context())
+    interrupted_after(stage, bundles["good"], 4)
+    for file, steps in zip(sorted(cache.glob("streams/*/answer-*.json")), (-5, 10**30), strict=False):
+        kept = json.loads(file.read_text().partition("\n")[0])
+        kept["value"]["outcomes"][3]["steps"] = steps
+        file.write_text(stamped(json.dumps(kept) + "\n"))
+        assert is_own(file)
+    played()
+    assert run(stage, bundles["good"]).rows == whole.rows
+    assert played() == 20
+
+
+LIKE = Outcome("near", 4, True, 1, "go", {"jerk": 0.5}, {"time": "why"}, {"fresh": (1.0,)})
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("steps", -5), ("steps", 0), ("steps", 10**30), ("steps", STEP_LIMIT + 1), ("steps", True), ("steps", 3.0),
+    ("success", 2), ("success", "yes"), ("seed", 8), ("task", "other"), ("instruction", "x" * 201),
+    ("motion", {"jerk": math.nan}), ("motion", {"jerk": math.inf}), ("series", {"fresh": [0.0]}),
+])  # fmt: skip
+def test_what_no_episode_is_like_is_refused_whoever_says_it(field: str, value: object):
+    job = EpisodesJob("world.py:make", "", "near", (4,), show=field != "series")
+    answer = to_json(Played((LIKE,)))
+    if field != "series":
+        assert outcomes_of(answer, job) == (LIKE,)
+    answer["outcomes"][0][field] = value
+    with pytest.raises(DataError, match="The process that played 'near'"):
+        outcomes_of(answer, job)
 
 
 def test_a_place_that_cannot_be_written_costs_nothing_but_a_sentence(bundles, world, cache):

@@ -1,6 +1,6 @@
 import pytest
 
-from vlatool.files.printable import message_of, one_line, printable, without_password
+from vlatool.files.printable import TOLD, message_of, one_line, printable, without_password
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,8 @@ class _Mute(Exception):
 def test_an_exception_without_a_text_is_told():
     assert message_of(ValueError("a")) == "a"
     assert message_of(ValueError("\udcff")) == "?"
+    assert message_of(ValueError("z" * 10**7)) == "z" * TOLD + "... (10,000,000 characters)"
+    assert message_of(ValueError("z" * TOLD)) == "z" * TOLD
     assert message_of(_Mute()) == "(its text cannot be told: ValueError)"
 
 

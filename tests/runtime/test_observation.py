@@ -130,6 +130,23 @@ def test_nan_and_infinity_are_counted(encode):
         encode({**GOOD, "state": [np.inf, -np.inf]})
 
 
+def test_what_is_too_large_for_the_dtype_is_not_called_infinity(encode):
+    """A warning of numpy would be an error here; infinity itself stays infinity."""
+    with pytest.raises(DataError, match=r"'state' has values that are too large for float32 .*: up to 1e\+300"):
+        encode({**GOOD, "state": [1e300, 0.0]})
+    with pytest.raises(DataError, match=r"'state' holds infinity in 1 of 2"):
+        encode({**GOOD, "state": [np.inf, 0.0]})
+
+
+def test_what_is_too_large_once_it_is_normalised_is_told(tmp_path: Path):
+    (tmp_path / "narrow.json").write_text(json.dumps({"far": {"mean": [0.0, 0.0], "std": [1e-3, 1e-3]}}))
+    far = TensorSpec("far", (1, 2), normalisation="mean_std", statistics="narrow.json#far")
+    encode = ObservationEncoder(PolicySpec((far,), OUT, 10.0), tmp_path)
+    for given in (np.float32([3e38, 0]), np.float32([[3e38, 0]])):
+        with pytest.raises(DataError, match=r"'far' has values that are too large for float32 .*up to 3e\+38"):
+            encode({"far": given})
+
+
 @pytest.mark.parametrize("value", [3, None, b"go", ["go"], np.array(["go", "home"]), np.zeros((1, 3), np.int64)])
 def test_text_must_be_text(encode, value):
     with pytest.raises(DataError, match=f"'say' is text; got {type(value).__name__}"):

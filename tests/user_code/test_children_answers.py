@@ -2,7 +2,7 @@
 
 import pytest
 
-from vlatool.errors import BundleError, MissingExtra, SourceError
+from vlatool.errors import BundleError, MissingExtra, SourceError, VlatoolError
 from vlatool.user_code import _answers as answers
 
 
@@ -43,6 +43,20 @@ def test_what_was_raised_is_raised_as_what_a_child_may_raise(told, kind, says: s
     with pytest.raises(kind, match=says) as caught:
         answers.result(told, "policy.py")
     assert type(caught.value) is kind
+
+
+@pytest.mark.parametrize("told", [
+    {"error": "DataError", "message": "z" * 10**6, "fix": "z" * 10**6},
+    {"error": "z" * 10**6, "message": "z" * 10**6, "fix": ""},
+    {"raised": "z" * 10**6, "message": "z" * 10**6, "ours": True},
+    {"raised": "SystemExit", "message": "z" * 10**6, "ours": False},
+    {"errno": 2, "message": "z" * 10**6, "file": "z" * 10**6},
+], ids=lambda told: next(iter(told)))  # fmt: skip
+def test_what_foreign_code_says_is_shortened(told):
+    with pytest.raises((VlatoolError, OSError)) as caught:
+        answers.result(told, "policy.py")
+    assert "zz... (1,000,000 characters)" in str(caught.value)
+    assert len(str(caught.value)) < 10_000
 
 
 @pytest.mark.parametrize("ours", [True, False])

@@ -72,9 +72,20 @@ def _only(value: Any) -> Any:
 
 
 def _truth(key: str, value: Any) -> bool:
-    number = None
+    truth = truth_of(value)
+    if truth is None:
+        raise DataError(f"info['{key}'] is {value!r:.60}; allowed: true or false (or 1 or 0).", FIX)
+    return truth
+
+
+def truth_of(value: Any) -> bool | None:
+    """Return what true, false, 1 or 0 says, of Python or numpy, or an array of one of them; None for all else.
+
+    Example:
+        >>> truth_of(1), truth_of([False]), truth_of("False"), truth_of(None)
+        (True, False, None, None)
+    """
+    value, number = _only(value), None
     with contextlib.suppress(TypeError, ValueError):
         number = None if isinstance(value, str | bytes) else float(value)
-    if number not in (0.0, 1.0):
-        raise DataError(f"info['{key}'] is {value!r:.60}; allowed: true or false (or 1 or 0).", FIX)
-    return bool(number)
+    return bool(number) if number in (0.0, 1.0) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -50,4 +51,4 @@ class Seen:
 
 def _copy(value: Any) -> Any:
     """Return a value that the environment cannot change afterwards."""
-    return np.array(value) if isinstance(value, np.ndarray) else value
+    return value if isinstance(value, str) else copy.deepcopy(value)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError, nearest
 
@@ -59,10 +60,12 @@ class World:
     def step(self, action: Any) -> tuple[Mapping[str, Any], bool, Any]:
         """Take an action; return the next observation, whether the episode is over, and the info.
 
+        The environment gets a copy of it, and may write into that.
+
         Raises:
-            DataError: when it does not give the five values of gymnasium.
+            DataError: when it does not give the five values of gymnasium, or does not say whether the episode is over.
         """
-        answer = self._environment.step(action)
+        answer = self._environment.step(action.copy() if isinstance(action, np.ndarray) else action)
         if not (isinstance(answer, tuple | list) and len(answer) == 5):
             raise DataError(
                 f"step() of {self._name} gives {_told(answer)}; it must give five values: observation, reward, "
@@ -70,7 +73,8 @@ class World:
                 f"return observation, reward, done, False, info where gym had observation, reward, done, info; {GUIDE}",
             )
         observation, _, terminated, truncated, info = answer
-        return self._observation(observation), self._over(terminated) or self._over(truncated), info
+        flags = [self._flag("terminated", terminated), self._flag("truncated", truncated)]
+        return self._observation(observation), any(flags), info
 
     def disturbances(self) -> tuple[str, ...]:
         """Return the disturbances that the environment offers.
@@ -109,13 +113,19 @@ class World:
         found = getattr(self._environment, name, None)
         return getattr(getattr(self._environment, "unwrapped", None), name, None) if found is None else found
 
-    def _over(self, flag: Any) -> bool:
-        if np.size(flag) != 1:
+    def _flag(self, name: str, value: Any) -> bool:
+        """Return what ``terminated`` or ``truncated`` says: true or false, whatever an array of one of them holds."""
+        if (flag := truth_of(value)) is not None:
+            return flag
+        if np.size(value) != 1:
             raise DataError(
-                f"step() of {self._name} tells of {np.size(flag)} episodes at once whether they are over.",
+                f"step() of {self._name} tells of {np.size(value)} episodes at once whether they are over.",
                 "name a single environment, not a vector of them",
             )
-        return bool(np.asarray(flag).reshape(-1)[0])
+        raise DataError(
+            f"{name} of step() of {self._name} is {value!r:.60}; allowed: true or false (or 1 or 0).",
+            f"return bool(...) of the condition that ends an episode, not a text or None; {GUIDE}",
+        )
 
     def _observation(self, observation: Any) -> Mapping[str, Any]:
         """Return an observation by the names of the policy; one that has no name is that of its only input."""

@@ -9,10 +9,11 @@ from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.episodes.environment import World
+from vlatool.episodes.faults import named
 from vlatool.episodes.film import Camera, images_of
 from vlatool.episodes.play import STEP_LIMIT, EpisodesJob, Request
 from vlatool.files.messages import from_json, to_json
-from vlatool.module.factory import call_factory, exits_caught
+from vlatool.module.factory import call_factory
 from vlatool.stage.base import Context
 from vlatool.user_code.children import call
 
@@ -47,7 +48,7 @@ def probe(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]
     job, spec = asked.job, Bundle.open(Path(asked.bundle)).manifest.spec
     environment = call_factory(job.environment, Path(job.folder), {"task": job.task})
     try:
-        with exits_caught(f"the environment of task '{job.task}'"):
+        with named(job.task, job.seeds[0]):
             observation, _ = World(environment, job.task, spec).reset(job.seeds[0])
             Camera(environment, job.task, spec)(observation)
     finally:

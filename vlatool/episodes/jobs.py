@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Sequence
+import math
+from collections.abc import Generator, Iterator, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
 from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
 from vlatool.episodes.disturbed import OWN
+from vlatool.episodes.faults import locate, under_way
 from vlatool.episodes.play import PRELOAD, RECORDINGS, EpisodesJob, Played, Request
 from vlatool.episodes.progress import Tally
-from vlatool.errors import DataError
+from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.messages import from_json, to_json
 from vlatool.module.factory import factory_file
 from vlatool.stage.base import Context
@@ -70,13 +72,36 @@ def _played(
     name, count = (PROCESSES, 1) if alone and context.launcher != PROCESSES else (context.launcher, context.workers)
 
     def done(at: int, answer: Any) -> None:
-        kept.put(numbers[at], _outcomes(answer, jobs[at]))
+        kept.put(numbers[at], outcomes_of(answer, jobs[at]))
+
+    begun: set[str] = set()
+    ours = {under_way(job.task, seed) for job in jobs for seed in job.seeds}
+
+    def tell(what: str, share: float | None) -> None:
+        begun.add(what) if what in ours else context.tell(what, share)
 
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
-    answers = launcher(name, count).answers(work, context.tell, done, context.notes.append)
+    answers = launcher(name, count).answers(work, tell, done, context.notes.append)
     with contextlib.closing(answers):
-        for job, answer in zip(jobs, answers, strict=True):
-            yield _outcomes(answer, job)
+        for job in jobs:
+            with _located(job, begun, away=name != PROCESSES):
+                answer = next(answers)
+            yield outcomes_of(answer, job)
+        next(answers, None)  # what is open is closed
+
+
+@contextlib.contextmanager
+def _located(job: EpisodesJob, begun: Set[str], *, away: bool) -> Iterator[None]:
+    """Let what comes instead of the outcomes of a job name its task, and the seed that was under way."""
+    try:
+        yield
+    except VlatoolError as error:
+        seed = next((seed for seed in reversed(job.seeds) if under_way(job.task, seed) in begun), None)
+        if seed is not None or isinstance(error, DataError | SourceError):
+            known = seed is not None or any(f"seed {other}" in str(error.message) for other in job.seeds)
+            seeds = f"(one of the seeds {job.seeds[0]} to {job.seeds[-1]})" if away and not known else ""
+            locate(error, job.task, seed, seeds)
+        raise
 
 
 def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
@@ -131,15 +156,33 @@ def _placed(job: EpisodesJob) -> tuple[EpisodesJob, tuple[Folder, ...]]:
     return replace(job, environment=f"{file}:{function}"), (Folder(str(file.parent)),)
 
 
-def _outcomes(answer: Any, job: EpisodesJob) -> Outcomes:
-    """Return what a child says of the episodes of a job."""
+def outcomes_of(answer: Any, job: EpisodesJob) -> Outcomes:
+    """Return what is said of the episodes of a job: by a child, a worker elsewhere, or a file of an earlier run.
+
+    Raises:
+        DataError: when it is not of these episodes, or of what no episode can be like.
+    """
     try:
         outcomes = from_json(Played, answer).outcomes
     except ValueError as error:
         raise DataError(f"The process that played '{job.task}' did not answer with episodes: {error}.") from error
     if [(outcome.task, outcome.seed) for outcome in outcomes] != [(job.task, seed) for seed in job.seeds]:
         raise DataError(f"The process that played '{job.task}' answered with other episodes.")
+    for outcome in outcomes:
+        if why := _impossible(outcome, job):
+            raise DataError(f"The process that played '{job.task}' answered with what no episode is like: {why}.")
     return outcomes
+
+
+def _impossible(outcome: Outcome, job: EpisodesJob) -> str:
+    """Return why no episode ends like that; nothing when one may."""
+    if not 1 <= outcome.steps <= play.STEP_LIMIT:
+        return f"{outcome.steps:.3g} steps (allowed: 1 to {play.STEP_LIMIT:,})"
+    if len(outcome.instruction) > play.LONGEST:
+        return f"an instruction of {len(outcome.instruction):,} characters"
+    if not all(map(math.isfinite, outcome.motion.values())):
+        return "a motion that is infinite or NaN"
+    return "steps that nobody asked for" if outcome.series and not job.show else ""
 
 
 class _Kept:
@@ -156,7 +199,7 @@ class _Kept:
         for number, job in enumerate(jobs):
             with contextlib.suppress(DataError):  # not what that job gives: played again
                 if (value := self._store.get(self._keys[number])) is not None:
-                    self.found[number] = _outcomes(value, job)
+                    self.found[number] = outcomes_of(value, job)
         taken = sum(map(len, self.found.values()))
         self._store.taken += taken
         self._store.asked += sum(len(job.seeds) for job in jobs)

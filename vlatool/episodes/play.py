@@ -22,13 +22,14 @@ from vlatool.episodes.body import Body, series_of
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.disturbed import OWN, Seen
 from vlatool.episodes.environment import GUIDE, World
+from vlatool.episodes.faults import named, under_way
 from vlatool.episodes.film import world_of
 from vlatool.episodes.frames import KeepingEncoder, Noisy
 from vlatool.episodes.late import Late
-from vlatool.errors import DataError, VlatoolError, require
+from vlatool.errors import DataError, require
 from vlatool.files.messages import from_json, to_json
-from vlatool.files.printable import message_of, one_line
-from vlatool.module.factory import call_factory, exits_caught
+from vlatool.files.printable import one_line
+from vlatool.module.factory import call_factory
 from vlatool.motion.measure import measured
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
@@ -42,6 +43,7 @@ EVALUATION_SEEDS = 5_000_000
 """First seed of the episodes that policies are judged by; those that they are trained on have smaller ones."""
 RECORDINGS = "data/"
 """What of a bundle no episode needs."""
+Tell = Callable[[str, float | None], None]
 PRELOAD = ("numpy", "onnxruntime", __name__)
 
 
@@ -166,12 +168,16 @@ class Worker:
             self._key = key
         return self._environment
 
-    def play(self, job: EpisodesJob, limit: int = STEP_LIMIT) -> list[Outcome]:
-        """Play the episodes of a job."""
+    def play(self, job: EpisodesJob, limit: int = STEP_LIMIT, tell: Tell = lambda *_: None) -> list[Outcome]:
+        """Play the episodes of a job; tell of each that it begins."""
         spec = self.queue.policy.spec
         world = world_of(self.environment(job), job.task, spec, job.film)
         with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
-            return [_episode(world, self._actor(job, seed), spec, job, seed, limit) for seed in job.seeds]
+            outcomes = []
+            for seed in job.seeds:
+                tell(under_way(job.task, seed), None)
+                outcomes.append(_episode(world, self._actor(job, seed), spec, job, seed, limit))
+            return outcomes
 
     def _actor(self, job: EpisodesJob, seed: int) -> Actor:
         """Return who acts: the policy, the policy with noise, or a control that does not look."""
@@ -208,29 +214,30 @@ def _opened(bundle: Bundle, engine: str) -> Policy:
 _worker: Worker | None = None
 
 
-def play(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> dict[str, Any]:
+def play(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
     """Answer a ``Request`` in this process with ``Played``."""
     global _worker
     asked = from_json(Request, request)
     if _worker is None:
         _worker = Worker(asked.bundle, asked.engine)
-    answer: dict[str, Any] = to_json(Played(tuple(_worker.play(asked.job, asked.limit))))
+    answer: dict[str, Any] = to_json(Played(tuple(_worker.play(asked.job, asked.limit, tell))))
     return answer
 
 
-def disturbances(request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> list[str]:
+def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
     spec = Bundle.described(asked.bundle).manifest.spec
     environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
     try:
-        return list(World(environment, asked.job.task, spec).disturbances())
+        with named(asked.job.task):
+            return list(World(environment, asked.job.task, spec).disturbances())
     finally:
         with contextlib.suppress(Exception):
             environment.close()
 
 
-def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None]) -> None:
+def close(_request: Mapping[str, Any], _tell: Tell) -> None:
     """Close what is open in this process."""
     global _worker
     if _worker is not None:
@@ -240,33 +247,27 @@ def close(_request: Mapping[str, Any], _tell: Callable[[str, float | None], None
 
 def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int) -> Outcome:
     task = job.task
-    try:
-        with exits_caught(f"the environment of task '{task}', at seed {seed},"):
-            if job.disturb and job.disturb not in OWN:
-                world.disturb(job.disturb, job.strength, seed)
-            observation, info = world.reset(seed)
-            queue.reset(seed)
-            success, body, seen = Success(), Body(spec), Seen(spec, job.disturb, job.strength, seed)
+    with named(task, seed):
+        if job.disturb and job.disturb not in OWN:
+            world.disturb(job.disturb, job.strength, seed)
+        observation, info = world.reset(seed)
+        queue.reset(seed)
+        success, body, seen = Success(), Body(spec), Seen(spec, job.disturb, job.strength, seed)
+        body.look(info)
+        told = told_to(observation, spec)
+        for step in range(1, limit):
+            action = _acted(queue, seen(observation), f"task '{task}' at seed {seed}, step {step},")
+            observation, over, info = world.step(action.item() if action.ndim == 0 else action)
+            success.look(info)
+            body.acted(action, queue.fresh)
             body.look(info)
-            told = told_to(observation, spec)
-            for step in range(1, limit):
-                action = _acted(queue, seen(observation), f"task '{task}' at seed {seed}, step {step},")
-                observation, over, info = world.step(action.item() if action.ndim == 0 else action)
-                success.look(info)
-                body.acted(action, queue.fresh)
-                body.look(info)
-                if over:
-                    track = body.track()
-                    series = series_of(track, spec.action) if job.show else {}
-                    won = success.at_the_end(task, seed)
-                    return Outcome(task, seed, won, step, told, measured(track), body.refused, series)
-    except VlatoolError:
-        raise
-    except Exception as error:  # the seam: a user's environment may raise anything
-        raise DataError(
-            f"The environment of task '{task}' failed at seed {seed}: {type(error).__name__}: {message_of(error)}."
-        ) from error
-    raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.")
+            if over:
+                track = body.track()
+                series = series_of(track, spec.action) if job.show else {}
+                won = success.at_the_end(task, seed)
+                return Outcome(task, seed, won, step, told, measured(track), body.refused, series)
+        raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.",
+                        "let step() return truncated=True after as many steps as an episode may take")  # fmt: skip
 
 
 def told_to(observation: Mapping[str, Any], spec: PolicySpec) -> str:

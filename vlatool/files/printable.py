@@ -8,6 +8,8 @@ import unicodedata
 HIDDEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Unicode categories that move the cursor, change colours or the order of letters, or cannot be encoded."""
 KEPT = "\n\t\u200d\u00ad"
+TOLD = 2000
+"""Characters of what foreign code says that are shown."""
 
 
 def printable(text: str) -> str:
@@ -25,6 +27,16 @@ def printable(text: str) -> str:
 def one_line(text: str, longest: int = 400) -> str:
     """Return a text as one printable line of a bounded length."""
     return " ".join(printable(text[: 4 * longest]).split())[:longest]
+
+
+def shortened(text: str, longest: int = TOLD) -> str:
+    """Return the beginning of a text that is too long, and how long it is; other texts as they are.
+
+    Example:
+        >>> shortened("x" * 5000, 3)
+        'xxx... (5,000 characters)'
+    """
+    return text if len(text) <= longest else f"{text[:longest]}... ({len(text):,} characters)"
 
 
 def without_password(text: str) -> str:
@@ -56,10 +68,10 @@ def secrets_in(text: str) -> set[str]:
     return {secret for secret in secrets | {item.partition("=")[2] for item in query.split("&")} if secret}
 
 
-def message_of(error: BaseException) -> str:
-    """Return the text of an exception of somebody else's class, which may fail to have one."""
+def message_of(error: BaseException, longest: int = TOLD) -> str:
+    """Return the text of an exception of somebody else's class, shortened; the class may fail to have one."""
     try:
-        return str(error).encode("utf-8", "replace").decode()
+        return shortened(str(error), longest).encode("utf-8", "replace").decode()
     except KeyboardInterrupt:
         raise
     except BaseException as another:  # the seam: it is code of the user

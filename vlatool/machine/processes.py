@@ -12,7 +12,7 @@ from pathlib import Path
 
 SINGLE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Variables that make numpy's libraries compute in one thread; read when they are loaded."""
-PR_SET_PDEATHSIG = 1
+PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 """Of ``prctl(2)``."""
 START = """\
 import sys
@@ -66,6 +66,22 @@ def die_with_parent() -> None:
     """Let the kernel kill this process when the thread that started it ends, however that ends (Linux)."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def adopt_orphans() -> None:
+    """Become the parent of whatever processes that descend from this one leave behind when they end (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
+
+
+def child_processes() -> set[int]:
+    """Return the children of this process, adopted ones too; none where there is no ``/proc``."""
+    own, found = str(os.getpid()), set()
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            if stat.read_bytes().rpartition(b")")[2].split()[1].decode() == own:
+                found.add(int(stat.parent.name))
+    return found
 
 
 @contextlib.contextmanager

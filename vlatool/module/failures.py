@@ -19,6 +19,8 @@ GUIDE = "docs/guides/your-own-policy.md"
 TOOLS = ("torch", "onnxscript", "onnx_ir", "onnx", "functorch")
 """Packages that export; a line of theirs is not where a policy goes wrong."""
 LONGEST = 300
+SEARCHED = 1 << 20
+"""Characters of an error's text in which a cause is looked for."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def _in_distribution(chain: list[BaseException]) -> bool:
 
 def _cause_in_text(chain: list[BaseException]) -> Cause | None:
     """Return the first cause of the table that the text of an error names."""
-    texts = [f"{type(error).__name__}: {message_of(error)}" for error in reversed(chain)]
+    texts = [f"{type(error).__name__}: {message_of(error, SEARCHED)}" for error in reversed(chain)]
     for cause in CAUSES:
         if any(re.search(cause.pattern or "", text, re.DOTALL) for text in texts):
             return cause
@@ -193,7 +195,7 @@ def _line(chain: list[BaseException]) -> str:
 
 
 def _operator(chain: list[BaseException], node: Any) -> str:
-    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1]))
+    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1], SEARCHED))
     if match:
         return match[1]
     return str(node.target) if node is not None and node.op == "call_function" else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -25,9 +26,9 @@ def metrics() -> dict[str, Metric]:
 
 
 def measured(track: Track) -> dict[str, float]:
-    """Return name -> number of one episode; what the track does not have is left out."""
+    """Return name -> number of one episode; what the track does not have, or is not finite, is left out."""
     values = {name: metric.of(track) for name, metric in metrics().items()}
-    return {name: float(value) for name, value in values.items() if value is not None}
+    return {name: float(value) for name, value in values.items() if value is not None and math.isfinite(value)}
 
 
 def ratio_of(

@@ -34,6 +34,7 @@ class ObservationEncoder:
     def __init__(self, spec: PolicySpec, assets: Assets) -> None:
         self.names = [tensor.name for tensor in spec.inputs]
         self._encoders = [(tensor.name, _encoder(tensor, assets)) for tensor in spec.inputs]
+        self._dtypes = {tensor.name: tensor.dtype for tensor in spec.inputs}
 
     def __call__(self, observation: Mapping[str, Any]) -> dict[str, Array]:
         """Return one array with a batch axis for each input of the spec.
@@ -42,21 +43,31 @@ class ObservationEncoder:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
 
         Raises:
-            DataError: when an input is missing or has another shape or dtype, or holds NaN or infinity.
+            DataError: when an input is missing or has another shape or dtype, or holds NaN, infinity or what its dtype
+                cannot hold.
         """
         values = {}
-        for name, encode in self._encoders:
-            try:
-                value = observation[name]
-            except Exception:  # the seam: a mapping raises KeyError, anything else may raise anything
-                raise self._missing_input(observation, name) from None
-            try:
-                values[name] = encode(value)
-            except (RuntimeWarning, FloatingPointError):  # where the caller lets numpy raise
-                raise DataError(
-                    f"The input '{name}' has values beyond what its dtype holds.", "check the sensor or the recording"
-                ) from None
+        with np.errstate(over="raise"):
+            for name, encode in self._encoders:
+                try:
+                    value = observation[name]
+                except Exception:  # the seam: a mapping raises KeyError, anything else may raise anything
+                    raise self._missing_input(observation, name) from None
+                try:
+                    values[name] = encode(value)
+                except (RuntimeWarning, FloatingPointError):
+                    raise self._too_large(name, value) from None
         return values
+
+    def _too_large(self, name: str, value: Any) -> DataError:
+        """Return the error for finite values that the dtype cannot hold, as they are or once they are normalised."""
+        dtype, largest = self._dtypes[name], np.nanmax(np.abs(np.asarray(value, np.float64)))
+        limit = f" (beyond {np.finfo(dtype).max:.2g})" if np.dtype(dtype).kind == "f" else ""
+        return DataError(
+            f"The input '{name}' has values that are too large for {dtype}{limit}, as they are or normalised: up to "
+            f"{largest:.3g}.",
+            "check the sensor or the recording, and its unit",
+        )
 
     def _missing_input(self, observation: Any, name: str) -> DataError:
         takes = f"the policy takes {', '.join(self.names)}."

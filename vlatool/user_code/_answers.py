@@ -16,9 +16,14 @@ from typing import Any
 from vlatool import errors
 from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError
 from vlatool.files.json import parse_json
+from vlatool.files.printable import TOLD, shortened
 
 ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
+
+
+LONGEST = 2 * TOLD
+"""Characters of a message of a child, which may quote what foreign code says."""
 
 
 class Killed(SourceError):
@@ -74,11 +79,11 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     if "error" in answer:
         kind = Killed if answer["error"] == Killed.__name__ else getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, InputError | MissingExtra):
-            raise kind(answer["message"], answer["fix"])
+            raise kind(shortened(answer["message"], LONGEST), shortened(answer["fix"], LONGEST))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
         raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}")
     if "errno" in answer:
-        raise OSError(answer["errno"], message, answer["file"])
+        raise OSError(answer["errno"], message, answer["file"] and shortened(answer["file"], LONGEST))
     name = plain(answer["raised"])
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
@@ -96,7 +101,8 @@ def nonsense(about: str) -> SourceError:
 
 
 def plain(text: str) -> str:
-    """Return a text without what would steer a terminal."""
+    """Return a text without what would steer a terminal, shortened where it is very long."""
+    text = shortened(text, LONGEST)
     return "".join(character if unicodedata.category(character)[0] != "C" else " " for character in text).rstrip()
 
 

@@ -1,7 +1,7 @@
 """The other side of ``children``: ``python -m vlatool.user_code._child FD`` is the server that forks the children.
 
-The server imports what its children need once, and never runs a user's code itself. It ends with its parent, and each
-of its children with it.
+The server imports what its children need once, and never runs a user's code itself. It ends with its parent, each of
+its children with it, and with each child whatever that has started: the server adopts what is left, and kills it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import socket
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import IO, Any
 
 from vlatool.errors import VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.machine.processes import die_with_parent
+from vlatool.machine.processes import adopt_orphans, child_processes, die_with_parent
 from vlatool.user_code import trust
 from vlatool.user_code._answers import ENDINGS
 
@@ -43,6 +43,7 @@ def main() -> None:
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
     children: dict[int, socket.socket] = {}
+    adopt_orphans()
     while True:
         watched: list[Any] = [control, woken, *children.values()]
         ready = select.select(watched, [], [])[0]
@@ -56,6 +57,7 @@ def main() -> None:
         if control in ready:
             message, fds, *_ = socket.recv_fds(control, MESSAGE, FDS)
             if not message:
+                _end_all(children)
                 return
             _start(json.loads(message), fds, children, [control.fileno(), woken, wake])
 
@@ -69,6 +71,24 @@ def _reap(children: dict[int, socket.socket]) -> None:
                 with contextlib.suppress(OSError):
                     status.sendall(f"{os.waitstatus_to_exitcode(ended[1])}\n".encode())
                 status.close()
+    _end_strays(children)
+
+
+def _end_strays(children: Mapping[int, socket.socket]) -> None:
+    """Kill what is left of children that have ended."""
+    for pid in child_processes() - set(children):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _end_all(children: Mapping[int, socket.socket]) -> None:
+    """Kill all children and what they leave, which shows once they are gone; whoever waits for this has patience."""
+    for pid in children:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    with contextlib.suppress(ChildProcessError):
+        while os.waitpid(-1, 0)[0]:
+            _end_strays({})
 
 
 def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket], own: list[int]) -> None:
@@ -88,6 +108,7 @@ def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket
     code = 1
     try:
         die_with_parent()
+        adopt_orphans()  # so that it is known whose they are: what leaves its parent stays below this child
         if os.getppid() == server:
             for fd in (status, *own, *(other.fileno() for other in children.values())):
                 os.close(fd)
@@ -146,6 +167,8 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
     try:
         return {"result": _function(request["call"])(request["job"], tell)}
     except VlatoolError as error:
+        if os.environ.get("VLATOOL_DEBUG") and error.__cause__ is not None:
+            traceback.print_exc()
         return {"error": type(error).__name__, "message": str(error.message), "fix": str(error.fix)}
     except MemoryError:
         return {"memory": True}

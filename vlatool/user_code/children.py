@@ -24,6 +24,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from vlatool.errors import SourceError
+from vlatool.files.printable import shortened
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.processes import SINGLE, import_path, python_command
 from vlatool.user_code import trust
@@ -166,7 +167,7 @@ class Apart:
                 if "progress" in line:
                     tell(plain(line["progress"][0]), line["progress"][1])
                 elif "warning" in line:
-                    warnings.warn(str(line["warning"]), UserWarning, stacklevel=2)
+                    warnings.warn(shortened(line["warning"]), UserWarning, stacklevel=2)
                 else:
                     self._print()
                     return result(line, self.about, own=own)

@@ -1,0 +1,67 @@
+"""Where in the episodes a fault is: every error of an environment names its task, its seed and what to do."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+from vlatool.errors import DataError, SourceError, VlatoolError
+from vlatool.files.printable import message_of
+from vlatool.module.factory import exits_caught
+
+
+def under_way(task: str, seed: int) -> str:
+    """Return what a child says when it begins an episode, so that its parent knows where it ended."""
+    return f"task '{task}', seed {seed}"
+
+
+@contextlib.contextmanager
+def named(task: str, seed: int | None = None) -> Iterator[None]:
+    """Turn whatever is raised in this block into an error that names task, seed and remedy.
+
+    Args:
+        task: Of the environment.
+        seed: Of the episode; None before there is one.
+
+    Raises:
+        VlatoolError: of the class that was raised.
+        DataError: for every other exception.
+        SourceError: for what is raised beside ``Exception``.
+    """
+    at = "" if seed is None else f" at seed {seed}"
+    try:
+        with exits_caught(f"the environment of task '{task}'{at and f',{at},'}"):
+            yield
+    except VlatoolError as error:
+        locate(error, task, seed)
+        raise
+    except Exception as error:  # the seam: a user's environment may raise anything
+        said = f"The environment of task '{task}' failed{at}: {type(error).__name__}: {message_of(error)}."
+        raise DataError(said, _remedy(task, seed)) from error
+
+
+def locate(error: VlatoolError, task: str, seed: int | None, seeds: str = "") -> None:
+    """Add to an error what of task and seed it does not name, and what to do where it does not say it.
+
+    Args:
+        error: It is changed.
+        task: Of the environment.
+        seed: Of the episode; None where it is not known.
+        seeds: Which ones come into question then, a part of a sentence.
+    """
+    message = str(error.message)
+    words = [] if f"task '{task}'" in message else [f"in task '{task}'"]
+    if seed is not None and f"seed {seed}" not in message:
+        words.append(f"at seed {seed}")
+    elif seed is None and seeds:
+        words.append(seeds)
+    if words:
+        start = " ".join(words)
+        error.message = f"{start[:1].upper()}{start[1:]}: {message}"
+    if not error.fix and isinstance(error, DataError | SourceError):
+        error.fix = _remedy(task, seed)
+
+
+def _remedy(task: str, seed: int | None) -> str:
+    call = f"make(task={task!r})" + ("" if seed is None else f".reset(seed={seed})")
+    return f"call {call} of the environment yourself, and correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
