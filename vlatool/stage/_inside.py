@@ -32,7 +32,7 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
 def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any]:
     """Return what a child needs to know of a stage."""
     return {
-        "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
+        "stage": stage.name(), "options": stage.given(), "workers": context.workers,
         "launcher": context.launcher,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
         "events": context.events, "video": context.video,

@@ -134,6 +134,10 @@ class Stage(Numeric):
         """Return the options that differ from their defaults, as JSON values."""
         return self.model_dump(mode="json", exclude_defaults=True)
 
+    def given(self) -> dict[str, Any]:
+        """Return the options that were given, as JSON values: the same stage is built of them, which knows it too."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Raise a user error when this stage cannot run on that source; cheap."""
 
