@@ -208,3 +208,16 @@ def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
     assert observations_for(source_bundle, 1)
     with pytest.raises(SourceError, match=r"A block gives \[1, 17\] for \[1, 16\]"):
         Depth(samples=1).change({"main": Grown().eval()}, source_bundle, Context())
+
+
+def test_how_many_blocks_stay_is_said(source_bundle: Bundle):
+    said: list[str] = []
+    context = Context(said=said)
+    Depth(blocks=1, samples=4).change({"main": Net().eval()}, source_bundle, context)
+    Depth(keep=(0, 2), samples=4).change({"main": Net().eval()}, source_bundle, context)
+    assert said == ["kept 1 of 4 blocks of trunk: 0", "kept 2 of 4 blocks of trunk: 0, 2"]
+
+
+def test_the_guide_names_all_that_is_protected():
+    guide = (Path(__file__).parents[2] / "docs/guides/prune-and-fine-tune.md").read_text()
+    assert f"({', '.join(PROTECTED)})" in " ".join(guide.split())

@@ -90,13 +90,13 @@ class ModuleStage(Transform):
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return how large the modules are, and how to go on."""
         size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
-        folder, edits = read_location(bundle.path), len(read_edits(bundle))
+        folder, edits = read_location(bundle.path), _structure(bundle)
         export = f"vlatool export {bundle.path} -o BUNDLE --trust {folder}"
         if not holds_weights(bundle):
             streams = f"vlatool quantize weight-only {bundle.path} -o BUNDLE --trust {folder}"
-            stay = f"weights stay in the shards in {folder}, {edits} structural edits; not exported yet:"
+            stay = f"weights stay in the shards in {folder}, {edits}; not exported yet:"
             return (stay, export, f"{streams}    # one weight in memory at a time")
-        return (f"weights {size / 1e6:.2f} MB, {edits} structural edits; not exported yet:", export)
+        return (f"weights {size / 1e6:.2f} MB, {edits}; not exported yet:", export)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Change the modules, write them, and run the policy once."""
@@ -135,6 +135,15 @@ class ModuleStage(Transform):
         changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program)
         context.tell("running the changed policy", None)
         return changed
+
+
+def _structure(bundle: Bundle) -> str:
+    """Say how much of the structure is not as the policy's own code makes it."""
+    edits = len(read_edits(bundle))
+    told = f"{edits or 'no'} structural edit{'s' if edits != 1 else ''}"
+    fewer = any(entry.get("stage") == "prune.steps" for entry in bundle.manifest.build)
+    turns = [step.repeat for step in bundle.manifest.program if fewer and step.carry]
+    return ", ".join([told, *(f"{count} denoising step{'s' if count != 1 else ''}" for count in turns)])
 
 
 def _run_once(bundle: Bundle) -> None:

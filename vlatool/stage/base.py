@@ -59,6 +59,7 @@ class Context:
             it forgets them. Nothing is kept when None.
         kept: What is kept of this run, once a stage has opened it.
         notes: Gets sentences on how it was computed that belong into the report.
+        said: Gets sentences on what a stage that makes a bundle did, which the command line prints.
     """
 
     tell: Tell = field(default=_silent)
@@ -71,6 +72,7 @@ class Context:
     unfinished: list[Path] | None = None
     kept: Store | None = None
     notes: list[str] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)
 
 
 class SampleSet:
