@@ -206,7 +206,7 @@ def silence(weight: torch.Tensor, member: Member, keep: tuple[int, ...]) -> None
     (Edit("main", "0.weight", "units 0.1", (0,)), "cannot be chosen from"),
     (Edit("main", "0.weight", "units 1.0", (0,)), "cannot be chosen from"),
     (Edit("main", "7.weight", "units 0.0", (0,)), "cannot be chosen from"),
-    (Edit("main", "0.weight", "units 0.0", (8,)), r"are 8; an edit keeps 8"),
+    (Edit("main", "0.weight", "units 0.0", (8,)), r"are 8, numbered from 0; an edit keeps number 8"),
 ])  # fmt: skip
 def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):
     module = nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 3))

@@ -205,12 +205,17 @@ def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
 
 
 def test_the_clock_of_a_board_predicts_what_is_exported(deep: Bundle, tmp_path: Path):
-    of = (deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
+    told: list[str] = []
+    of = (deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context(lambda what, _share: told.append(what)))
     clock = BoardClock(load_profile("raspberry-pi-4"), *of)
     whole, (shallow,) = clock.times([(Edit("main", "blocks", "blocks", (0,)),)])
     assert whole > shallow > 0
     assert whole == predictions(load_profile("raspberry-pi-4"), Bundle.open(tmp_path / "1-graphs"))[0].value
     assert clock.times([]) == (whole, []), "a prediction does not change from run to run"
+    clock.times([(Edit("main", "blocks", "blocks", (number,)),) for number in range(2)])
+    assert [what for what in told if "exporting" in what] == [
+        f"exporting without some of it: {number} of 2" for number in (1, 2)
+    ]
 
 
 def test_a_board_without_ground_is_refused(deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -11,6 +11,7 @@ from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
 from vlatool.module._resized import Resizer
 from vlatool.module.axes import Walk
+from vlatool.module.edit import AGAIN
 from vlatool.module.factors import Shape
 from vlatool.module.factory import exits_caught
 from vlatool.module.to_onnx import quiet_exporter
@@ -124,10 +125,11 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     shape = walk.weights.get(edit.module, [])
     leaves = walk.factors.leaves(shape[axis]) if axis < len(shape) else ()
     if place >= len(leaves) or walk.factors.is_frozen(leaves[place]):
-        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.")
+        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.", AGAIN)
     if max(edit.keep) >= walk.factors.sizes[leaves[place]]:
         size = walk.factors.sizes[leaves[place]]
-        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}; an edit keeps {max(edit.keep)}.")
+        kept = f"numbered from 0; an edit keeps number {max(edit.keep)}"
+        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}, {kept}.", AGAIN)
     return leaves[place]
 
 
