@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from _tiny import deepen, observations, with_expert
 from _trainings import RECORDED, training_of
+from safetensors.torch import load_file, save_file
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
@@ -163,3 +164,36 @@ def test_what_cannot_be_pruned_so_is_told_with_the_stage(
         first_steps(stage, source_bundle, tmp_path / "cache", Context())
     assert "distill.policy starts with prune." in caught.value.fix
     assert "run it first: vlatool prune " in caught.value.fix
+
+
+def test_protected_blocks_may_go_where_they_are_named(deep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The trunk of many policies is called transformer.encoder and transformer.decoder."""
+    code = deep / "policy.py"
+    code.write_text(
+        code.read_text()
+        .replace("self.blocks", "self.decoder")
+        .replace(
+            'str(Path(__file__).with_name("weights.safetensors"))', 'str(Path(__file__).with_name("w.safetensors"))'
+        )
+    )
+    weights = load_file(str(deep / "weights.safetensors"))
+    save_file({name.replace("blocks.", "decoder."): value for name, value in weights.items()}, deep / "w.safetensors")
+    with pytest.raises(SystemExit) as left:
+        main(["distill", "policy", str(deep), "--student", STUDENT, "-o", str(tmp_path / "no"), *map(str, flags())])
+    assert left.value.code == RecipeError.exit_code
+    told = capsys.readouterr().err
+    assert "name the stacks that may lose blocks: --include NAME" in told
+    assert "prune.depth (ratio 0.5)" in told
+    ran("distill", "policy", deep, "--student", STUDENT, "--include", "decoder", "-o", tmp_path / "short", *flags())
+    assert "kept 2 of 3 blocks of decoder" in capsys.readouterr().out
+    ran("prune", "depth", deep, "--include", "decoder", "-o", tmp_path / "d")
+    ran("prune", "structured", tmp_path / "d", "--ratio", 0.25, "-o", tmp_path / "w", "--trust", deep)
+    ran("distill", "policy", tmp_path / "w", "-o", tmp_path / "long", "--trust", deep, *flags())
+    assert Bundle.open(tmp_path / "short").hash == Bundle.open(tmp_path / "long").hash
+
+
+@pytest.mark.parametrize("student", ["", "width=0.5"])
+def test_stacks_are_named_for_a_student_that_loses_blocks(student: str):
+    with pytest.raises(RecipeError, match=r"--include names stacks .*, and the student loses none") as caught:
+        PolicyDistillation(student=student, include=("blocks",)).check(None, None)
+    assert "--student depth=0.5" in caught.value.fix

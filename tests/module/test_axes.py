@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional
 
 from vlatool.errors import SourceError
-from vlatool.module.axes import Walk
+from vlatool.module.axes import Member, Walk
 from vlatool.module.cut import RETRACE, cut, traced
 from vlatool.module.edits import Edit
 from vlatool.module.factors import Factors
@@ -151,11 +153,60 @@ def test_a_module_for_one_observation_is_traced_again_for_a_batch():
     assert again.get_parameter("up.weight") is small.get_parameter("up.weight")
 
 
+class Sequenced(nn.Module):
+    """torch's attention in its default layout, (sequence, batch, width): heads are counted together with the batch."""
+
+    def __init__(self, *, whole: bool, to_others: bool):
+        super().__init__()
+        self.to_others, self.whole = to_others, whole
+        self.state, self.goal = nn.Linear(4, 8 * 16), nn.Linear(4, 5 * 16)
+        self.attention = nn.MultiheadAttention(16, 4)
+        self.action = nn.Linear(16, 2)
+
+    def forward(self, state):
+        tokens = self.state(state).reshape(-1, 8, 16).transpose(0, 1)
+        others = self.goal(state).reshape(state.shape[0], 5, 16).transpose(0, 1) if self.to_others else tokens
+        values = 0.5 * others if self.to_others else others
+        needs = {"need_weights": self.whole, "average_attn_weights": False}
+        return self.action(self.attention(tokens, others, values, **needs)[0]).transpose(0, 1)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("to_others", [True, False])
+def test_units_of_torchs_attention_go_whatever_the_batch_is(whole: bool, to_others: bool):
+    torch.manual_seed(0)
+    module, feed = Sequenced(whole=whole, to_others=to_others).eval(), torch.randn(1, 4)
+    groups = list(walked(module, feed).members().values())
+    assert any(member.sizes == (3, 4, 4) and member.place == 1 for members in groups for member in members), "heads"
+    batch = torch.randn(5, 4)
+    for members in groups:
+        first, size = members[0], members[0].sizes[members[0].place]
+        keep = tuple(range(0, size, 2))
+        units = f"units {first.axis}.{first.place}"
+        whole_one = copy.deepcopy(module)
+        for member in members:
+            silence(whole_one.get_parameter(member.weight), member, keep)
+        small = cut(copy.deepcopy(module), [feed], [Edit("main", first.weight, units, keep)])
+        assert not hasattr(small, RETRACE), "one module for any batch"
+        with torch.no_grad():
+            torch.testing.assert_close(small(batch), whole_one(batch), msg=f"{first.weight} {units}")
+            torch.testing.assert_close(small(batch), torch.cat([small(row[None]) for row in batch]))
+
+
+def silence(weight: torch.Tensor, member: Member, keep: tuple[int, ...]) -> None:
+    """Let the units of one axis of a weight that are not kept do nothing."""
+    axis, gone = member.axis, [unit for unit in range(member.sizes[member.place]) if unit not in keep]
+    with torch.no_grad():
+        parts = weight.reshape(*weight.shape[:axis], *member.sizes, *weight.shape[axis + 1 :])
+        parts.index_fill_(axis + member.place, torch.tensor(gone), 0.0)
+        weight.copy_(parts.reshape(weight.shape))
+
+
 @pytest.mark.parametrize(("edit", "says"), [
     (Edit("main", "0.weight", "units 0.1", (0,)), "cannot be chosen from"),
     (Edit("main", "0.weight", "units 1.0", (0,)), "cannot be chosen from"),
     (Edit("main", "7.weight", "units 0.0", (0,)), "cannot be chosen from"),
-    (Edit("main", "0.weight", "units 0.0", (8,)), r"are 8; an edit keeps 8"),
+    (Edit("main", "0.weight", "units 0.0", (8,)), r"are 8, numbered from 0; an edit keeps number 8"),
 ])  # fmt: skip
 def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):
     module = nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 3))

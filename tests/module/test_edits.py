@@ -47,14 +47,15 @@ def test_convolutions_are_cut_too():
 
 @pytest.mark.parametrize(("edit", "says"), [
     (Edit("other", "0", "outputs", (0,)), "names the graph 'other'"),
-    (Edit("main", "7", "outputs", (0,)), "names the module '7'"),
+    (Edit("main", "7", "outputs", (0,)), "names the module '7'; known: 0, 1, 2, 3\\."),
     (Edit("main", "2", "outputs", (0,)), r"outputs of '2' \(ReLU\) cannot be chosen"),
     (Edit("main", "1", "inputs", (0,)), "inputs of '1'"),
-    (Edit("main", "0", "outputs", (6,)), "has 6 outputs; an edit keeps 6"),
+    (Edit("main", "0", "outputs", (6,)), "has 6 outputs, numbered from 0; an edit keeps number 6"),
 ])  # fmt: skip
 def test_an_edit_that_does_not_fit_is_refused(edit: Edit, says: str):
-    with pytest.raises(SourceError, match=says):
+    with pytest.raises(SourceError, match=says) as caught:
         apply({"main": mlp()}, [edit])
+    assert caught.value.fix.startswith("make the bundle again")
 
 
 def test_grouped_convolutions_are_refused():
@@ -106,12 +107,16 @@ def test_a_bundle_without_changes_has_none(source_bundle: Bundle):
 ])  # fmt: skip
 def test_a_file_of_edits_that_makes_no_sense_is_refused(changed: Bundle, edit: object):
     (changed.path / EDITS).write_text(json.dumps([edit]))
-    with pytest.raises(SourceError, match="an invalid edit"):
+    with pytest.raises(
+        SourceError, match=r"an invalid edit: .*; wanted graph and module .*outputs, inputs, blocks"
+    ) as it:
         read_edits(changed)
+    assert it.value.fix.startswith("make the bundle again")
 
 
 def test_a_file_that_is_no_list_is_refused(changed: Bundle):
-    for text, says in (("{}", "must hold a list"), ("[", "not valid JSON")):
+    for text, says in (("{}", "must hold a list"), ("[", "not valid JSON"),
+                       (f"[{'9' * 5000}]", r"not valid JSON: a number of 5000 digits\.")):  # fmt: skip
         (changed.path / EDITS).write_text(text)
         with pytest.raises(SourceError, match=says):
             read_edits(changed)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from _tiny import deepen
+from safetensors.torch import load_file, save_file
 from torch import nn
 
 from vlatool.bundle.bundle import Bundle
@@ -14,6 +16,7 @@ from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.module.edits import Edit, apply
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune.depth import PROTECTED, Depth, spread
+from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, build_stage
 from vlatool.stage.run import run_transform
 
@@ -208,3 +211,27 @@ def test_a_block_that_changes_shapes_is_named(source_bundle: Bundle):
     assert observations_for(source_bundle, 1)
     with pytest.raises(SourceError, match=r"A block gives \[1, 17\] for \[1, 16\]"):
         Depth(samples=1).change({"main": Grown().eval()}, source_bundle, Context())
+
+
+def test_how_many_blocks_stay_is_said(source_bundle: Bundle):
+    said: list[str] = []
+    context = Context(said=said)
+    Depth(blocks=1, samples=4).change({"main": Net().eval()}, source_bundle, context)
+    Depth(keep=(0, 2), samples=4).change({"main": Net().eval()}, source_bundle, context)
+    assert said == ["kept 1 of 4 blocks of trunk: 0", "kept 2 of 4 blocks of trunk: 0, 2"]
+
+
+def test_the_guide_names_all_that_is_protected():
+    guide = (Path(__file__).parents[2] / "docs/guides/prune-and-fine-tune.md").read_text()
+    assert f"({', '.join(PROTECTED)})" in " ".join(guide.split())
+
+
+def test_weights_that_are_not_finite_are_blamed_and_not_the_observation(policy_dir: Path, tmp_path: Path):
+    deepen(policy_dir)
+    weights = load_file(str(policy_dir / "weights.safetensors"))
+    weights["blocks.0.norm.bias"][3:5] = torch.nan
+    save_file(weights, str(policy_dir / "weights.safetensors"))
+    source = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
+    says = r"weight 'blocks\.0\.norm\.bias' of 'main' is not finite in 2 of 16 values"
+    with pytest.raises(SourceError, match=says):
+        run_transform(Depth(keep=(0,)), source, tmp_path / "out", Context())

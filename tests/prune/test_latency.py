@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from _tiny import deepen
 from torch import nn
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.cli import main
 from vlatool.errors import DataError, ProfileError, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.hardware.profile import load_profile
@@ -204,12 +205,17 @@ def test_the_clock_runs_what_is_exported(deep: Bundle, tmp_path: Path):
 
 
 def test_the_clock_of_a_board_predicts_what_is_exported(deep: Bundle, tmp_path: Path):
-    of = (deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context())
+    told: list[str] = []
+    of = (deep, tmp_path, "", 1, dict(deep.manifest.made_by), Context(lambda what, _share: told.append(what)))
     clock = BoardClock(load_profile("raspberry-pi-4"), *of)
     whole, (shallow,) = clock.times([(Edit("main", "blocks", "blocks", (0,)),)])
     assert whole > shallow > 0
     assert whole == predictions(load_profile("raspberry-pi-4"), Bundle.open(tmp_path / "1-graphs"))[0].value
     assert clock.times([]) == (whole, []), "a prediction does not change from run to run"
+    clock.times([(Edit("main", "blocks", "blocks", (number,)),) for number in range(2)])
+    assert [what for what in told if "exporting" in what] == [
+        f"exporting without some of it: {number} of 2" for number in (1, 2)
+    ]
 
 
 def test_a_board_without_ground_is_refused(deep: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -261,9 +267,27 @@ def test_an_empty_choice_is_refused(deep: Bundle):
         LatencyPruning(target_ms=1, chosen="[]").change(load_modules(deep), deep, Context())
 
 
-def test_threads_are_not_predicted():
-    with pytest.raises(RecipeError, match="--threads is of measurements on this machine"):
-        LatencyPruning(target_ms=1, board="pi5", threads=2)
+@pytest.mark.parametrize("make", [
+    lambda: LatencyPruning(target_ms=1, board="pi5", threads=2),
+    lambda: LatencyPruning(target_ms=1, threads=2).on(load_profile("pi5")),
+])  # fmt: skip
+def test_threads_are_not_predicted(make: Callable[[], LatencyPruning]):
+    says = "--threads 2 is of measurements on this machine; .*5 is predicted as a whole"
+    with pytest.raises(RecipeError, match=says) as caught:
+        make()
+    assert caught.value.fix.startswith("leave --threads out")
+
+
+def test_the_command_line_predicts_for_a_board_in_a_child(
+    deep: Bundle, policy_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Options that nobody typed are not typed for the child either."""
+    words = ("prune", "latency", str(deep.path), "-o", str(tmp_path / "out"), "--profile", "raspberry-pi-5")
+    words = (*words, "--trust", str(policy_dir))
+    with pytest.raises(SystemExit) as left:
+        main([*words, "--target-ms", "1000"])
+    assert "is predicted to take" in capsys.readouterr().err
+    assert left.value.code == RecipeError.exit_code
 
 
 def test_a_target_that_a_board_meets_is_refused_before_the_ranking(

@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
+from vlatool.cli import main
 from vlatool.errors import RecipeError, SourceError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.gate.config import Gate
@@ -151,3 +152,13 @@ def test_what_cannot_have_fewer_steps_is_refused(schedule, to: int, says: str):
 def test_a_policy_without_repeats_is_refused(source_bundle: Bundle, tmp_path: Path):
     with pytest.raises(RecipeError, match="repeats no graph"):
         run_transform(Steps(to=1), source_bundle, tmp_path / "out", Context())
+
+
+def test_what_changed_is_said_and_not_that_nothing_did(folder: Path, one: Bundle, tmp_path: Path, capsys):
+    words = ["prune", "steps", str(folder), "--to", "1", "-o", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as left:
+        main(words)
+    assert not left.value.code
+    told = capsys.readouterr().out
+    assert "steps of 'head': 4 -> 1" in told
+    assert "weights 0.00 MB, no structural edits, 1 denoising step; not exported yet:" in told

@@ -53,6 +53,14 @@ def test_options_are_those_that_differ_from_the_defaults_and_build_the_stage_aga
     assert StaticInt8().options() == {}
 
 
+def test_what_was_given_builds_the_stage_again_and_says_what_was_not():
+    stage = build_stage("quantize.qat", {"layout": "ort", "steps": 8})
+    again = build_stage(stage.name(), stage.model_copy(update={"batch": 2}).given())
+    assert again == stage.model_copy(update={"batch": 2})
+    assert again.model_fields_set == {"layout", "steps", "batch"}
+    assert build_stage("quantize.qat", {}).given() == {}
+
+
 def test_every_wrong_option_is_listed():
     with pytest.raises(RecipeError) as caught:
         build_stage("quantize.static_int8", {"samples": 0, "methode": "minmax", "activations": "int4"})

@@ -3,6 +3,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
+from vlatool.user_code import children
+
 ENDING = """
 import os, signal
 from vlatool.user_code import children
@@ -23,3 +27,8 @@ server.process.wait = interrupted
 def test_ctrl_c_while_the_children_end_is_no_traceback() -> None:
     done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_vlatools_own_code_raises_is_a_bug_and_not_the_policys() -> None:
+    with pytest.raises(RuntimeError, match=r"^vlatool\.stage\._inside\.run failed: KeyError: 'stage'$"):
+        children.call("vlatool.stage._inside:run", {}, lambda *_: None, "policy.py")

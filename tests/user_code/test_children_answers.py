@@ -15,7 +15,7 @@ from vlatool.user_code import _answers as answers
         b'{"errno": "x", "message": "x", "file": null}', b'{"errno": 99999, "message": "x", "file": null}',
         b'{"errno": 32, "message": "x", "file": null}', b'{"errno": true, "message": "x", "file": 3}',
         b'{"raised": "X", "message": "m", "ours": 1}', b'{"raised": null, "message": "m", "ours": true}',
-        b'{"result": 1, "result": 2}',
+        b'{"raised": "X", "message": "m", "ours": true, "where": 3}', b'{"result": 1, "result": 2}',
     ],
 )  # fmt: skip
 def test_what_no_child_says_is_nonsense(line: bytes):
@@ -34,6 +34,12 @@ def test_what_no_child_says_is_nonsense(line: bytes):
         ({"error": "UsageError", "message": "m", "fix": "f"}, SourceError, "^policy.py failed: UsageError: m$"),
         ({"error": "sys", "message": "m\x1b[2J", "fix": "f"}, SourceError, r"^policy.py failed: m \[2J$"),
         ({"raised": "X", "message": "m", "ours": True}, SourceError, "the process that runs it failed: X: m"),
+        ({"raised": "X", "message": "m", "ours": True, "where": ""}, SourceError, "that runs it failed: X: m"),
+        (
+            {"raised": "X", "message": "m", "ours": True, "where": "vlatool.a.b"},
+            RuntimeError,
+            "^vlatool.a.b failed: X: m$",
+        ),
         ({"raised": "X", "message": "m", "ours": False}, SourceError, "policy.py raised X: m"),
         ({"errno": 28, "message": "full", "file": None}, OSError, "full"),
         ({"memory": True}, MemoryError, "^$"),

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import CALIBRATION
-from vlatool.distill._student import student_steps
+from vlatool.distill._student import DEPTH, student_steps
 from vlatool.errors import DataError, RecipeError
 from vlatool.stage.base import Context, Transform, build_stage
 from vlatool.training.expert import RECORD, expert_loss
@@ -46,6 +46,10 @@ class PolicyDistillation(ImitationStage):
         description="make the student of SOURCE first: the share of the blocks of each stack and of the "
         "multiply-accumulates that stays, such as depth=0.5,width=0.75",
     )
+    include: tuple[str, ...] = Field(
+        (), description="globs of stacks that lose blocks by --student depth=...; the trunk's when empty"
+    )
+    exclude: tuple[str, ...] = Field((), description="globs of stacks that --student depth=... leaves as they are")
     alpha: float = Field(
         1.0,
         ge=0,
@@ -64,12 +68,16 @@ class PolicyDistillation(ImitationStage):
 
     def chain(self) -> tuple[Transform, ...]:
         """The stages that make the student, then the training."""
-        made = [build_stage(name, options) for name, options in student_steps(self.student)]
-        return *(stage for stage in made if isinstance(stage, Transform)), self.model_copy(update={"student": ""})
+        stacks = {name: globs for name, globs in (("include", self.include), ("exclude", self.exclude)) if globs}
+        made = [build_stage(name, options | (stacks if name == DEPTH else {}))
+                for name, options in student_steps(self.student)]  # fmt: skip
+        left = self.model_copy(update={"student": "", "include": (), "exclude": ()})
+        return *(stage for stage in made if isinstance(stage, Transform)), left
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """What the teacher and the expert are asked for fits together, and is there."""
         super().check(source, profile)
+        self._check_stacks()
         if self.alpha == 1 and self.label_share < 1:
             raise RecipeError(
                 "--label-share is of the expert's actions, and --alpha 1 uses none of them.",
@@ -98,6 +106,14 @@ class PolicyDistillation(ImitationStage):
         if self.alpha < 1 and source is not None and CALIBRATION not in source.manifest.files:
             raise DataError(
                 f"--alpha {self.alpha:g} needs an expert's actions, and {source.path} has no recording.", RECORD
+            )
+
+    def _check_stacks(self) -> None:
+        named = "--include" if self.include else "--exclude"
+        if (self.include or self.exclude) and DEPTH not in dict(student_steps(self.student)):
+            raise RecipeError(
+                f"{named} names stacks of blocks, and the student loses none: --student is '{self.student}'.",
+                "ask for fewer blocks, such as --student depth=0.5; weights are named to vlatool prune structured",
             )
 
     def supervision(self) -> Supervision:

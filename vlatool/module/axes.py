@@ -88,8 +88,7 @@ class Walk(Values):
             whole = self.shapes.get(node.args[0])
             self.shapes[node] = whole[node.args[1]] if isinstance(whole, list) and whole else self._fresh(node)
             return
-        name = getattr(node.target, "_opname", None) or str(node.target).split(".")[-2]
-        rule = RULES.get(name)
+        rule = RULES.get(getattr(node.target, "_opname", ""))  # what computes a size has no name of an operator
         counted = len(self.products)
         try:
             given = rule(self, node) if rule is not None else None

@@ -53,7 +53,12 @@ class Values:
 
 def sizes_of(value: Any) -> list[int]:
     """Return the sizes of a value; a free one by the example that was traced."""
-    return [size if isinstance(size, int) else int(size.node.hint) for size in value.shape]
+    return [size_of(size) for size in value.shape]
+
+
+def size_of(size: Any) -> int:
+    """Return a size, a free one by the example that was traced."""
+    return size if isinstance(size, int) else int(size.node.hint)
 
 
 def _same(walk: Values, node: Any) -> Shape:

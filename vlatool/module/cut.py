@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
+from vlatool.module._resized import Resizer
 from vlatool.module.axes import Walk
+from vlatool.module.edit import AGAIN
 from vlatool.module.factors import Shape
 from vlatool.module.factory import exits_caught
 from vlatool.module.to_onnx import quiet_exporter
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
     from vlatool.module.edit import Edit
 
-SIZED = {"reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "unflatten": 2}
-"""Operator -> which of its arguments lists sizes of what it gives."""
 RETRACE = "vlatool_retrace"
 """Attribute of a cut module that takes one batch size alone: gives the same module for another size."""
 
@@ -101,8 +100,9 @@ def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> n
     program = traced(module, feeds)
     walk = Walk(program)
     keep = {_leaf(walk, edit): edit.keep for edit in edits}
-    for node in program.graph.nodes:
-        _resize(walk, node, keep)
+    resizer = Resizer(walk, keep)
+    for node in list(program.graph.nodes):
+        resizer.resize(node)
     state = program.state_dict
     for name, shape in walk.weights.items():
         value = state[name] if name in state else program.constants[name]
@@ -125,10 +125,11 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     shape = walk.weights.get(edit.module, [])
     leaves = walk.factors.leaves(shape[axis]) if axis < len(shape) else ()
     if place >= len(leaves) or walk.factors.is_frozen(leaves[place]):
-        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.")
+        raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.", AGAIN)
     if max(edit.keep) >= walk.factors.sizes[leaves[place]]:
         size = walk.factors.sizes[leaves[place]]
-        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}; an edit keeps {max(edit.keep)}.")
+        kept = f"numbered from 0; an edit keeps number {max(edit.keep)}"
+        raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}, {kept}.", AGAIN)
     return leaves[place]
 
 
@@ -146,35 +147,6 @@ def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[i
             rows = (rows[:, None] * size + chosen[None]).reshape(-1)
         value = value.detach().index_select(number, rows.to(value.device)).contiguous()
     return value
-
-
-def _resize(walk: Walk, node: Any, keep: Mapping[int, Sequence[int]]) -> None:
-    """Write the new sizes into an operator that states sizes."""
-    if node.op != "call_function":
-        return
-    name = getattr(node.target, "_opname", "")
-    shape = walk.shape(node)
-    if name in SIZED and shape is not None:
-        place = SIZED[name]
-        stated = list(node.args[place])
-        offset = len(shape) - len(stated) if name != "unflatten" else node.args[1] % len(shape)
-        for number, size in enumerate(stated):
-            if isinstance(size, int) and size > 0:
-                stated[number] = _kept_size(walk, shape[number + offset], keep)
-        node.args = (*node.args[:place], stated, *node.args[place + 1 :])
-    elif name.startswith("conv") and len(node.args) > 6 and node.args[6] > 1 and shape is not None:
-        node.args = (*node.args[:6], _kept_size(walk, shape[1], keep))
-    elif name in ("split", "split_with_sizes"):
-        shapes = walk.parts(node)
-        along = (node.args[2] if len(node.args) > 2 else node.kwargs.get("dim", 0)) % len(shapes[0])
-        sizes = [_kept_size(walk, part[along], keep) for part in shapes]
-        node.args = (node.args[0], sizes if name == "split_with_sizes" else sizes[0], *node.args[2:])
-
-
-def _kept_size(walk: Walk, axis: Iterable[int], keep: Mapping[int, Sequence[int]]) -> int:
-    return math.prod(
-        len(keep[leaf]) if leaf in keep else walk.factors.sizes[leaf] for leaf in walk.factors.leaves(axis)
-    )
 
 
 def _share(source: nn.Module, target: nn.Module) -> None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+AGAIN = "make the bundle again from its policy: vlatool prune, or vlatool rebuild; edits are not written by hand"
+"""What to do about an edit that does not fit."""
+
 
 @dataclass(frozen=True)
 class Edit:

@@ -22,6 +22,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, nearest, require
 from vlatool.files.json import read_json
 from vlatool.module.cut import cut
+from vlatool.module.edit import AGAIN
 from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
 
@@ -32,6 +33,12 @@ FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
 CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
 AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d")
+FORM = (
+    "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with digits) and keep (different whole "
+    "numbers from 0)"
+)
+MOST_KNOWN = 20
+"""Names of modules that a message lists."""
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
 
@@ -70,15 +77,16 @@ def edits_from(text: str | bytes, where: str) -> tuple[Edit, ...]:
     Raises:
         SourceError: when it is not one.
     """
-    listed = read_json(text.encode() if isinstance(text, str) else text, where, SourceError, "make the bundle again")
+    content = text.encode() if isinstance(text, str) else text
+    listed = read_json(content, where, SourceError, AGAIN, strict=True)
     if not isinstance(listed, list):
-        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.")
+        raise SourceError(f"{where} must hold a list of edits; got {type(listed).__name__}.", AGAIN)
     return tuple(_edit(entry, where) for entry in listed)
 
 
 def _edit(value: Any, where: str) -> Edit:
     if not _is_edit(value):
-        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}.")
+        raise SourceError(f"{where} has an invalid edit: {json.dumps(value)[:200]}; wanted {FORM}.", AGAIN)
     return Edit(str(value["graph"]), str(value["module"]), value["axis"], tuple(value["keep"]))
 
 
@@ -140,8 +148,10 @@ def apply(
         for edit in group:
             parts = dict(_named(made, edit.graph).named_modules())
             if edit.module not in parts:
-                known = list(parts)[:500]
-                raise SourceError(f"An edit names the module '{edit.module}'; {nearest(edit.module, known)}.")
+                known = [name for name in parts if name][:MOST_KNOWN]
+                more = f" and {len(parts) - 1 - len(known)} more" if len(parts) - 1 > len(known) else ""
+                says = f"An edit names the module '{edit.module}'; {nearest(edit.module, known)}{more}."
+                raise SourceError(says, AGAIN)
             _CHANGED.add(made[edit.graph])
             (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
     return made
@@ -149,7 +159,7 @@ def apply(
 
 def _named(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
     if graph not in modules:
-        raise SourceError(f"An edit names the graph '{graph}'; {nearest(graph, modules)}.")
+        raise SourceError(f"An edit names the graph '{graph}'; {nearest(graph, modules)}.", AGAIN)
     return modules[graph]
 
 
@@ -188,9 +198,10 @@ def _keep(module: Any, edit: Edit) -> None:
     torch = require("torch", "build")
     size = next((name for name in SIZES[edit.axis] if hasattr(module, name)), "")
     if not size or getattr(module, "groups", 1) != 1 or getattr(module, "transposed", False):
-        raise SourceError(f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.")
+        raise SourceError(f"The {edit.axis} of '{edit.module}' ({type(module).__name__}) cannot be chosen from.", AGAIN)
     if max(edit.keep) >= getattr(module, size):
-        raise SourceError(f"'{edit.module}' has {getattr(module, size)} {edit.axis}; an edit keeps {max(edit.keep)}.")
+        has = f"'{edit.module}' has {getattr(module, size)} {edit.axis}"
+        raise SourceError(f"{has}, numbered from 0; an edit keeps number {max(edit.keep)}.", AGAIN)
     axis = CHANNELS.index(edit.axis)
     for holder in (module._parameters, module._buffers):
         for name, value in holder.items():
@@ -205,10 +216,13 @@ def _keep_blocks(module: Any, edit: Edit) -> None:
     """Keep blocks; those of a list, and those that are numbered, are numbered anew."""
     nn = require("torch", "build").nn
     if not isinstance(module, nn.ModuleList | nn.Sequential):
-        raise SourceError(f"The blocks of '{edit.module}' ({type(module).__name__}) cannot be chosen from.")
+        kind = type(module).__name__
+        said = f"The blocks of '{edit.module}' ({kind}) cannot be chosen from: it is no nn.ModuleList or nn.Sequential."
+        raise SourceError(said, AGAIN)
     blocks = list(module._modules.items())
     if max(edit.keep) >= len(blocks):
-        raise SourceError(f"'{edit.module}' has {len(blocks)} blocks; an edit keeps {max(edit.keep)}.")
+        has = f"'{edit.module}' has {len(blocks)} blocks, numbered from 0"
+        raise SourceError(f"{has}; an edit keeps number {max(edit.keep)}.", AGAIN)
     module._modules.clear()
     for number, index in enumerate(edit.keep):
         name, block = blocks[index]

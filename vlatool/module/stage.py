@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
-from vlatool.errors import BundleError, SourceError, VlatoolError, require
+from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
 from vlatool.module.description import read_location
 from vlatool.module.edits import FOLDER, Edit, apply, holds_weights, joined_edits, read_edits, write_module
@@ -90,13 +91,13 @@ class ModuleStage(Transform):
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return how large the modules are, and how to go on."""
         size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
-        folder, edits = read_location(bundle.path), len(read_edits(bundle))
+        folder, edits = read_location(bundle.path), _structure(bundle)
         export = f"vlatool export {bundle.path} -o BUNDLE --trust {folder}"
         if not holds_weights(bundle):
             streams = f"vlatool quantize weight-only {bundle.path} -o BUNDLE --trust {folder}"
-            stay = f"weights stay in the shards in {folder}, {edits} structural edits; not exported yet:"
+            stay = f"weights stay in the shards in {folder}, {edits}; not exported yet:"
             return (stay, export, f"{streams}    # one weight in memory at a time")
-        return (f"weights {size / 1e6:.2f} MB, {edits} structural edits; not exported yet:", export)
+        return (f"weights {size / 1e6:.2f} MB, {edits}; not exported yet:", export)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Change the modules, write them, and run the policy once."""
@@ -108,7 +109,8 @@ class ModuleStage(Transform):
             _run_once(changed)
             return changed
         changed = self._changed(bundle, out, context)
-        torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
+        with _weights_blamed(lambda: load_modules(changed)):
+            torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
 
     def _changed(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
@@ -137,6 +139,36 @@ class ModuleStage(Transform):
         return changed
 
 
+@contextlib.contextmanager
+def _weights_blamed(modules: Callable[[], Mapping[str, nn.Module]]) -> Iterator[None]:
+    """Say of an answer that is not finite which weight makes it so, where one does.
+
+    Raises:
+        SourceError: naming the first weight that is not finite.
+    """
+    try:
+        yield
+    except GraphError as error:
+        for graph, module in modules().items():
+            for name, value in module.named_parameters():
+                if wrong := int((~value.detach().isfinite()).sum()):
+                    raise SourceError(
+                        f"The policy's weight '{name}' of '{graph}' is not finite in {wrong:,} of {value.numel():,} "
+                        "values, and so is what the policy gives.",
+                        "take weights from before the training that broke them",
+                    ) from error
+        raise
+
+
+def _structure(bundle: Bundle) -> str:
+    """Say how much of the structure is not as the policy's own code makes it."""
+    edits = len(read_edits(bundle))
+    told = f"{edits or 'no'} structural edit{'s' if edits != 1 else ''}"
+    fewer = any(entry.get("stage") == "prune.steps" for entry in bundle.manifest.build)
+    turns = [step.repeat for step in bundle.manifest.program if fewer and step.carry]
+    return ", ".join([told, *(f"{count} denoising step{'s' if count != 1 else ''}" for count in turns)])
+
+
 def _run_once(bundle: Bundle) -> None:
     """Run a policy whose weights are in shards: with their values where that is quick, with shapes alone else.
 
@@ -145,7 +177,7 @@ def _run_once(bundle: Bundle) -> None:
     """
     stored = stored_modules(bundle)
     if stored.nbytes < RUN_BELOW:
-        with weights_read(stored):
+        with weights_read(stored), _weights_blamed(lambda: stored.modules):
             policy_of(bundle, stored.modules, SEED).infer(observations_for(bundle, 1)[0])
         return
     try:

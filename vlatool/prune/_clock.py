@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -51,12 +51,19 @@ class Clock:
 
         They are medians of the whole policy's calls times ratios of lower percentiles, which other programs move less.
         """
-        paths = [self._whole, *(self._export(edits) for edits in pruned)]
+        paths = [self._whole, *self._exports(pruned)]
         job = LatencyJob(tuple(map(str, paths)), self._engine, self._threads, CALLS, SECONDS, check=False)
         measured = agent.measure(job, self._context.tell)
         low, *others = (float(np.percentile(policy.samples, UNDISTURBED)) for policy in measured.policies)
         whole = float(np.median(measured.policies[0].samples))
         return whole, [ms / low * whole for ms in others]
+
+    def _exports(self, pruned: Sequence[Sequence[Edit]]) -> Iterator[Path]:
+        """Export the policy after each list of edits, and tell how far that is."""
+        for number, edits in enumerate(pruned, 1):
+            if len(pruned) > 1:
+                self._context.tell(f"exporting without some of it: {number} of {len(pruned)}", number / len(pruned))
+            yield self._export(edits)
 
     def _export(self, edits: Sequence[Edit]) -> Path:
         """Return the place of a bundle in ONNX of the policy after edits."""
@@ -90,7 +97,7 @@ class BoardClock(Clock):
         Raises:
             RecipeError: when the latency model has no ground for this board and engine.
         """
-        whole, *others = (self._ms(path) for path in [self._whole, *map(self._export, pruned)])
+        whole, *others = (self._ms(path) for path in [self._whole, *self._exports(pruned)])
         return whole, others
 
     def _ms(self, path: Path) -> float:

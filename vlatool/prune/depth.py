@@ -81,6 +81,11 @@ class Depth(ModuleStage):
         """
         sizes = self._chosen(self._sizes(modules), source)
         left = _listed_blocks(sizes, self.keep) if self.keep else self._left(sizes, modules, source, context)
+        context.said.extend(
+            f"kept {len(kept)} of {sizes[graph, name]} blocks of {name or 'the module itself'}: "
+            f"{', '.join(map(str, kept))}"
+            for (graph, name), kept in left.items()
+        )
         edits = [Edit(graph, name, BLOCKS, tuple(kept)) for (graph, name), kept in left.items()]
         return Changed(tuple(sorted(edits, key=lambda edit: -len(edit.module))))  # stacks within blocks first
 

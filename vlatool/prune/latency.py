@@ -79,7 +79,7 @@ class LatencyPruning(ModuleStage):
         """Return the stage that predicts for a board, or measures where the board is this machine.
 
         Raises:
-            RecipeError: when its profile cannot be found by its name, or another board was named.
+            RecipeError: when its profile cannot be found by its name, another board was named, or threads were.
         """
         if self.board:
             if load_profile(self.board) != profile:
@@ -93,6 +93,7 @@ class LatencyPruning(ModuleStage):
                 f"The bundle records for which board it was pruned, and {profile.name} is not a known profile.",
                 "name its file: --board FILE, or add its folder to VLATOOL_PROFILES",
             )
+        self._refuse_threads(profile.name)
         return self.model_copy(update={"board": profile.name})
 
     @model_validator(mode="after")
@@ -106,9 +107,15 @@ class LatencyPruning(ModuleStage):
         if self.board and not self.chosen:
             board = load_profile(self.board)
             _ = Candidate(board, board.default_mode, self.engine or board.engine).figures
-            if "threads" in self.model_fields_set:
-                raise RecipeError("--threads is of measurements on this machine; a board is predicted as a whole.")
+            self._refuse_threads(self.board)
         return self
+
+    def _refuse_threads(self, board: str) -> None:
+        if "threads" in self.model_fields_set and not self.chosen:
+            raise RecipeError(
+                f"--threads {self.threads} is of measurements on this machine; {board} is predicted as a whole.",
+                "leave --threads out, or measure here: leave --profile and --board out",
+            )
 
     def key(self, source_hash: str) -> str:
         """Return the cache key, with what predictions rest on besides the model: the profile, and own measurements."""

@@ -49,7 +49,12 @@ class Steps(ModuleStage):
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Change the program alone."""
-        return Changed(program=self._program(source.manifest.program))
+        before, program = source.manifest.program, self._program(source.manifest.program)
+        context.said.extend(
+            f"steps of '{old.graph}': {old.repeat} -> {new.repeat}"
+            for old, new in zip(before, program, strict=True) if old != new
+        )  # fmt: skip
+        return Changed(program=program)
 
     def _program(self, steps: Sequence[ProgramStep]) -> tuple[ProgramStep, ...]:
         if all(step.repeat == 1 for step in steps):

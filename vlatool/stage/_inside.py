@@ -25,14 +25,16 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
         BundleError: when what it wrote is not a whole bundle.
     """
     job = {**_job(stage, source, context), "out": str(draft)}
-    children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), PRELOAD)
+    answer = children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), PRELOAD)
+    said = answer.get("said") if isinstance(answer, Mapping) else None
+    context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
     return Bundle.open(draft)
 
 
 def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any]:
     """Return what a child needs to know of a stage."""
     return {
-        "stage": stage.name(), "options": stage.model_dump(mode="json"), "workers": context.workers,
+        "stage": stage.name(), "options": stage.given(), "workers": context.workers,
         "launcher": context.launcher,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
         "events": context.events, "video": context.video,
@@ -40,13 +42,14 @@ def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any
 
 
 def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> dict[str, Any]:
-    """Run the stage of a job in this process; return the hash of the bundle that it made."""
+    """Run the stage of a job in this process; return the hash of the bundle that it made, and what is said of it."""
     stage = build_stage(job["stage"], job["options"])
     if not isinstance(stage, Transform):
         raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
-    bundle = stage.run(source, Path(job["out"]), _context(job, tell))
-    return {"hash": bundle.hash}
+    context = _context(job, tell)
+    bundle = stage.run(source, Path(job["out"]), context)
+    return {"hash": bundle.hash, "said": context.said}
 
 
 def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle, context: Context) -> Report:

@@ -59,6 +59,7 @@ class Context:
             it forgets them. Nothing is kept when None.
         kept: What is kept of this run, once a stage has opened it.
         notes: Gets sentences on how it was computed that belong into the report.
+        said: Gets sentences on what a stage that makes a bundle did, which the command line prints.
     """
 
     tell: Tell = field(default=_silent)
@@ -71,6 +72,7 @@ class Context:
     unfinished: list[Path] | None = None
     kept: Store | None = None
     notes: list[str] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)
 
 
 class SampleSet:
@@ -133,6 +135,10 @@ class Stage(Numeric):
     def options(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, as JSON values."""
         return self.model_dump(mode="json", exclude_defaults=True)
+
+    def given(self) -> dict[str, Any]:
+        """Return the options that were given, as JSON values: the same stage is built of them, which knows it too."""
+        return self.model_dump(mode="json", exclude_unset=True)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Raise a user error when this stage cannot run on that source; cheap."""

@@ -7,6 +7,7 @@ import os
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import BundleError, DataError, VlatoolError
@@ -94,9 +95,13 @@ def first_steps(
 
 def _alone(step: Transform, stage: Transform) -> str:
     """Return in words which stage of several failed, and how to give it other options."""
-    options = ", ".join(f"{name} {value}" for name, value in step.options().items())
+    options = ", ".join(f"{name} {_words(value)}" for name, value in step.given().items())
     command = f"vlatool {step.name().replace('.', ' ').replace('_', '-')}"
     return f"{stage.name()} starts with {step.name()} ({options}); to give it other options, run it first: {command}"
+
+
+def _words(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:

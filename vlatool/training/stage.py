@@ -241,8 +241,8 @@ class TrainingStage(ModuleStage):
     def _job(self, source: Bundle) -> dict[str, Any]:
         """Return what another process of the training needs to know."""
         threads = require("torch", "build").get_num_threads()
-        options = self.model_dump(mode="json")
-        return {"stage": self.name(), "options": options, "source": str(source.path.absolute()), "threads": threads}
+        place = str(source.path.absolute())
+        return {"stage": self.name(), "options": self.given(), "source": place, "threads": threads}
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Train; what a run that is killed goes on from is there until the result is written."""

@@ -1,7 +1,8 @@
 """What a child that runs a user's code says, checked before it is believed: that code can write what it likes.
 
 A policy shares its process with the function of vlatool that answers, and can answer in its place. It decides neither
-the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks.
+the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks,
+unless vlatool's own code raised what it should not have.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def _makes_sense(line: Mapping[str, Any]) -> bool:
         case {"progress": [str(), int() | float() as share]}:
             return math.isfinite(share)
         case {"error": str(), "message": str(), "fix": str()} | {"raised": str(), "message": str(), "ours": bool()}:
-            return True
+            return isinstance(line.get("where", ""), str)
         case {"errno": int(number), "message": str(), "file": None | str()}:
             return number in errno.errorcode and number not in ENDINGS
     return False
@@ -68,7 +69,8 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
 
     Raises:
         InputError, MissingExtra: of the class that is named.
-        SourceError: for everything else that was raised; RuntimeError where ``own``.
+        SourceError: for everything else that was raised.
+        RuntimeError: for a bug of vlatool: where ``own``, or where its code raised it.
         OSError, MemoryError: what the child met.
     """
     if "result" in answer:
@@ -85,6 +87,8 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     if "errno" in answer:
         raise OSError(answer["errno"], message, answer["file"] and shortened(answer["file"], LONGEST))
     name = plain(answer["raised"])
+    if where := plain(answer.get("where", "")):
+        raise RuntimeError(f"{where} failed: {name}: {message}")
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
     if answer["ours"]:

@@ -185,7 +185,15 @@ def _raised(error: BaseException) -> dict[str, Any]:
     if os.environ.get("VLATOOL_DEBUG"):
         traceback.print_exc()
     lines = message_of(error).strip().splitlines()
-    return {"raised": type(error).__name__, "message": lines[0] if lines else "", "ours": isinstance(error, Exception)}
+    told = {"raised": type(error).__name__, "message": lines[0] if lines else "", "ours": isinstance(error, Exception)}
+    return {**told, "where": _place_of_bug(error) if isinstance(error, Exception) else ""}
+
+
+def _place_of_bug(error: BaseException) -> str:
+    """Return the function of vlatool that raised an exception itself; empty where other code did."""
+    frame = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][-1]
+    module = str(frame.f_globals.get("__name__", ""))
+    return f"{module}.{frame.f_code.co_name}" if module.startswith("vlatool.") else ""
 
 
 def _function(name: str) -> Callable[..., Any]:

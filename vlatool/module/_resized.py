@@ -1,0 +1,102 @@
+"""Operators of a traced module that state sizes, after some elements of its weights are gone."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from vlatool.module.axes import Walk
+from vlatool.module.axis_rules import size_of
+
+SIZED = {"reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "unflatten": 2}
+"""Operator -> which of its arguments lists sizes of what it gives."""
+
+
+class Resizer:
+    """Writes the new sizes into operators that state some.
+
+    Args:
+        walk: Of the graph.
+        keep: Factor -> its elements that stay.
+    """
+
+    def __init__(self, walk: Walk, keep: Mapping[int, Sequence[int]]) -> None:
+        self._walk, self._keep = walk, keep
+
+    def resize(self, node: Any) -> None:
+        """Change one operator.
+
+        Raises:
+            RuntimeError: naming operator and layer, for a form of the operator that is not known here.
+        """
+        if node.op != "call_function":
+            return
+        name = getattr(node.target, "_opname", "")
+        try:
+            if name in SIZED and self._walk.shape(node) is not None:
+                self._stated(node, SIZED[name])
+            elif name.startswith("conv"):
+                self._grouped(node)
+            elif name in ("split", "split_with_sizes"):
+                self._split(node, name)
+        except (IndexError, KeyError, TypeError, ValueError) as error:
+            raise RuntimeError(
+                f"the new sizes of '{name}' in the layer '{layer_of(node)}' cannot be found "
+                f"({type(error).__name__}: {error}); its arguments are {node.args}"
+            ) from error
+
+    def size(self, axis: Iterable[int]) -> int:
+        """Return how many elements an axis has afterwards."""
+        keep, sizes = self._keep, self._walk.factors.sizes
+        return math.prod(len(keep[leaf]) if leaf in keep else sizes[leaf] for leaf in self._walk.factors.leaves(axis))
+
+    def _stated(self, node: Any, place: int) -> None:
+        """Change the sizes in a list; those that are given for a batch of any size too."""
+        if not isinstance(node.args[place], list | tuple):  # of another kind, such as view(dtype)
+            return
+        shape, stated = self._walk.needed(node), list(node.args[place])
+        apart = len(shape) - len(stated)
+        first = apart if len(node.args) <= place or place == 1 else node.args[1] % (apart + 1)
+        for number, size in enumerate(stated):
+            axis = shape[number + first]
+            if hasattr(size, "op"):
+                stated[number] = self._scaled(node, size, self.size(axis))
+            elif size > 0:
+                stated[number] = self.size(axis)
+        node.args = (*node.args[:place], stated, *node.args[place + 1 :])
+
+    def _scaled(self, node: Any, size: Any, wanted: int) -> Any:
+        """Return a node for a size that is computed, such as that of the batch times the heads.
+
+        What it depends on is the batch alone, in proportion: what it is in the trace says what is left of it.
+        """
+        given = size_of(size.meta["val"])
+        if given == wanted:
+            return size
+        common = math.gcd(given, wanted)
+        graph = node.graph
+        with graph.inserting_before(node):
+            more = graph.call_function(operator.mul, (size, wanted // common))
+            less = graph.call_function(operator.floordiv, (more, given // common))
+        for made in (more, less):
+            made.meta = {**node.meta, "val": size.meta["val"]}
+        return less
+
+    def _grouped(self, node: Any) -> None:
+        shape = self._walk.shape(node)
+        if len(node.args) > 6 and node.args[6] > 1 and shape is not None:
+            node.args = (*node.args[:6], self.size(shape[1]))
+
+    def _split(self, node: Any, name: str) -> None:
+        shapes = self._walk.parts(node)
+        along = (node.args[2] if len(node.args) > 2 else node.kwargs.get("dim", 0)) % len(shapes[0])
+        sizes = [self.size(part[along]) for part in shapes]
+        node.args = (node.args[0], sizes if name == "split_with_sizes" else sizes[0], *node.args[2:])
+
+
+def layer_of(node: Any) -> str:
+    """Return the name of the layer that an operator is in; empty for the module itself."""
+    stack = list((node.meta.get("nn_module_stack") or {}).values())
+    return str(stack[-1][0]).removeprefix("L['self'].") if stack else ""
