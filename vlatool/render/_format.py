@@ -7,7 +7,7 @@ import re
 import unicodedata
 from typing import Any
 
-from vlatool.report import Measurement
+from vlatool.report import COUNT, Measurement
 
 UNMEASURED = "unmeasured"
 NARROW_SPACE = "\u202f"
@@ -137,7 +137,7 @@ def _scale(measurement: Measurement) -> tuple[float, str]:
         return 100.0, "points" if is_points(measurement) else "%"
     if measurement.unit == "m" and measurement.name.startswith("error"):
         return 1000.0, "mm"
-    return 1.0, {"1": "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
+    return 1.0, {"1": "", COUNT: "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
 
 
 def unit(measurement: Measurement) -> str:
