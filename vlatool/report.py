@@ -23,6 +23,8 @@ TRAINING_TIME = "training_time."
 """The same of measurements of how long it took, in seconds."""
 COUNT = "count"
 """Unit of a number of things, which may be a mean of such numbers; ``1`` is a share."""
+NO_INTERVAL = "no interval: "
+"""What the part of a note begins with that says why a number that usually has an interval has none."""
 ORIGINS = ("measured", "predicted")
 VERDICTS = ("pass", "fail", "inconclusive", "info")
 ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")
