@@ -21,6 +21,10 @@ TEACHER = ", and its teacher"
 """What the name of the details ends with that say how much the teacher of a training counted."""
 TRAINING_TIME = "training_time."
 """The same of measurements of how long it took, in seconds."""
+COUNT = "count"
+"""Unit of a number of things, which may be a mean of such numbers; ``1`` is a share."""
+NO_INTERVAL = "no interval: "
+"""What the part of a note begins with that says why a number that usually has an interval has none."""
 ORIGINS = ("measured", "predicted")
 VERDICTS = ("pass", "fail", "inconclusive", "info")
 ROLES = ("baseline", "chosen", "within", "outside", "failed", "subject")
@@ -35,7 +39,8 @@ class Measurement:
     Args:
         name: What was measured, for example ``latency_p50``.
         value: The number; NaN when it could not be had (then ``note`` says why).
-        unit: ``ms``, ``MB``, ``1`` (a share), ``x`` (a ratio), or the unit of an action element.
+        unit: ``ms``, ``MB``, ``1`` (a share), ``count`` (a number of things), ``x`` (a ratio), the unit of an action
+            element, or nothing where there is none.
         origin: ``measured`` (on ``where``) or ``predicted`` (for ``where``).
         where: The host, or the profile.
         samples: How many observations the number rests on.

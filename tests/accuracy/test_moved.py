@@ -8,6 +8,7 @@ import pytest
 
 from vlatool.accuracy.moved import drops_by_task, ratios, with_task_speedup
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.render._format import full
 from vlatool.report import Measurement, Row
 
 
@@ -113,3 +114,17 @@ def test_a_task_gains_what_more_steps_leave():
     task = with_task_speedup(row).get("task_speedup")
     assert (task.value, task.low, task.high) == (1.6, pytest.approx(1.9 / 1.3), pytest.approx(2.1 / 1.2))
     assert with_task_speedup(Row("a", measurements=(steps,))).get("task_speedup") is None
+
+
+@pytest.mark.parametrize(("pairs", "moves", "why"), [
+    (6, 6, "no interval: 6 pairs, and it takes 8"),
+    (400, 3, "no interval: too few pairs in which the baseline's is not 0"),
+    (400, 40, ""), (8, 8, ""),
+])  # fmt: skip
+def test_a_ratio_without_an_interval_says_why(pairs: int, moves: int, why: str):
+    base = [outcome("a", seed, True, 10, reversals=0.1 if seed < moves else 0.0) for seed in range(pairs)]
+    own = [outcome("a", seed, True, 10, reversals=0.2 if seed < moves else 0.0) for seed in range(pairs)]
+    ratio = rows(base, own)[1].get("reversals_ratio")
+    assert ratio.value == pytest.approx(2.0)
+    assert (ratio.low is None, ratio.high is None) == (bool(why), bool(why))
+    assert full(ratio) == f"2.00× ({why}, n = {pairs})" if why else "no interval" not in ratio.note

@@ -79,7 +79,7 @@ def test_success_is_counted_over_the_seeds_with_its_interval(int8_bundle, policy
 
 def test_a_baseline_plays_the_same_seeds_and_is_paired(paired):
     base, row = paired.rows
-    assert (base.name, base.role, row.name) == ("baseline", "baseline", "tiny")
+    assert (base.name.endswith("/bundle"), base.role, row.role) == (True, "baseline", "subject")
     assert base.raw["seed"] == row.raw["seed"]
     assert row.value("success_drop") == 0.0
     assert row.get("success_drop").low < 0 < row.get("success_drop").high

@@ -223,6 +223,20 @@ def test_a_ratio_that_would_be_printed_as_one_is_worth_no_sentence():
     assert list(told([row], "")) == ["Where both succeed, more than the baseline's: jerk 1.04x."]
 
 
+def under(*records: dict[str, object]) -> str:
+    return " ".join(told([Row("int8", details={"under disturbances": list(records)})], ""))
+
+
+def test_it_succeeds_least_only_where_it_loses():
+    light: dict[str, object] = {"disturbance": "light", "strength": 1.0, "baseline": 0.6667, "success": 0.6667}
+    same, better = {**light, "drop": 0.0}, {**light, "disturbance": "delay", "success": 0.7, "drop": -0.0333}
+    assert under(same, better) == "Under no disturbance does it succeed less often than the baseline."
+    worse = {**light, "disturbance": "push", "success": 0.6, "drop": 0.0667}
+    said = "It loses most beside the baseline under push: 60.0% succeed, 6.67 points fewer than of the baseline."
+    assert under(same, worse, better) == said
+    assert under(light) == "It succeeds least under light: 66.7%."
+
+
 def test_several_strengths_are_played_one_after_the_other(bundles: dict[str, Bundle]):
     report = evaluated(bundles, "eager", 20, disturb=("delay", "push"), strength="2,0,1,1")
     row = report.rows[-1]

@@ -56,7 +56,8 @@ def test_a_baseline_gets_its_row_and_the_bundle_its_distance_to_it(float_bundle,
     stage = Recorded(baseline=float_bundle.path)
     assert stage.inputs() == (float_bundle.path / "manifest.json",)
     base, row = stage.run(int8_bundle, Context()).rows
-    assert (base.name, base.role) == ("baseline", "baseline")
+    assert (base.role, row.role) == ("baseline", "subject")
+    assert len({base.name, row.name}) == 2, "by their folders: both bundles are of one policy"
     expected = np.abs(chunks(int8_bundle)[0] - chunks(float_bundle)[0]).mean(axis=(0, 1))
     assert row.value("error_baseline.dx") == pytest.approx(expected[0], rel=1e-4)
     assert row.value("error_baseline.dy") == pytest.approx(expected[1], rel=1e-4)

@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "telemetry"))
@@ -56,6 +57,18 @@ def test_beside_others_it_has_a_speed_up_and_no_refusals():
     assert told["speedup"].value == 3.0
     assert "latency_p99.9" not in told
     assert "cpu" not in told
+
+
+@pytest.mark.parametrize("calls", [1, 2, 3, 7, 10])  # of a round; the fewest are too few for a bound of the median
+def test_the_speed_up_is_the_quotient_of_the_medians_beside_it(calls):
+    for seed in range(20):
+        random = np.random.default_rng((seed, calls))  # a machine with two speeds: no call is near the middle
+        speeds = np.where(random.random((2, 20, calls)) < 0.5, 1.0, 2.0)
+        rounds = (speeds + 0.1 * random.random(speeds.shape)).tolist()
+        own, base = (PolicyRun(name, tuple(map(tuple, each)), ()) for name, each in zip("ab", rounds, strict=True))
+        what = run_of(own)
+        told, reference = ({each.name: each.value for each in measurements(what, one, base, 0)} for one in (own, base))
+        assert told["speedup"] == pytest.approx(reference["latency_p50"] / told["latency_p50"], rel=1e-12)
 
 
 def test_energy_of_a_jetson_is_that_of_its_input_rail(tmp_path):

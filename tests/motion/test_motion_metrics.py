@@ -12,6 +12,7 @@ import pytest
 
 from vlatool.motion.measure import measured, metrics
 from vlatool.motion.track import Track
+from vlatool.report import COUNT
 
 TRAJECTORIES = 1000
 
@@ -203,3 +204,11 @@ def test_one_step_and_nothing_told_give_what_can_be_known():
     assert measured(discrete) == {"task_time": 0.8}
     still = Track(5.0, np.zeros((9, 2)), np.arange(9) % 3 == 0, position=np.zeros((10, 2)), alike=(0, 1), shortest=0.0)
     assert measured(still) == {"task_time": 1.8, "path_length": 0.0, "jerk": 0.0, "action_rate": 0.0, "reversals": 0.0}
+
+
+@pytest.mark.parametrize(("name", "unit"), [
+    ("gripper_flips", COUNT), ("turns", COUNT), ("collisions", COUNT), ("reversals", "1"), ("spectral_arc_length", ""),
+])  # fmt: skip
+def test_counts_and_numbers_without_a_dimension_are_no_shares(name: str, unit: str):
+    assert metrics()[name].unit == unit
+    assert ("share" in (type(metrics()[name]).__doc__ or "").lower()) is (unit == "1")

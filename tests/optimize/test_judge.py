@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from vlatool.hardware.profile import load_profile
-from vlatool.optimize.choice import choose
+from vlatool.optimize.choice import choose, speed_words
 from vlatool.optimize.judge import Judged, judge
 from vlatool.optimize.recipe import Limits
 from vlatool.report import Measurement, Row
@@ -264,11 +264,15 @@ def test_a_speed_up_that_the_interval_does_not_show_is_none(p50, low, high):
     assert f"{p50:.4g} ms instead of 10 ms" in told
 
 
-def test_the_ratio_that_is_told_is_that_of_the_times_that_are_told():
-    speedup = Measurement("speedup", 9.0, "x", samples=20, low=8.0, high=10.0)
+@pytest.mark.parametrize("board", ["", "a board"])
+@pytest.mark.parametrize(("value", "low", "high"), [(2.52, 2.4, 2.6), (2.52, None, None), (0.959, 0.9, 1.1)])
+def test_the_ratio_that_is_told_is_that_of_the_table(board: str, value: float, low: float | None, high: float | None):
+    speedup = Measurement("speedup", value, "x", samples=20, low=low, high=high)
     latency, size = Measurement("latency_p50", 4.0, "ms", samples=20), Measurement("size", 1.0, "MB")
-    found = chosen(Row("int8", measurements=(latency, speedup, size, drop(0.0))))
-    assert "2.50x as fast as float32 (4 ms instead of 10 ms" in found.sentences[0]
+    told = speed_words(Row("int8", measurements=(latency, speedup, size, drop(0.0))), FLOAT, board)
+    assert f"{value:.3g}x" in told
+    assert "2.5x" not in told, "the quotient of rounded medians"
+    assert low is None or not (board or low < 1) or f"{low:.2f} to {high:.2f}" in told
 
 
 def test_a_candidate_that_is_not_faster_is_no_rival_of_one_that_is():

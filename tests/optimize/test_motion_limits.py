@@ -60,6 +60,13 @@ def test_motion_that_the_episodes_cannot_decide_is_a_warning():
     assert any(said in text for text in judged.warnings)
 
 
+def test_motion_without_an_interval_decides_nothing():
+    judged = held(row("int8", 5.0, Measurement("jerk_ratio", 1.0, "x", samples=6)), max_motion=0.05)
+    assert judged.within
+    said = "jerk is 1x that of float32; 6 pairs of episodes cannot exclude more than 5 %"
+    assert any(said in text for text in judged.warnings)
+
+
 def test_motion_that_is_unknown_keeps_no_limit():
     assert "its motion is unknown" in held(row("int8", 5.0), max_motion=0.05).row.reason
 

@@ -9,6 +9,7 @@ import pytest
 
 from vlatool.accuracy.disturbed import with_disturbed
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.render._format import label
 from vlatool.render.formats.html import HtmlRenderer
 from vlatool.render.formats.markdown import MarkdownRenderer
 from vlatool.render.sections.motion import Motion
@@ -64,3 +65,14 @@ def test_tables_of_a_report_from_elsewhere_are_drawn_as_far_as_they_go(report: R
     odd = replace(row, details={**row.details, **broken})
     page = HtmlRenderer().render(replace(report, rows=(base, odd)))
     assert "How it moves, and where it fails" in page
+
+
+@pytest.mark.parametrize(("name", "shown"), [
+    ("gripper_flips", "1.00"), ("turns", "1.00"), ("collisions", "1.00"), ("spectral_arc_length", "1.00"),
+    ("reversals", "100.0 %"),
+])  # fmt: skip
+def test_a_count_is_no_percentage_and_a_share_is(name: str, shown: str):
+    outcomes = [Outcome("open", seed, True, 40, "", {name: 1.0}) for seed in range(9)]
+    report = Report("evaluate", "a title", rows=(success_row("int8", "subject", outcomes),))
+    (line,) = (line for line in MarkdownRenderer().render(report).splitlines() if line.startswith(f"| {label(name)} "))
+    assert line.split("|")[2].split("(")[0].strip() == shown

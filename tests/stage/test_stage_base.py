@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -5,6 +8,7 @@ from pydantic import ValidationError
 
 from vlatool import __version__, registry
 from vlatool.benchmark.latency import Latency
+from vlatool.distill.policy import PolicyDistillation
 from vlatool.errors import RecipeError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.export.onnx import ExportOnnx
@@ -90,6 +94,23 @@ def test_the_key_follows_options_and_source_and_nothing_else():
     assert len(set(keys)) == 3
     assert DynamicInt8().key("a") == keys[0]
     assert all(len(key) == 16 and int(key, 16) >= 0 for key in keys)
+
+
+def test_the_key_of_a_training_is_the_same_in_other_processes_and_folders(tmp_path: Path):
+    code = "from vlatool.distill.policy import PolicyDistillation as Stage; print(Stage(steps=3).key('a'))"
+    for seed, folder in (("0", tmp_path), ("7", Path.cwd())):
+        other = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(folder)}
+        found = subprocess.run([sys.executable, "-c", code], env=other, cwd=folder, capture_output=True, check=True)
+        assert found.stdout.decode().strip() == PolicyDistillation(steps=3).key("a")
+
+
+def test_an_option_that_another_version_does_not_have_is_part_of_the_key_even_by_default(monkeypatch):
+    class Newer(DynamicInt8):
+        shard: bool = False
+
+    monkeypatch.setattr(Newer, "name", DynamicInt8.name)
+    assert Newer().options() == DynamicInt8().options()
+    assert Newer().key("a") != DynamicInt8().key("a")
 
 
 def test_the_key_follows_what_openvino_computes_in_and_that_of_an_export_does_not(monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.motion.measure import FEWEST, ratio_of
-from vlatool.report import Measurement, Row
+from vlatool.report import NO_INTERVAL, Measurement, Row
 from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
@@ -73,8 +73,13 @@ def with_task_speedup(row: Row) -> Row:
 
 def _ratio(name: str, ratio: tuple[float, float, float], count: int, note: str, confidence: float) -> Measurement:
     value, low, high = ratio
-    ends = (low, high) if np.isfinite(high) else (None, None)
-    return Measurement(name, value, "x", samples=count, low=ends[0], high=ends[1], confidence=confidence, note=note)
+    if np.isfinite(high):
+        return Measurement(name, value, "x", samples=count, low=low, high=high, confidence=confidence, note=note)
+    zeros = "too few pairs in which the baseline's is not 0"  # resamples have none of them, and no ratio
+    why = f"{count} pairs, and it takes {FEWEST}" if count < FEWEST else zeros
+    first, _, rest = note.partition("; ")
+    parts = (first, f"{NO_INTERVAL}{why}", *([rest] if rest else []))
+    return Measurement(name, value, "x", samples=count, confidence=confidence, note="; ".join(parts))
 
 
 class _Pairs:

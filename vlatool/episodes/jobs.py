@@ -104,6 +104,24 @@ def _located(job: EpisodesJob, begun: Set[str], *, away: bool) -> Iterator[None]
         raise
 
 
+def check_opens(bundles: Sequence[Bundle], job: EpisodesJob, engine: str, context: Context) -> None:
+    """Refuse, before episodes are played, a bundle that cannot be: each is opened once, golden action and all.
+
+    Args:
+        bundles: That will play.
+        job: Of any episodes.
+        engine: Of the runtime; the bundle's own when empty.
+        context: Progress and workers.
+
+    Raises:
+        BundleError, GraphError: when a bundle was changed, or its engine computes something else here.
+    """
+    for bundle in bundles:
+        name = context.launcher if bundle.manifest.graphs else PROCESSES
+        work = _work("opened", bundle, [job], engine, PRELOAD, away=name != PROCESSES)
+        list(launcher(name, 1).answers(work, context.tell, lambda _number, _answer: None, context.notes.append))
+
+
 def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
     """Return the disturbances that can be played: those that need no environment, and its own.
 

@@ -224,6 +224,16 @@ def play(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
     return answer
 
 
+def opened(request: Mapping[str, Any], _tell: Tell) -> None:
+    """Open the bundle of a ``Request`` in this process, as its episodes would.
+
+    Raises:
+        BundleError, GraphError: when it cannot be.
+    """
+    asked = from_json(Request, request)
+    _opened(Bundle.described(asked.bundle), asked.engine)
+
+
 def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)

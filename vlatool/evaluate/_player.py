@@ -22,7 +22,7 @@ class Player:
         bundle: Who acts.
         wait: How late its actions come; at once when None.
         engine: Of the runtime; the bundle's own when empty.
-        context: Progress and workers.
+        context: Progress, which says whose it is, and workers.
         most: Episodes that it will play at most.
         baseline: Who plays the same episodes before.
     """

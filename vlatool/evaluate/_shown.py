@@ -15,6 +15,7 @@ from vlatool.episodes.film import Film
 from vlatool.episodes.filmable import check_filmable
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, OutputError, SourceError, VlatoolError
+from vlatool.evaluate._names import names_of
 from vlatool.files.printable import message_of
 from vlatool.render.filmstrip import Shot, filmstrip
 from vlatool.render.video import write_video
@@ -113,7 +114,7 @@ def _filmed(
     with tempfile.TemporaryDirectory(prefix="vlatool-video-") as scratch:
         folders = [Path(scratch) / str(place) for place in range(len(plays))]
         found = [play([replace(again, film=str(folder))])[0] for play, folder in zip(plays, folders, strict=True)]
-        names = (*(["baseline"] if len(plays) > 1 else []), bundles[-1].manifest.name)
+        names = names_of(bundles)
         shots = [_shot(name, outcome, Film.open(folder))
                  for name, outcome, folder in zip(names, found, folders, strict=True)]  # fmt: skip
         episode = f"task '{again.task}', seed {again.seeds[0]}"

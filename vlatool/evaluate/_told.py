@@ -30,16 +30,27 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
         yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
     if steps and _is_more(steps):
         yield f"Over all episodes, it needs {_times(steps.value)} the steps."
-    if found := worst_record(row):
-        first, name = found
-        drop = f", {100 * first['drop']:.3g} points fewer than of the baseline" if first.get("drop", 0) > 0 else ""
-        yield f"It succeeds least{' beside the baseline' if 'drop' in first else ''} under {name}: " \
-              f"{first['success']:.1%}{drop}."  # fmt: skip
+    yield from _disturbed(row)
     latencies = {one.name: item.value for one in rows for item in one.measurements if item.name == LATE}
     if latencies:
         late = ", ".join(f"{name} {ms:.3g} ms" for name, ms in latencies.items())
         where = f"predicted for {board}" if board else "measured here"
         yield f"Actions come as late as inferences take ({where}): {late}."
+
+
+def _disturbed(row: Row) -> Iterator[str]:
+    """Yield a sentence on the disturbance that costs most, beside the baseline where there is one."""
+    if (found := worst_record(row)) is None:
+        return
+    worst, name = found
+    drop = worst.get("drop")
+    if drop is None:
+        yield f"It succeeds least under {name}: {worst['success']:.1%}."
+    elif drop > 0:
+        yield f"It loses most beside the baseline under {name}: {worst['success']:.1%} succeed, " \
+              f"{100 * drop:.3g} points fewer than of the baseline."  # fmt: skip
+    else:
+        yield "Under no disturbance does it succeed less often than the baseline."
 
 
 def _is_more(ratio: Measurement) -> bool:

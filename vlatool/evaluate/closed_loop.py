@@ -17,11 +17,12 @@ from vlatool.accuracy.paired import Outcome, compare_success, success_row, with_
 from vlatool.accuracy.shown import with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
-from vlatool.episodes.jobs import disturbances_of, run_jobs
+from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
 from vlatool.errors import DataError, SourceError, UsageError, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
+from vlatool.evaluate._names import BASELINE, names_of
 from vlatool.evaluate._player import Player
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._shown import check_video_of, played_again
@@ -148,13 +149,17 @@ class ClosedLoop(Measure):
         self._may_run(jobs[0])
         kinds = self._disturbances(source, jobs[0], context)
         bundles = [*([Bundle.open(self.baseline)] if self.baseline else []), source]
+        names = names_of(bundles)
         check_video_of(bundles, jobs[0], context)
+        if self.baseline:
+            check_opens(bundles, jobs[0], self.engine, context)
         waits = [latency_of(one, self.board, self.engine, context) if self.latency_in_the_loop else None
                  for one in bundles]  # fmt: skip
         plays: list[Player] = []
-        for one, wait in zip(bundles, waits, strict=True):
+        told_by = [context.about(whose) for whose in self._whose(names)]
+        for one, wait, teller in zip(bundles, waits, told_by, strict=True):
             most = sum(len(job.seeds) for job in jobs)
-            plays.append(Player(one, wait, self.engine, context, most, plays[0] if plays else None))
+            plays.append(Player(one, wait, self.engine, teller, most, plays[0] if plays else None))
         rows: list[Row] = []
         believed, decision = Credibility("unknown"), None
         if self.baseline and self.limit is not None:
@@ -164,14 +169,14 @@ class ClosedLoop(Measure):
         else:
             *reference, outcomes = (play(jobs) for play in plays)
         if self.baseline:
-            rows.append(self._reference(bundles[0], reference[0], context))
+            rows.append(self._reference(bundles[0], names[0], reference[0], context))
             believed = credibility(rows[0]) if self.instruction == "right" else believed
-        row = success_row(source.manifest.name, "subject", outcomes)
+        row = success_row(names[-1], "subject", outcomes)
         row = compare_success(rows[0], row) if rows else row
         row = with_decision(row, decision) if decision else row
         if kinds:
-            played = [self._disturbed(kinds, late(jobs, wait), one, context)
-                      for one, wait in zip(bundles, waits, strict=True)]  # fmt: skip
+            played = [self._disturbed(kinds, late(jobs, wait), one, context, whose)
+                      for one, wait, whose in zip(bundles, waits, self._whose(names), strict=True)]  # fmt: skip
             row = with_disturbed(row, played[-1], played[0] if self.baseline else None)
         again = played_again(jobs[0], [*reference, outcomes], plays, bundles, context)
         if again.outcomes:
@@ -203,25 +208,36 @@ class ClosedLoop(Measure):
             raise UsageError(f"There is no disturbance '{unknown[0]}'; {nearest(unknown[0], (*known, ALL))}.")
         return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
 
+    def _whose(self, names: Sequence[str]) -> list[str]:
+        """Return whose episodes are told of, for each variant; nothing for one alone."""
+        if self.control:
+            return [f"the control, {self.control} actions"] * len(names)
+        if len(names) < 2:
+            return [""]
+        base = f"the {BASELINE}" if names[0] == BASELINE else f"{names[0]}, the {BASELINE}"
+        return [base, names[-1]]
+
     def _disturbed(
-        self, kinds: Sequence[str], jobs: list[EpisodesJob], bundle: Bundle, context: Context
+        self, kinds: Sequence[str], jobs: list[EpisodesJob], bundle: Bundle, context: Context, whose: str
     ) -> dict[tuple[str, float], list[Outcome]]:
         """Return disturbance and strength -> the episodes of a bundle under it."""
         played = {}
         for kind, strength in product(kinds, self.strength):
-            context.tell(f"episodes under {kind}, strength {strength:g}", None)
+            under = f"under {kind}, strength {strength:g}"
             disturbed = [replace(job, disturb=kind, strength=strength) for job in jobs]
-            played[kind, strength] = run_jobs(bundle, disturbed, self.engine, context)
+            teller = context.about(f"{whose}, {under}" if whose else under)
+            played[kind, strength] = run_jobs(bundle, disturbed, self.engine, teller)
         return played
 
-    def _reference(self, baseline: Bundle, outcomes: list[Outcome], context: Context) -> Row:
+    def _reference(self, baseline: Bundle, name: str, outcomes: list[Outcome], context: Context) -> Row:
         """Return the row of the baseline's episodes; play the controls that show what succeeds by chance."""
-        row = success_row("baseline", "baseline", outcomes)
+        row = success_row(name, "baseline", outcomes)
         if self.instruction != "right":
             return row
         controls = []
         for control in self.controls():
-            outcomes = run_jobs(baseline, control._jobs(baseline), self.engine, context)
+            (whose,) = control._whose([name])
+            outcomes = run_jobs(baseline, control._jobs(baseline), self.engine, context.about(whose))
             controls.append(success_row(control.control, "subject", outcomes))
         return with_chance(row, controls)
 

@@ -20,6 +20,7 @@ from vlatool.bundle.spec import TensorSpec
 from vlatool.data import CALIBRATION, EVALUATION, Recording, evaluation_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
+from vlatool.evaluate._names import names_of
 from vlatool.machine.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
@@ -69,15 +70,17 @@ class Recorded(Measure):
         episodes = None if recording.episodes is None else recording.episodes[indices]
         reference: Array | None = None
         rows = []
+        bundles = [*([Bundle.open(self.baseline)] if self.baseline else []), source]
+        names = names_of(bundles)
         if self.baseline:
-            reference = self._reference(Bundle.open(self.baseline), source, recording, indices, context)
+            reference = self._reference(bundles[0], source, recording, indices, context)
             own = alone(action, reference, expert, episodes)
-            rows.append(Row("baseline", "baseline", measurements=tuple(own)))
+            rows.append(Row(names[0], "baseline", measurements=tuple(own)))
         actions = run_recorded(source, recording, indices, self.engine, context)
         measurements = alone(action, actions, expert, episodes)
         if reference is not None:
             measurements += compare(action, actions, reference, "baseline")
-        rows.append(Row(source.manifest.name, measurements=tuple(measurements)))
+        rows.append(Row(names[-1], measurements=tuple(measurements)))
         kind = "calibration" if reservation else "recorded"
         title = f"{source.manifest.name} on {len(indices)} {kind} observations"
         trust = credibility(rows[0]) if self.baseline else Credibility("unknown")

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import BundleError, VlatoolError
+from vlatool.bundle.unexported import no_graph
+from vlatool.errors import VlatoolError
 from vlatool.explain import _tables as tables
 from vlatool.explain._bfloat16 import Phases, phase_sentences, phases
 from vlatool.explain._islands import Fallback, Island, QuantizedGraph, fallbacks, timed
@@ -152,7 +153,7 @@ def explanation(
 
 def _find(bundle: Bundle, options: Options, context: Context) -> _Findings:
     if not bundle.manifest.graphs:
-        raise BundleError(f"{bundle.path} has no graph to explain.", "export it first: vlatool export SOURCE -o BUNDLE")
+        raise no_graph(bundle, "explain")
     quantization = origin(bundle)
     baseline = find_baseline(bundle, quantization, options.baseline)
     seen = observations_of(bundle, baseline, options.data, options.samples)

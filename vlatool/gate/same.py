@@ -8,6 +8,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.unexported import no_graph
 from vlatool.errors import BundleError, GraphError, nearest
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
@@ -31,7 +32,7 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
     """
     for bundle in (candidate, baseline):
         if not bundle.manifest.graphs:
-            raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+            raise no_graph(bundle, "run")
         engine, known = bundle.manifest.engine, registry.names("engines")
         if engine and engine not in known:
             raise BundleError(f"{bundle.path} is made for the engine '{engine}'; {nearest(engine, known)}.")

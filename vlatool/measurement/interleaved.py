@@ -125,8 +125,9 @@ def percentile_measurements(
 ) -> list[Measurement]:
     """Return percentiles in ms, each with its upper bound at 99 %.
 
-    The median is always given; without a bound where the samples are too few for one. Any other percentile that is not
-    bounded is left out, or, with ``refusals``, named with what it would take.
+    The median is always given; without a bound where the samples are too few for one. Of an even number of calls it is
+    the mean of the two in the middle, as in ``speedup_of``, so that a speed-up is the quotient of the medians beside
+    it. Any other percentile that is not bounded is left out, or, with ``refusals``, named with what it would take.
 
     Args:
         what: The name before ``_p50``.
@@ -140,11 +141,12 @@ def percentile_measurements(
     for percent in percents:
         bounded = percentile(samples, percent, most=most)
         name = f"{what}_{bounded.name}"
+        value = float(np.median(samples)) if percent == PERCENTILES[0] else bounded.value
         if bounded.known:
-            high, confidence = bounded.bound, bounded.confidence
-            measured.append(Measurement(name, bounded.value, "ms", samples=count, high=high, confidence=confidence))
+            high, confidence = max(bounded.bound, value), bounded.confidence
+            measured.append(Measurement(name, value, "ms", samples=count, high=high, confidence=confidence))
         elif percent == PERCENTILES[0]:
-            measured.append(Measurement(name, float(np.median(samples)), "ms", samples=count))
+            measured.append(Measurement(name, value, "ms", samples=count))
         elif refusals:
             measured.append(Measurement(name, math.nan, "ms", samples=count, note=_lacks(bounded, count, seconds)))
     return measured

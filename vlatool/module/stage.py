@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.unexported import export_command
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
@@ -92,7 +93,7 @@ class ModuleStage(Transform):
         """Return how large the modules are, and how to go on."""
         size = sum(record.bytes for name, record in bundle.manifest.files.items() if name.endswith(".safetensors"))
         folder, edits = read_location(bundle.path), _structure(bundle)
-        export = f"vlatool export {bundle.path} -o BUNDLE --trust {folder}"
+        export = export_command(bundle.path)
         if not holds_weights(bundle):
             streams = f"vlatool quantize weight-only {bundle.path} -o BUNDLE --trust {folder}"
             stay = f"weights stay in the shards in {folder}, {edits}; not exported yet:"

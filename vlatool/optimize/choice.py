@@ -92,8 +92,8 @@ def _best(inside: list[Judged], base: Judged, origin: str, small: bool) -> tuple
 def is_faster(row: Row, base: Row, origin: str = "measured") -> bool:
     """Say whether a row is faster than float32.
 
-    Measured: the interval of the speed-up lies above 1, and the ratio of the medians that are printed does not round to
-    1.00. Predicted: the prediction is; intervals of predictions for one board overlap, since they share their error.
+    Measured: the interval of the speed-up lies above 1, and the speed-up that is printed does not round to 1.00.
+    Predicted: the prediction is; intervals of predictions for one board overlap, since they share their error.
     """
     if ratio(row, base, origin) < LEAST:
         return False
@@ -102,7 +102,9 @@ def is_faster(row: Row, base: Row, origin: str = "measured") -> bool:
 
 
 def ratio(row: Row, base: Row, origin: str = "measured") -> float:
-    """Return how many times as fast a row is as another, from the medians that are printed; 0 when unknown."""
+    """Return how many times as fast a row is as another: its speed-up, or the quotient of medians; 0 when unknown."""
+    if origin == "measured" and (speedup := row.get("speedup")) is not None and speedup.known:
+        return speedup.value
     own, reference = p50(row, origin), p50(base, origin)
     return reference / own if 0 < own < float("inf") and reference < float("inf") else 0.0
 
@@ -145,7 +147,7 @@ def speed_words(row: Row, base: Row, elsewhere: str = "") -> str:
     speedup = row.get("speedup")
     known = speedup is not None and speedup.low is not None and speedup.high is not None
     span = f"; {speedup.low:.2f} to {speedup.high:.2f}" if speedup and known else ""
-    times = speedup.value if speedup and known and elsewhere else ratio(row, base)
+    times = ratio(row, base)
     here = "measured on this host" if elsewhere else _times(row, base)
     if is_faster(row, base):
         return f"{times:.2f}x as fast as {base.name} ({span[2:] + '; ' if elsewhere and span else ''}{here})"

@@ -42,7 +42,7 @@ def with_accuracy(
         )
         if loop is None:
             continue
-        success[name] = cached_measure(loop, bundle, cache, context).rows[-1]
+        success[name] = cached_measure(loop, bundle, cache, context.about(name)).rows[-1]
         if name == base:
             played = _with_controls(loop, bundle, success[name], cache, context)
         else:

@@ -56,7 +56,7 @@ def _motion(row: Row, limits: Limits) -> Iterator[Moves]:
         if growth > limits.max_motion:
             reason = f"{words} {_grows(ratio)}, allowed {100 * limits.max_motion:.3g} % (--max-motion)"
             yield Moves((reason,), growth / max(limits.max_motion, 1e-3) - 1)
-        elif (ratio.high or ratio.value) - 1 > limits.max_motion:
+        elif ratio.high is None or ratio.high - 1 > limits.max_motion:
             yield Moves(warnings=(f"{row.name}: {words} {_grows(ratio)}; {ratio.samples} pairs of episodes cannot "
                                   f"exclude more than {100 * limits.max_motion:.3g} %",))  # fmt: skip
 

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
+from vlatool.bundle.unexported import no_graph
 from vlatool.data import observations_for
 from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
@@ -51,9 +52,7 @@ class Quantization(Transform):
         if source is None:
             return
         if not source.manifest.graphs:
-            raise BundleError(
-                f"{source.path} has no graph to quantize.", "export it first: vlatool export SOURCE -o BUNDLE"
-            )
+            raise no_graph(source, "quantize")
         for pattern in self.graphs:
             if not fnmatch.filter(source.manifest.graphs, pattern):
                 raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from vlatool.bundle.bundle import Bundle, hash_file, write_manifest
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
+from vlatool.bundle.unexported import export_command
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
 from vlatool.files.work import forget, work_directory
@@ -80,7 +81,7 @@ class WeightOnly(WeightOptions):
         elif not takes_shards(source):
             raise BundleError(
                 f"{source.path} has no graph to quantize, and its policy.yaml names no weights to stream.",
-                "export it first: vlatool export SOURCE -o BUNDLE; or add 'weights: \"*.safetensors\"' to policy.yaml",
+                f"export it first: {export_command(source.path)}; or add 'weights: \"*.safetensors\"' to policy.yaml",
             )
 
     def runs(self, source: Bundle | None) -> str:

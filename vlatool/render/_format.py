@@ -7,7 +7,7 @@ import re
 import unicodedata
 from typing import Any
 
-from vlatool.report import Measurement
+from vlatool.report import COUNT, NO_INTERVAL, Measurement
 
 UNMEASURED = "unmeasured"
 NARROW_SPACE = "\u202f"
@@ -137,7 +137,7 @@ def _scale(measurement: Measurement) -> tuple[float, str]:
         return 100.0, "points" if is_points(measurement) else "%"
     if measurement.unit == "m" and measurement.name.startswith("error"):
         return 1000.0, "mm"
-    return 1.0, {"1": "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
+    return 1.0, {"1": "", COUNT: "", "x": "×", "degC": "°C"}.get(measurement.unit, plain(measurement.unit))
 
 
 def unit(measurement: Measurement) -> str:
@@ -191,9 +191,11 @@ def is_usual(measurement: Measurement) -> bool:
 
 
 def span(measurement: Measurement) -> str:
-    """Return the interval, marked with its coverage when that is not 95 %."""
+    """Return the interval, marked with its coverage when that is not 95 %; or, where the note says it, why none is."""
     ends = interval(measurement)
-    return ends if is_usual(measurement) or not ends else f"{number(measurement.confidence * 100)} %: {ends}"
+    if not ends:
+        return next((plain(part) for part in measurement.note.split("; ") if part.startswith(NO_INTERVAL)), "")
+    return ends if is_usual(measurement) else f"{number(measurement.confidence * 100)} %: {ends}"
 
 
 def aside(measurement: Measurement) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import GOLDEN_TOLERANCE, check_files
 from vlatool.bundle.spec import PolicySpec
+from vlatool.bundle.unexported import no_graph
 from vlatool.errors import BundleError, GraphError, UsageError
 from vlatool.files.printable import printable
 from vlatool.runtime.arguments import check_whole
@@ -90,7 +91,7 @@ class Policy:
         """Open every graph of a verified bundle and check it against the spec; see ``vlatool.runtime.load``."""
         manifest = bundle.manifest
         if not manifest.graphs:
-            raise BundleError(f"{bundle.path} has no graph to run.", "export it first: vlatool export SOURCE -o BUNDLE")
+            raise no_graph(bundle, "run")
         check_chunk(manifest.spec)
         limit_mb = allowed_mb(manifest, memory_mb)
         check_sizes(manifest, limit_mb)

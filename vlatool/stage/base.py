@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -73,6 +73,10 @@ class Context:
     kept: Store | None = None
     notes: list[str] = field(default_factory=list)
     said: list[str] = field(default_factory=list)
+
+    def about(self, whose: str) -> Context:
+        """Return the context with what is told beginning with whose it is, where that is not empty."""
+        return replace(self, tell=lambda what, share: self.tell(f"{whose}: {what}", share)) if whose else self
 
 
 class SampleSet:

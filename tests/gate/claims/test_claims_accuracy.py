@@ -106,8 +106,10 @@ def test_a_world_that_everybody_succeeds_in_decides_nothing(float_bundle: Bundle
 def test_episodes_are_paired(float_bundle: Bundle, int8_bundle: Bundle, policy_dir: Path) -> None:
     claim = AccuracyClaim(max_drop=0.5, episodes=8, policy=policy_dir)
     found = examine(int8_bundle, float_bundle, claim, Context())
-    recorded, loop = found.measurements
+    recorded, loop, rate = found.measurements
     assert (recorded.name, loop.name, loop.samples) == ("recorded_drop", "success_drop", 8)
+    before = next(each for each in found.baseline if each.name == "success")
+    assert (rate.name, rate.samples, rate.value) == ("success", 8, pytest.approx(before.value - loop.value))
     assert "more failed episodes: +0.00%" in found.sentence
     strict = examine(int8_bundle, float_bundle, claim.model_copy(update={"max_drop": 0.01}), Context())
     assert strict.verdict in ("inconclusive", "fail"), "eight episodes do not show that at most 1 % more fail"

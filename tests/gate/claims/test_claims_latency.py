@@ -90,3 +90,11 @@ def test_the_sentence_says_what_was_found_and_what_could_have_been() -> None:
     assert "4.0% slower (unbounded to unbounded, 10 processes" in open_
     assert "processes would decide" in open_
     assert (slower(1.0), change(1.1)) == ("0.0% slower", "+10.0%")
+
+
+def test_where_no_sensible_number_would_decide_the_reason_is_said() -> None:
+    noisy = sentence_of(Decision("inconclusive", 1.01, 0.2, 3.0, 0.05, 10, 4.0))
+    assert noisy.endswith(", this machine is too noisy to decide it: let nothing else run")
+    close = sentence_of(Decision("inconclusive", 1.05, 1.04, 1.06, 0.05, 10, 0.02))
+    assert close.endswith(", it is too close to what is allowed for more processes to decide")
+    assert "would decide" not in noisy + close

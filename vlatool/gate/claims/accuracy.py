@@ -34,6 +34,7 @@ class _Drop:
     samples: int
     baseline: tuple[Measurement, ...] = ()
     warnings: tuple[str, ...] = ()
+    candidate: tuple[Measurement, ...] = ()
 
     def verdict(self, allowed: float) -> str:
         return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
@@ -83,6 +84,7 @@ def examine(
                     confidence=CONFIDENCE, note=lost.words)
         for lost in drops
     )  # fmt: skip
+    measured += tuple(number for lost in drops for number in lost.candidate)
     baselines = tuple(number for lost in drops for number in lost.baseline if number.name in DECIDE)
     trust = credibility(Row("baseline", "baseline", measurements=baselines), "the baseline")
     verdict = "inconclusive" if trust.fails else worst(lost.verdict(claim.max_drop) for lost in drops)
@@ -122,7 +124,9 @@ def _closed_loop(episodes: Episodes) -> _Drop:
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
     value, low, high = exact_drop(lost, won, len(before), CONFIDENCE)
-    return _Drop("success_drop", "more failed episodes:", value, low, high, len(before), rows[0].measurements)
+    own = tuple(number for number in rows[1].measurements if number.name == "success")
+    words = "more failed episodes:"
+    return _Drop("success_drop", words, value, low, high, len(before), rows[0].measurements, candidate=own)
 
 
 def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context, engine: str) -> _Drop:

@@ -15,6 +15,8 @@ from vlatool.stats.sequential import Decision, jointly
 STATISTICS = ("median", "mean")
 """Of the calls; of the observations, each the median of its calls."""
 TOLD = (("latency_ratio", "medians"), ("latency_mean_ratio", "means of ratios"))
+MOST = 1000
+"""Processes beyond which it is no advice that they would decide."""
 AGREE = CONFIRM - 1
 """Pairs of ``CONFIRM`` that must be slow: between equal bundles, 19 of 20 are so once in 50,000 times."""
 
@@ -74,9 +76,16 @@ def sentence_of(decision: Decision) -> str:
     words = f"{slower(decision.ratio)} ({change(decision.low)} to {change(decision.high)}, {decision.processes} "
     words += f"processes; allowed: {change(1 + decision.margin)}); "
     words += f"a slowdown of {decision.detectable:.1%} is found 95 times in 100"
-    if decision.verdict == "inconclusive":
-        words += f", about {decision.wanted} processes would decide"
-    return words
+    return f"{words}, {_advice(decision)}" if decision.verdict == "inconclusive" else words
+
+
+def _advice(decision: Decision) -> str:
+    """Return how many processes would decide; why none would where that is no sensible number."""
+    if decision.wanted <= MOST:
+        return f"about {decision.wanted} processes would decide"
+    if replace(decision, ratio=1.0).wanted > MOST:  # two equal bundles could not be told to be so
+        return "this machine is too noisy to decide it: let nothing else run"
+    return "it is too close to what is allowed for more processes to decide"
 
 
 def slower(ratio: float) -> str:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from vlatool.motion.metric import Metric
 from vlatool.motion.track import Track
+from vlatool.report import COUNT
 
 
 class Collisions(Metric):
     """Steps that the environment tells as collisions."""
 
     title = "collisions"
-    unit = "1"
+    unit = COUNT
 
     def of(self, track: Track) -> float | None:
         """Return how many; None where the environment does not tell."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from vlatool.motion.metric import Metric
 from vlatool.motion.track import Array, Track
+from vlatool.report import COUNT
 
 BAND = 0.1
 """An opening within so much of the middle is neither open nor closed, so that noise there is no flip."""
@@ -15,7 +16,7 @@ class GripperFlips(Metric):
     """Changes between open and closed, of the opening that the environment tells, or of the action's element."""
 
     title = "gripper flips"
-    unit = "1"
+    unit = COUNT
 
     def of(self, track: Track) -> float | None:
         """Return how many; None without a gripper."""

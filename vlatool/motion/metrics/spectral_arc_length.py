@@ -19,7 +19,7 @@ class SpectralArcLength(Metric):
     """
 
     title = "spectral arc length"
-    unit = "1"
+    unit = ""
 
     def of(self, track: Track) -> float | None:
         """Return the length; None without positions and joints, and where nothing moves."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from vlatool.motion.metric import Metric
 from vlatool.motion.track import Track, lengths
+from vlatool.report import COUNT
 
 TURNED = 1e-6
 """Radians from which on a base has turned."""
@@ -15,7 +16,7 @@ class Turns(Metric):
     """Steps in which the heading changes, and the position does not."""
 
     title = "turns on the spot"
-    unit = "1"
+    unit = COUNT
 
     def of(self, track: Track) -> float | None:
         """Return how many; None without positions and headings."""

@@ -39,7 +39,7 @@ class Variants:
             where = next((item.where for item in items if item), "this host")
             note = f"on {place(report, where)}" if len(places(report, "measured")) > 1 else ""
             cells = (Cell(plain(row.name), note=note, css=css), *(_cell(row, item, bar, where) for item in items))
-            words = "" if row.role == "subject" else role(row)
+            words = "" if row.role in ("subject", row.name) else role(row)
             lines.append(Line(cells, words, plain(row.reason), row.role == "chosen"))
         table = Table((Column("variant", False), *heads), tuple(lines), style="cards")
         how = " ".join(part for part in (about(report), brackets(report, "measured")) if part)
