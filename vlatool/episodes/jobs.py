@@ -11,6 +11,7 @@ from typing import Any
 
 from vlatool.accuracy.paired import Outcome
 from vlatool.bundle.bundle import DIGEST, MANIFEST, Bundle
+from vlatool.data import CALIBRATION
 from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
 from vlatool.episodes.disturbed import OWN
@@ -151,11 +152,16 @@ def _work(
     folders: tuple[Folder, ...] = ()
     about = jobs[0].environment.rpartition(":")[0]
     if away:
-        recorded = sorted(name for name in bundle.manifest.files if not name.startswith(RECORDINGS))
-        folders = (Folder(path, (MANIFEST, DIGEST, *recorded)), *_placed(jobs[0])[1])
+        folders = (Folder(path, (MANIFEST, DIGEST, *_needed(bundle, jobs))), *_placed(jobs[0])[1])
         jobs = [_placed(job)[0] for job in jobs]
     requests = [to_json(Request(path, engine, play.STEP_LIMIT, job)) for job in jobs]
     return Work(f"{HERE}:{function}", requests, about, preload, last and f"{HERE}:{last}", folders)
+
+
+def _needed(bundle: Bundle, jobs: Sequence[EpisodesJob]) -> list[str]:
+    """Return the files of a bundle that its episodes read: of the recordings what controls and noise are drawn from."""
+    asked = (CALIBRATION,) if any(job.control or job.noise for job in jobs) else ()
+    return sorted(name for name in bundle.manifest.files if not name.startswith(RECORDINGS) or name in asked)
 
 
 def _placed(job: EpisodesJob) -> tuple[EpisodesJob, tuple[Folder, ...]]:
