@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import BundleError
+from vlatool.errors import BundleError, GraphError
 from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.same import check
 
@@ -99,3 +101,12 @@ def test_a_golden_action_is_not_left_out(float_bundle: Bundle) -> None:
     with pytest.raises(BundleError, match="has no golden action, which the baseline has"):
         check(bare, float_bundle, GATE)
     check(float_bundle, bare, GATE)
+
+
+@pytest.mark.parametrize("content", [b"\xff" * 100, b"PK\x03\x04" + bytes(200)])
+def test_a_graph_that_is_no_onnx_is_named(float_bundle: Bundle, tmp_path: Path, content: bytes) -> None:
+    shutil.copytree(float_bundle.path, tmp_path / "made")
+    (tmp_path / "made/graphs/main.onnx").write_bytes(content)
+    candidate = seal(tmp_path / "made", float_bundle.manifest)
+    with pytest.raises(GraphError, match=r"main\.onnx cannot be read as an ONNX file"):
+        check(candidate, float_bundle, Gate())

@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
 from vlatool.bundle.unexported import no_graph
-from vlatool.errors import BundleError, GraphError, nearest
+from vlatool.errors import BundleError, GraphError, nearest, require
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
 from vlatool.graph.draws import drawing
@@ -49,8 +49,16 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
 
 def _refuse_draws(bundle: Bundle) -> None:
     """Refuse graphs that draw random numbers: no two runs can be held against each other, and draws count calls."""
+    require("onnx", "build")
+    from google.protobuf.message import DecodeError
+
     for name, graph in bundle.manifest.graphs.items():
-        if operators := drawing(read(bundle.path / graph.file, weights=False)):
+        file = bundle.path / graph.file
+        try:
+            operators = drawing(read(file, weights=False))
+        except DecodeError as error:
+            raise GraphError(f"{file} cannot be read as an ONNX file: {error}.", "make the bundle again") from error
+        if operators:
             raise GraphError(
                 f"The graph '{name}' of {bundle.path} draws random numbers ({', '.join(operators)}): what it answers "
                 "at one call says nothing about the next.",

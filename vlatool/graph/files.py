@@ -64,15 +64,11 @@ def read(path: Path, *, weights: bool = True) -> Any:
     """Read an ONNX model, with a name of its own for every node; no output is itself a constant.
 
     Raises:
-        GraphError: when it is no ONNX file, or a file with its weights is missing.
+        GraphError: when a file with its weights is missing.
     """
     onnx = require("onnx", "build")
-    from google.protobuf.message import DecodeError
-
     try:
         model = onnx.load(str(path), load_external_data=weights)
-    except DecodeError as error:
-        raise GraphError(f"{path} cannot be read as an ONNX file: {error}.", "make or copy it again") from error
     except (OSError, onnx.checker.ValidationError) as error:
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
         raise GraphError(
