@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from vlatool.errors import SourceError
 from vlatool.user_code import children
 
 ENDING = """
@@ -29,6 +30,9 @@ def test_ctrl_c_while_the_children_end_is_no_traceback() -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_what_vlatools_own_code_raises_is_a_bug_and_not_the_policys() -> None:
-    with pytest.raises(RuntimeError, match=r"^vlatool\.stage\._inside\.run failed: KeyError: 'stage'$"):
+def test_what_vlatools_own_code_raises_is_named_and_not_blamed_on_the_policy() -> None:
+    """It stays an error with exit code 3: what a child says decides no exit code."""
+    says = r"^vlatool\.stage\._inside\.run failed in the process that runs policy\.py: KeyError: 'stage'\.\n"
+    with pytest.raises(SourceError, match=says) as caught:
         children.call("vlatool.stage._inside:run", {}, lambda *_: None, "policy.py")
+    assert caught.value.fix.startswith("that is vlatool's own code: report it")

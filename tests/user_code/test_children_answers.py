@@ -37,8 +37,8 @@ def test_what_no_child_says_is_nonsense(line: bytes):
         ({"raised": "X", "message": "m", "ours": True, "where": ""}, SourceError, "that runs it failed: X: m"),
         (
             {"raised": "X", "message": "m", "ours": True, "where": "vlatool.a.b"},
-            RuntimeError,
-            "^vlatool.a.b failed: X: m$",
+            SourceError,
+            "^vlatool.a.b failed in the process that runs policy.py: X: m.\n",
         ),
         ({"raised": "X", "message": "m", "ours": False}, SourceError, "policy.py raised X: m"),
         ({"errno": 28, "message": "full", "file": None}, OSError, "full"),

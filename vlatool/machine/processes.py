@@ -74,16 +74,6 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
-def child_processes() -> set[int]:
-    """Return the children of this process, adopted ones too; none where there is no ``/proc``."""
-    own, found = str(os.getpid()), set()
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            if stat.read_bytes().rpartition(b")")[2].split()[1].decode() == own:
-                found.add(int(stat.parent.name))
-    return found
-
-
 @contextlib.contextmanager
 def single_threads() -> Iterator[None]:
     """Let processes that are started meanwhile compute in one thread: they are as many as there are processors."""

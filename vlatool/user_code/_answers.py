@@ -1,8 +1,7 @@
 """What a child that runs a user's code says, checked before it is believed: that code can write what it likes.
 
 A policy shares its process with the function of vlatool that answers, and can answer in its place. It decides neither
-the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks,
-unless vlatool's own code raised what it should not have.
+the exit code nor what kind of error a person sees: an error of a child is one of its input, or of a package it lacks.
 """
 
 from __future__ import annotations
@@ -69,8 +68,8 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
 
     Raises:
         InputError, MissingExtra: of the class that is named.
-        SourceError: for everything else that was raised.
-        RuntimeError: for a bug of vlatool: where ``own``, or where its code raised it.
+        SourceError: for everything else that was raised, also by vlatool, which is named then; RuntimeError where
+            ``own``.
         OSError, MemoryError: what the child met.
     """
     if "result" in answer:
@@ -87,10 +86,11 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     if "errno" in answer:
         raise OSError(answer["errno"], message, answer["file"] and shortened(answer["file"], LONGEST))
     name = plain(answer["raised"])
-    if where := plain(answer.get("where", "")):
-        raise RuntimeError(f"{where} failed: {name}: {message}")
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
+    if where := plain(answer.get("where", "")):
+        said = f"{where} failed in the process that runs {about}: {name}: {message}."
+        raise SourceError(said, "that is vlatool's own code: report it; VLATOOL_DEBUG=1 shows how it came there")
     if answer["ours"]:
         raise SourceError(
             f"{about}: the process that runs it failed: {name}: {message}.",

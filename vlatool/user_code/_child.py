@@ -22,9 +22,11 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import IO, Any
 
+import psutil
+
 from vlatool.errors import VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.machine.processes import adopt_orphans, child_processes, die_with_parent
+from vlatool.machine.processes import adopt_orphans, die_with_parent
 from vlatool.user_code import trust
 from vlatool.user_code._answers import ENDINGS
 
@@ -76,9 +78,10 @@ def _reap(children: dict[int, socket.socket]) -> None:
 
 def _end_strays(children: Mapping[int, socket.socket]) -> None:
     """Kill what is left of children that have ended."""
-    for pid in child_processes() - set(children):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    for stray in psutil.Process().children():
+        if stray.pid not in children:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                stray.kill()
 
 
 def _end_all(children: Mapping[int, socket.socket]) -> None:
