@@ -8,6 +8,7 @@ import io
 import os
 import platform
 import warnings
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,8 @@ from vlatool.workers._shipped import Arriving, Parcel, Places
 
 PASSED = (*SINGLE, MAX_CPU_ISA, OLDER_MAX_CPU_ISA, VARIABLE, "VLATOOL_DEBUG")
 """Variables that a worker has as the machine has them that sends the work: they change what is computed."""
+MOST_SAID = 1000
+"""The last lines of progress of a job that are told; a job says which episodes it begins."""
 MATTERS = ("numpy", "onnxruntime", "onnxruntime-gpu", "onnxruntime-openvino", "openvino", "torch", "tensorrt")
 """Packages that may round differently in another version."""
 
@@ -77,6 +80,7 @@ class Seat:
         self._refused: dict[str, Any] = {}
         self._opened = contextlib.ExitStack()
         self._child: Apart | None = None
+        self._said: deque[str] = deque(maxlen=MOST_SAID)
         for name in PASSED:
             os.environ.pop(name, None)
         os.environ.update(self._order.variables)
@@ -106,8 +110,9 @@ class Seat:
         return {"result": None}
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return ``answer``, what came of a request, ``printed``, what its code printed, and ``warnings``."""
+        """Return ``answer``, what came of a request, what its code ``printed``, what was ``told``, and ``warnings``."""
         printed = io.StringIO()
+        self._said.clear()
         with contextlib.redirect_stderr(printed), warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             try:
@@ -116,7 +121,8 @@ class Seat:
                 self._dismiss()
                 answer = self._told(error)
         told = [str(warning.message) for warning in warned if issubclass(warning.category, UserWarning)]
-        return {"answer": self._back.told(answer), "printed": self._back.told(printed.getvalue()), "warnings": told}
+        return {"answer": self._back.told(answer), "printed": self._back.told(printed.getvalue()), "warnings": told,
+                "told": list(self._said)}  # fmt: skip
 
     def close(self) -> None:
         """Let the child end well."""
@@ -129,7 +135,7 @@ class Seat:
         if self._child is None:
             trust.restore([[self._there.named(value) for value in folder] for folder in self._order.named])
             self._child = self._opened.enter_context(Apart(self._order.about, self._order.preload))
-        return self._child.call(function, request, lambda _what, _share: None)
+        return self._child.call(function, request, lambda what, _share: self._said.append(what))
 
     def _dismiss(self) -> None:
         """End the child; the next job has another one."""

@@ -250,6 +250,8 @@ class _Crew:
                 sys.stderr.write(said["printed"])
         for warning in said["warnings"]:
             warnings.warn(str(warning), UserWarning, stacklevel=2)
+        for what in said["told"]:
+            self._tell(what, None)
         answer = said["answer"]
         if "lost" in answer:
             self._again(number, answer["lost"], answer["fix"])
