@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,10 @@ DROPPING = {"Dropout": 2, "BiasDropout": 4, "BitmaskDropout": 2, "BitmaskBiasDro
 """Operator that draws where its input of this number, ``training_mode``, says so."""
 SAMPLING = ("Sampling",)
 """Operators of ONNX Runtime that draw what they give."""
+DOMAINS = ("", "ai.onnx", "com.microsoft")
+"""Of operators; a name in any other one is of a function in the file, whose own nodes say what it does."""
+BOOL = 9
+"""``onnx.TensorProto.BOOL``."""
 GUIDE = 'see "Noise" in docs/guides/your-own-policy.md'
 
 
@@ -61,11 +65,15 @@ def refuse_drawing_file(model: Any, path: Path) -> None:
         GraphError: naming the operators, and how to declare the noise instead.
     """
     shapes = {value.name: _static(value) for value in (*model.graph.value_info, *model.graph.output)}
-    nodes = [*_nodes(model.graph.node), *(node for value in model.functions for node in _nodes(value.node))]
-    draws = [node for node in nodes if node.op_type in DRAWING and node.domain in ("", "ai.onnx")]
+    draws = _drawing_nodes(model)
     if not draws:
         return
     operators = ", ".join(dict.fromkeys(node.op_type for node in draws))
+    if not all(node.op_type in DRAWING for node in draws):
+        raise GraphError(
+            f"{path} draws random numbers, {_times(draws)} an inference ({operators}).",
+            "export it as it acts, not as it is trained: torch's module.eval() switches dropout off",
+        )
     index = "; each of them takes its part of the noise" if len(draws) > 1 else ""
     raise GraphError(
         f"{path} draws random numbers, {_times(draws)} an inference ({operators}): a graph that draws its own can "
@@ -81,15 +89,39 @@ def drawing(model: Any) -> tuple[str, ...]:
 
     The numbers of a session follow from their seed: whoever knows them counts inferences with them.
     """
-    nodes = [*_nodes(model.graph.node), *(node for value in model.functions for node in _nodes(value.node))]
-    return tuple(dict.fromkeys(node.op_type for node in nodes if _draws(node)))
+    return tuple(dict.fromkeys(node.op_type for node in _drawing_nodes(model)))
 
 
-def _draws(node: Any) -> bool:
-    """Return whether a node draws; a dropout that may be told to counts, since what tells it may be computed."""
+def _drawing_nodes(model: Any) -> list[Any]:
+    """Return the nodes that draw.
+
+    A dropout counts unless a constant of the graph that it is in switches it off: anything else may be computed, and in
+    a branch or a function the same name may be of another value.
+    """
+    graph, off = model.graph, _false_constants(model.graph)
+    inside = [inner for node in graph.node for inner in nodes_inside(node)]
+    inside += [node for value in model.functions for node in _nodes(value.node)]
+    return [*(node for node in graph.node if _draws(node, off)), *(node for node in inside if _draws(node, set()))]
+
+
+def _false_constants(graph: Any) -> set[str]:
+    """Return the names of constants of a graph that are false, whatever is fed."""
+    fed = {value.name for value in graph.input}
+    held = {tensor.name: tensor for tensor in graph.initializer if tensor.name not in fed}
+    held |= {node.output[0]: item.t for node in graph.node if node.op_type == "Constant" for item in node.attribute
+             if item.name == "value"}  # fmt: skip
+    return {
+        name
+        for name, tensor in held.items()
+        if tensor.data_type == BOOL and not (tensor.external_data or any(tensor.raw_data) or any(tensor.int32_data))
+    }
+
+
+def _draws(node: Any, off: Set[str]) -> bool:
+    """Return whether a node draws; ``off``: values that switch a dropout off."""
     place = DROPPING.get(node.op_type)
-    dropping = place is not None and len(node.input) > place and bool(node.input[place])
-    return dropping or node.op_type in DRAWING or node.op_type in SAMPLING
+    dropping = place is not None and len(node.input) > place and node.input[place] not in {"", *off}
+    return node.domain in DOMAINS and (dropping or node.op_type in DRAWING or node.op_type in SAMPLING)
 
 
 def _nodes(nodes: Sequence[Any]) -> Iterator[Any]:
