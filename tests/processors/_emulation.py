@@ -230,7 +230,8 @@ def unpack(packages: Sequence[Path], root: Path, only: str = "") -> None:
             with archive.open("wb") as stream:
                 subprocess.run(["dpkg-deb", "--fsys-tarfile", str(package)], stdout=stream, check=True)
             with tarfile.open(archive) as members:
-                members.extract(only, root, filter="data")
+                members.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.2 has none
+                members.extract(only, root)
 
 
 def told(words: Sequence[str], registry: str, variables: Mapping[str, str] | None = None) -> None:
