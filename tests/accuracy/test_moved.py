@@ -8,6 +8,7 @@ import pytest
 
 from vlatool.accuracy.moved import drops_by_task, ratios, with_task_speedup
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
+from vlatool.evaluate._told import told
 from vlatool.render._format import full
 from vlatool.report import Measurement, Row
 
@@ -128,3 +129,18 @@ def test_a_ratio_without_an_interval_says_why(pairs: int, moves: int, why: str):
     assert ratio.value == pytest.approx(2.0)
     assert (ratio.low is None, ratio.high is None) == (bool(why), bool(why))
     assert full(ratio) == f"2.00× ({why}, n = {pairs})" if why else "no interval" not in ratio.note
+
+
+def test_what_the_baseline_has_none_of_is_told_though_it_has_no_ratio():
+    base = [outcome("a", seed, True, 10, collisions=0.0, reversals=0.0) for seed in range(40)]
+    own = [outcome("a", seed, seed > 0, 10, collisions=2.0 if seed < 11 else 0.0, reversals=0.0) for seed in range(40)]
+    baseline, row = rows(base, own)
+    assert row.get("collisions_ratio") is None
+    added = row.get("collisions_added")
+    assert (added.value, added.unit, added.samples) == (pytest.approx(20 / 39), "count", 39)
+    assert (
+        added.note == "mean of 39 episodes in which both succeed: above 0 in 10 of them, and in none of the baseline's"
+    )
+    assert row.get("reversals_added") is None, "neither has any"
+    sentence = "Where both succeed, the baseline has none of these: collisions (0.513 in an episode)."
+    assert sentence in told((baseline, row), "")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.motion.measure import FEWEST, ratio_of
+from vlatool.motion.measure import FEWEST, metrics, ratio_of
 from vlatool.report import NO_INTERVAL, Measurement, Row
 from vlatool.stats.success_sequential import exact_drop
 
@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 MOTION = "motion."
 """What the names of raw samples begin with that a metric of motion gave."""
 RATIO = "_ratio"
+ADDED = "_added"
+"""What the name of a metric ends with where the baseline's is 0 in every pair, so that there is no ratio."""
 STEPS = "steps_ratio"
 WORST = "worst_task_drop"
 SPEEDUP = "task_speedup"
@@ -35,7 +37,7 @@ def compare_motion(baseline: Row, row: Row) -> Row:
     """
     pairs = _Pairs(baseline, row)
     tables = {title: table for key, title in AGAINST.items() if (table := pairs.table(key))}
-    found = (*pairs.ratios(), *pairs.steps(), *pairs.worst())
+    found = (*pairs.ratios(), *pairs.added(), *pairs.steps(), *pairs.worst())
     return replace(row, measurements=(*row.measurements, *found), details={**row.details, **tables})
 
 
@@ -49,6 +51,16 @@ def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = 
     """
     found = _Pairs(baseline, row, confidence).ratios()
     return {item.name: item for item in found if item.name.removesuffix(RATIO) in names}
+
+
+def pairs_above_none(baseline: Row, row: Row, names: Collection[str]) -> dict[str, tuple[int, int]]:
+    """Return metric -> in how many of the episodes in which both succeed a variant has any, and of how many.
+
+    Args:
+        baseline, row: Of ``success_row``, of the same episodes.
+        names: Metrics; those of which the baseline has some, or that the episodes do not have, are left out.
+    """
+    return {name: counts for name, counts in _Pairs(baseline, row).above_none() if name in names}
 
 
 def drops_by_task(baseline: Row, row: Row, confidence: float = CONFIDENCE) -> dict[str, Measurement]:
@@ -106,6 +118,22 @@ class _Pairs:
                 continue
             note = f"of the means of {known.sum()} episodes in which both succeed{self._worst_of(own, base, known)}"
             yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note, self._confidence)
+
+    def above_none(self) -> Iterator[tuple[str, tuple[int, int]]]:
+        """Yield each metric that the baseline has nothing of where both succeed, and the pairs with some, and all."""
+        for name in self._metrics:
+            own, base, known = self._values(name)
+            if known.any() and not base[known].any():
+                yield name, (int((own[known] > 0).sum()), int(known.sum()))
+
+    def added(self) -> Iterator[Measurement]:
+        """Yield the mean of each of these metrics that the variant has something of."""
+        for name, (some, count) in self.above_none():
+            if some:
+                own, _, known = self._values(name)
+                note = f"mean of {count} episodes in which both succeed: above 0 in {some} of them, and in none of the "
+                yield Measurement(f"{name}{ADDED}", float(own[known].mean()), metrics()[name].unit, samples=count,
+                                  note=f"{note}baseline's")  # fmt: skip
 
     def steps(self) -> Iterator[Measurement]:
         """Yield the ratio of the steps of all episodes; one that fails counts as long as the longest of its task."""

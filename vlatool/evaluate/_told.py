@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbed import worst_record
-from vlatool.accuracy.moved import RATIO, STEPS, WORST
+from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST
 from vlatool.evaluate._late import LATE
 from vlatool.report import Measurement, Row
 
@@ -28,6 +28,9 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
     if rougher := [item for item in changed if _is_more(item)]:
         words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {_times(item.value)}" for item in rougher)
         yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
+    if new := [item for item in row.measurements if item.name.endswith(ADDED)]:
+        words = (f"{item.name.removesuffix(ADDED).replace('_', ' ')} ({item.value:.3g} in an episode)" for item in new)
+        yield f"Where both succeed, the baseline has none of these: {', '.join(words)}."
     if steps and _is_more(steps):
         yield f"Over all episodes, it needs {_times(steps.value)} the steps."
     yield from _disturbed(row)

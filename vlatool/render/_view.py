@@ -88,8 +88,8 @@ def other_names(report: Report) -> list[str]:
 def motion_names(report: Report) -> list[str]:
     """Return the names of the measured numbers that say how the variants move beside the baseline."""
     present = names(report)
-    ratios = sorted(name for name in present if name.endswith("_ratio") and name not in OF_MOTION)
-    return [*(name for name in OF_MOTION if name in present), *ratios]
+    others = sorted(name for name in present if name.endswith(("_ratio", "_added")) and name not in OF_MOTION)
+    return [*(name for name in OF_MOTION if name in present), *others]
 
 
 def percentile_names(report: Report) -> list[str]:

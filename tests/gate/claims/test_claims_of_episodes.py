@@ -79,6 +79,28 @@ def test_metrics_that_are_named_count_and_must_be_known():
         MotionClaim(metrics=("jitter",))
 
 
+@pytest.mark.parametrize(("runs_into", "verdict", "says"), [
+    (0, "pass", "collisions 0 in all 60 common successes of both"),
+    (3, "inconclusive", "collisions in 3 of 60 common successes, in none of the baseline's"),
+    (9, "fail", "collisions in 9 of 60 common successes, in none of the baseline's"),
+])  # fmt: skip
+def test_collisions_where_the_baseline_has_none_decide(runs_into: int, verdict: str, says: str):
+    base = [Outcome("open", seed, True, 20, "", {"collisions": 0.0, "jerk": 1.0}) for seed in range(60)]
+    own = [
+        Outcome("open", seed, True, 20, "", {"collisions": 4.0 if seed < runs_into else 0.0, "jerk": 1.0})
+        for seed in range(60)
+    ]
+    result = motion.examine(episodes(base, own), MotionClaim(metrics=("collisions",)))
+    assert (result.verdict, result.sentence) == (verdict, says)
+    both = motion.examine(episodes(base, own), MotionClaim(metrics=("jerk", "collisions")))
+    assert both.verdict == verdict
+    assert says in both.sentence
+    rough = [Outcome("open", one.seed, True, 20, "", one.motion | {"jerk": 2.0}) for one in own]
+    both = motion.examine(episodes(base, rough), MotionClaim(metrics=("jerk", "collisions")))
+    assert both.verdict == "fail"
+    assert ("jerk +100.0%" in both.sentence, says in both.sentence) == (True, verdict == "fail"), "only what fails"
+
+
 def test_without_positions_or_common_successes_nothing_is_decided():
     bare = episodes(played(1, 60, own=False), played(2, 60, own=False))
     assert motion.examine(bare, MotionClaim()).verdict == "inconclusive"

@@ -2,33 +2,50 @@
 
 from __future__ import annotations
 
-from vlatool.accuracy.moved import RATIO, ratios
+from vlatool.accuracy.moved import RATIO, pairs_above_none, ratios
 from vlatool.gate.claims._ratio import confidence_of, judged
 from vlatool.gate.config import MotionClaim
 from vlatool.gate.episodes import Episodes
-from vlatool.gate.result import ClaimResult
-from vlatool.motion.measure import metrics
+from vlatool.gate.result import ClaimResult, worst
+from vlatool.motion.measure import FEWEST, metrics
 
 OF_BODY = ("path_length", "joint_path", "jerk", "joint_jerk")
 OF_ACTIONS = ("action_rate",)
 """Metrics that count where the environment tells nothing of the robot's body."""
-ZERO = " (not told, or 0 in every episode of the baseline)"
 NOTHING = "no episode in which both succeed tells how they move"
 
 
 def examine(episodes: Episodes, claim: MotionClaim) -> ClaimResult:
     """Examine the metrics that the claim names, or those of the body that the environment tells.
 
+    Where the baseline has nothing of a metric (no collision in any episode) there is no ratio: the candidate passes
+    with nothing either, and fails where it has some in so many episodes that chance is no explanation.
+
     Raises:
         DataError: when no environment is named, or it fails.
     """
     names = claim.metrics or next((own for own in (OF_BODY, OF_ACTIONS) if ratios(*episodes.rows, own)), OF_ACTIONS)
-    found = ratios(*episodes.rows, names, confidence_of(len(names)))
+    confidence = confidence_of(len(names))
+    found = ratios(*episodes.rows, names, confidence)
     titles = {name: metric.title for name, metric in metrics().items()}
     told = {titles.get(name, name): ratio for name in names if (ratio := found.get(f"{name}{RATIO}"))}
-    lacking = [name for name in claim.metrics if f"{name}{RATIO}" not in found]
-    result = judged("motion", told, claim.margin, NOTHING)
-    if lacking and result.verdict == "pass":
-        return ClaimResult("motion", "inconclusive", f"no ratio of {', '.join(lacking)}{ZERO}; {result.sentence}",
-                           result.measurements)  # fmt: skip
-    return result
+    none = pairs_above_none(*episodes.rows, claim.metrics)
+    results = [_from_none(titles.get(name, name), *counts, confidence) for name, counts in none.items()]
+    if told or not results:
+        results.insert(0, judged("motion", told, claim.margin, NOTHING))
+    if lacking := [name for name in claim.metrics if f"{name}{RATIO}" not in found and name not in none]:
+        results.insert(0, ClaimResult("motion", "inconclusive", f"no ratio of {', '.join(lacking)} (not told)"))
+    verdict = worst(result.verdict for result in results)
+    sentences = [result.sentence for result in results if result.verdict == verdict or verdict != "fail"]
+    measurements = tuple(item for result in results for item in result.measurements)
+    return ClaimResult("motion", verdict, "; ".join(sentences), measurements)
+
+
+def _from_none(title: str, some: int, count: int, confidence: float) -> ClaimResult:
+    """Judge a metric that the baseline has nothing of; the test is the exact sign test of pairs, one-sided."""
+    if not some:
+        enough = count >= FEWEST
+        return ClaimResult("motion", "pass" if enough else "inconclusive",
+                           f"{title} 0 in all {count} common successes of both")  # fmt: skip
+    verdict = "fail" if 0.5**some <= (1 - confidence) / 2 else "inconclusive"
+    return ClaimResult("motion", verdict, f"{title} in {some} of {count} common successes, in none of the baseline's")
