@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.unexported import export_command
-from vlatool.data import observations_for
+from vlatool.data import observations_for, write_played
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
 from vlatool.module.description import read_location
@@ -45,6 +45,7 @@ class Changed:
         edits: What is kept of the structure; the caller cuts the modules.
         training: How they were trained, as JSON values: ``losses`` of the steps, ``rounds`` of data; None when not.
         program: How the graphs run from now on; as before when None.
+        played: Observations that they were trained on, for the ranges of activations, name -> (N, ...); none when None.
         options: What the stage found out on this machine, under names of options of its own, so that it is made again
             in the same way wherever that is done.
     """
@@ -52,6 +53,7 @@ class Changed:
     edits: tuple[Edit, ...] = ()
     training: Mapping[str, Any] | None = None
     program: tuple[ProgramStep, ...] | None = None
+    played: Mapping[str, Any] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -135,7 +137,7 @@ class ModuleStage(Transform):
         made_by = self.made_by()
         made_by["options"] = {**made_by["options"], **done.options}
         edits = joined_edits(read_edits(bundle), done.edits)
-        changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program)
+        changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program, done.played)
         context.tell("running the changed policy", None)
         return changed
 
@@ -198,6 +200,7 @@ def write_changed(
     made_by: dict[str, Any],
     training: Mapping[str, Any] | None = None,
     program: tuple[ProgramStep, ...] | None = None,
+    played: Mapping[str, Any] | None = None,
 ) -> Bundle:
     """Write a source bundle with other modules.
 
@@ -209,11 +212,14 @@ def write_changed(
         made_by: Stage, options and versions.
         training: How they were trained, if they were.
         program: How they run; as in the source when None.
+        played: Observations that they were trained on, which the bundle keeps.
     """
     write_module(out, edits, modules)
     if training is not None:
         (out / TRAINING).write_text(json.dumps(training) + "\n", encoding="utf-8")
     carry_over(source, out)
+    if played is not None:
+        write_played(played, out)
     shutil.copyfile(source.path / LOCATION, out / LOCATION)
     build = (*history(source), {**made_by, "input": source.hash})
     program = source.manifest.program if program is None else program

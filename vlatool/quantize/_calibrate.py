@@ -62,7 +62,7 @@ def calibrate(
     Args:
         bundle: A float32 bundle.
         values: What is looked at.
-        observations: Raw observations, consumed one at a time.
+        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time.
         context: For progress.
         channels: Whether the largest magnitude of each entry of the last axis is kept too.
         numbers: What messages call the observations: their places in the recording; counted from 0 when empty.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import calibration_checks, calibration_recording
+from vlatool.data import PLAYED, calibration_checks, calibration_recording, played_observations
 from vlatool.errors import DataError
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._calibrate import Values, calibrate
@@ -37,7 +38,9 @@ class Calibrated(Quantization):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is calibration data."""
         super().check(source, profile)
-        if source is not None and calibration_recording(source, self.calibration) is None:
+        if source is None or (PLAYED in source.manifest.files and not self.calibration):
+            return
+        if calibration_recording(source, self.calibration) is None:
             raise self._missing(source)
 
     def observed(self, bundle: Bundle, seen: SampleSet) -> tuple[list[int], Iterator[Mapping[str, Any]]]:
@@ -62,9 +65,16 @@ class Calibrated(Quantization):
     def statistics(
         self, bundle: Bundle, values: Values, seen: SampleSet, context: Context
     ) -> dict[str, dict[str, Statistics]]:
-        """Run the calibration samples; return graph -> value -> statistics. See ``calibrate`` for the errors."""
-        numbers, observations = self.observed(bundle, seen)
-        return calibrate(bundle, values, observations, context, numbers=numbers)
+        """Run the calibration samples, and what a training kept; return graph -> value -> statistics.
+
+        Raises:
+            DataError, GraphError: see ``calibrate``.
+        """
+        played = [] if self.calibration else played_observations(bundle)
+        alone = played and calibration_recording(bundle) is None
+        numbers, recorded = ([], iter(())) if alone else self.observed(bundle, seen)
+        observations = itertools.chain(recorded, seen.watch(played))
+        return calibrate(bundle, values, observations, context, numbers=[*numbers, *range(len(played))])
 
     def _missing(self, bundle: Bundle) -> DataError:
         fix = f"pass --calibration FILE.npz{self.without}"

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import Encoded
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
@@ -45,6 +47,17 @@ class Watcher:
         return {name: values[name] for name in self._outputs}
 
 
+class _Passing(ObservationEncoder):
+    """An encoder that hands on what is encoded already."""
+
+    def __init__(self, encode: ObservationEncoder) -> None:
+        self.names, self._encode = encode.names, encode
+
+    def __call__(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Encode an observation, as ``ObservationEncoder`` does, where that is to be done."""
+        return observation if isinstance(observation, Encoded) else self._encode(observation)
+
+
 def run_watched(
     bundle: Bundle,
     watchers: Mapping[str, Watcher],
@@ -58,7 +71,7 @@ def run_watched(
     Args:
         bundle: A float32 bundle.
         watchers: Graph name -> session; graphs without one run as they are.
-        observations: Raw observations, consumed one at a time.
+        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time.
         context: For progress.
         what: Is being done, before the words "sample 3".
         numbers: What messages call the observations: their places in the recording; counted from 0 when empty.
@@ -69,6 +82,7 @@ def run_watched(
     graphs = bundle.manifest.graphs
     others = {name: engine_class()(bundle.file(graphs[name].file), 1) for name in graphs if name not in watchers}
     policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
+    policy.encode = _Passing(policy.encode)
     for place, observation in enumerate(observations):
         number = numbers[place] if numbers else place
         if place % 8 == 0:

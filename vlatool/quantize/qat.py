@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from vlatool.data import MOST
 from vlatool.runtime.engine import layouts
 from vlatool.stage.base import build_stage
 from vlatool.training.fake_quantization import BLOCK, fake_quantization
@@ -26,11 +27,14 @@ class Qat(ImitationStage):
 
     The teacher is the policy in float32 before any edit, or ``--teacher``: no labels are needed. What is trained are
     the weights; they are rounded to the same grid as by ``quantize static-int8`` (int8, with activations) or
-    ``quantize weight-only`` (int4, in blocks of 32), which follow, and write the same form of bundle. Try these alone
-    first: they take seconds, and most policies lose nothing. In a recipe, name the method that follows.
+    ``quantize weight-only`` (int4, in blocks of 32), which follow, and write the same form of bundle. Ranges of
+    activations are taken from what the training saw, too: 128 observations, spread over its episodes, stay in the
+    bundle (``data/played.npz``) and calibrate beside the recorded ones. Try the methods alone first: they take seconds,
+    and most policies lose nothing. In a recipe, name the method that follows.
     """
 
     changed_first: ClassVar[bool] = False
+    keeps: ClassVar[int] = MOST
 
     weights: Literal["int8", "int4"] = Field("int8", description="int8 with int8 activations; int4 weights alone")
     learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")

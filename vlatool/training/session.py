@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
 from vlatool.episodes.jobs import run_jobs
@@ -142,6 +144,12 @@ class Session:
             self._trainer.finish()
         self._events.close()
         return self._about()
+
+    def observations(self, most: int) -> dict[str, Any]:
+        """Return rows of the inputs, spread over all rounds: name -> (N, ...)."""
+        rows = sorted({int(row) for row in np.linspace(0, len(self._frames) - 1, most)})
+        held = self._frames.batch(np.array(rows))
+        return {tensor.name: held[tensor.name] for tensor in self._spec.inputs}
 
     def _show(self) -> None:
         """Write what the expert did, to learn from and to judge with, where the expert is asked."""

@@ -57,6 +57,8 @@ class TrainingStage(ModuleStage):
     changed_first: ClassVar[bool] = True
     """Whether a policy that is as its factory makes it has nothing to learn."""
     trains: ClassVar[bool] = True
+    keeps: ClassVar[int] = 0
+    """Observations that stay in the bundle, to take the ranges of activations from."""
     teacher: Path | None = Field(
         None, description="the teacher: a policy, or its source bundle; the policy before any edit when empty"
     )
@@ -210,7 +212,8 @@ class TrainingStage(ModuleStage):
         crew_asked = self._job(source), self.processes, place, self.runs(source), settings.device.name
         with settings.device.holding(*programs), crew_of(*crew_asked) as crew:
             session = Session(plan, settings, lesson, source, teacher, place, context, crew)
-            return Changed(training=session.run())
+            training = session.run()
+            return Changed(training=training, played=session.observations(self.keeps) if self.keeps else None)
 
     def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
         """Return the teacher of a student's modules, and what it teaches; every process of a training has its own."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from statistics import median
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
-from vlatool.data import CALIBRATION, EVALUATION
+from vlatool.data import CALIBRATION, EVALUATION, PLAYED
 from vlatool.files.written import LEDGER
 from vlatool.gate.config import GrowthClaim, LatencyClaim
 from vlatool.gate.inputs import MEMORY, Inputs
@@ -21,7 +21,7 @@ PROBES = 3
 """Fresh processes that load each bundle once."""
 OBSERVATIONS = 16
 """Observations that such a process answers, beside the golden one."""
-ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, "recipe.yaml", "SIGNATURE",
+ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, PLAYED, "recipe.yaml", "SIGNATURE",
          "reports/report.html", "reports/report.md", "reports/report.json",
     "reports/smooth_quant.json",
     "reports/weights.json")  # fmt: skip

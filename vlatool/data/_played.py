@@ -1,0 +1,69 @@
+"""Observations that a training saw, as the graphs take them: ranges of activations are taken from these, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.spec import PolicySpec
+from vlatool.errors import DataError
+from vlatool.files.npz import open_npz
+
+Array = NDArray[Any]
+PLAYED = "data/played.npz"
+MOST = 128
+"""Observations that are kept: twice those that calibrate by default."""
+
+
+class Encoded(dict[str, Array]):
+    """An observation as the graphs take it, name -> (1, ...): normalised, text as ids."""
+
+
+def write_played(rows: Mapping[str, Array], out: Path) -> None:
+    """Keep rows of a training in the bundle that is written.
+
+    Args:
+        rows: Input name -> (N, ...).
+        out: Directory of the bundle.
+    """
+    (out / PLAYED).parent.mkdir(exist_ok=True)
+    (out / PLAYED).unlink(missing_ok=True)  # it may be the file of the bundle before
+    np.savez_compressed(out / PLAYED, allow_pickle=False, **rows)
+
+
+def played_observations(source: Bundle) -> list[Encoded]:
+    """Return the observations that a bundle's training kept; none where it kept none.
+
+    Raises:
+        DataError: when the file is corrupt, or does not fit the spec.
+    """
+    if PLAYED not in source.manifest.files:
+        return []
+    path = source.file(PLAYED)
+    arrays = open_npz(path)
+    for tensor in source.manifest.spec.inputs:
+        _check(path, tensor.name, arrays.get(tensor.name), source.manifest.spec)
+    names = [tensor.name for tensor in source.manifest.spec.inputs]
+    if len({len(arrays[name]) for name in names}) > 1:
+        raise _broken(path, "its inputs have different numbers of rows")
+    return [Encoded({name: arrays[name][row : row + 1] for name in names}) for row in range(len(arrays[names[0]]))]
+
+
+def _check(path: Path, name: str, array: Array | None, spec: PolicySpec) -> None:
+    tensor = next(tensor for tensor in spec.inputs if tensor.name == name)
+    if array is None:
+        raise _broken(path, f"it has no '{name}'")
+    if array.shape[1:] != tensor.shape[1:] or array.dtype != np.dtype(tensor.dtype) or not array.ndim:
+        wanted = f"{tensor.dtype} (N, {', '.join(map(str, tensor.shape[1:]))})"
+        raise _broken(path, f"'{name}' is {array.dtype} {array.shape}; wanted {wanted}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise _broken(path, f"'{name}' has values that are not finite")
+
+
+def _broken(path: Path, why: str) -> DataError:
+    return DataError(f"{path} does not fit the policy: {why}.", "train again: quantize qat writes it")
