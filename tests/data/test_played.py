@@ -11,7 +11,7 @@ import pytest
 
 from tests._reach import folder_of
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import MOST, PLAYED, Encoded, played_observations, recorded_observations, write_played
+from vlatool.data import MOST, PLAYED, Encoded, kept_rows, played_observations, recorded_observations, write_played
 from vlatool.errors import DataError
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
@@ -44,6 +44,13 @@ def test_what_was_written_is_read_and_gives_the_statistics_of_the_raw_observatio
     again = calibrate(bundle, values, played, Context())
     for name, seen in raw["main"].items():
         assert (seen.low, seen.high) == (again["main"][name].low, again["main"][name].high)
+
+
+@pytest.mark.parametrize(("most", "row_bytes", "count"), [
+    (128, 100, 128), (128, 1 << 20, 64), (128, 100 << 20, 16), (128, 0, 128), (8, 1 << 20, 8),
+])  # fmt: skip
+def test_large_observations_are_kept_fewer(most: int, row_bytes: int, count: int):
+    assert kept_rows(most, row_bytes) == count
 
 
 @pytest.mark.parametrize(("change", "why"), [

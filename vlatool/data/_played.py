@@ -18,10 +18,18 @@ Array = NDArray[Any]
 PLAYED = "data/played.npz"
 MOST = 128
 """Observations that are kept: twice those that calibrate by default."""
+LEAST = 16
+BYTES = 64 << 20
+"""Of observations beyond ``LEAST``, before they are compressed: large images are kept fewer."""
 
 
 class Encoded(dict[str, Array]):
     """An observation as the graphs take it, name -> (1, ...): normalised, text as ids."""
+
+
+def kept_rows(most: int, row_bytes: int) -> int:
+    """Return how many observations of a size are kept."""
+    return min(most, max(LEAST, BYTES // max(1, row_bytes)))
 
 
 def write_played(rows: Mapping[str, Array], out: Path) -> None:

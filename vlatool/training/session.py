@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import recorded_observations
+from vlatool.data import kept_rows, recorded_observations
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
@@ -146,10 +146,12 @@ class Session:
         return self._about()
 
     def observations(self, most: int) -> dict[str, Any]:
-        """Return rows of the inputs, spread over all rounds: name -> (N, ...)."""
-        rows = sorted({int(row) for row in np.linspace(0, len(self._frames) - 1, most)})
-        held = self._frames.batch(np.array(rows))
-        return {tensor.name: held[tensor.name] for tensor in self._spec.inputs}
+        """Return rows of the inputs, spread over all rounds, fewer where they are large: name -> (N, ...)."""
+        names = [tensor.name for tensor in self._spec.inputs]
+        first = self._frames.batch(np.zeros(1, int))
+        count = kept_rows(most, sum(first[name].nbytes for name in names))
+        held = self._frames.batch(np.unique(np.linspace(0, len(self._frames) - 1, count).astype(int)))
+        return {name: held[name] for name in names}
 
     def _show(self) -> None:
         """Write what the expert did, to learn from and to judge with, where the expert is asked."""
