@@ -116,5 +116,14 @@ def test_a_policy_without_recordings_calibrates_on_its_training(tmp_path: Path):
     StaticInt8().check(exported, None)
     int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context())
     assert int8.manifest.made_by["calibration"]["samples"] == MOST
-    with pytest.raises(DataError, match="carries no calibration data"):
+    with pytest.raises(DataError, match="carries no calibration data") as told:
         run_transform(build_stage("quantize.smooth_quant", {}), exported, tmp_path / "smooth", Context())
+    assert "qat" not in told.value.fix, "it would not help"
+
+
+def test_who_has_an_environment_alone_is_told_of_qat(tmp_path: Path):
+    source = run_transform(TorchModule(policy=folder_of(tmp_path / "policy")), None, tmp_path / "source", Context())
+    exported = run_transform(build_stage("export.onnx", {}), source, tmp_path / "exported", Context())
+    with pytest.raises(DataError, match=r"^reach carries no calibration data") as told:
+        StaticInt8().check(exported, None)
+    assert told.value.fix.endswith(", or quantize.qat, which plays episodes")

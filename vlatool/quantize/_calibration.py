@@ -77,5 +77,6 @@ class Calibrated(Quantization):
         return calibrate(bundle, values, observations, context, numbers=[*numbers, *range(len(played))])
 
     def _missing(self, bundle: Bundle) -> DataError:
-        fix = f"pass --calibration FILE.npz{self.without}"
-        return DataError(f"{bundle.path} carries no calibration data, which {self.name()} needs.", fix)
+        plays = ", or quantize.qat, which plays episodes" if self.without and bundle.manifest.environment else ""
+        fix = f"pass --calibration FILE.npz{self.without}{plays}"
+        return DataError(f"{bundle.manifest.name} carries no calibration data, which {self.name()} needs.", fix)
