@@ -58,6 +58,11 @@ class Frames:
         """Make a draft a round."""
         (self._folder / f"draft-{number:03d}").rename(self._place(number))
 
+    def places(self, number: int) -> Array:
+        """Return the numbers over all rounds of the rows of one."""
+        sizes = [len(next(iter(arrays.values()))) for arrays in self._rounds]
+        return np.arange(sizes[number]) + sum(sizes[:number])
+
     def batch(self, rows: Array) -> dict[str, Array]:
         """Return rows by their numbers over all rounds: name -> (B, ...)."""
         starts = np.cumsum([0, *(len(next(iter(arrays.values()))) for arrays in self._rounds)])

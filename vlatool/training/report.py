@@ -13,6 +13,7 @@ from vlatool.render import write_reports
 from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
 from vlatool.training.forecast import duration
 from vlatool.training.supervision import teacher_lines, teacher_record
+from vlatool.training.unseen import BEFORE, KEY, NEW
 
 Record = dict[str, Any]
 
@@ -57,5 +58,11 @@ def _round(about: Record) -> Record:
     episodes = about.get("episodes")
     success = f"{about['successes'] / episodes:.1%}" if episodes else None
     who = about["actor"] if episodes else "batches" if about.get("yielded") else "recordings"
+    losses = about.get(KEY, {})
     return {"before step": about["step"] + 1, "who acted": who, "episodes": episodes, "success": success,
-            "observations": about["observations"]}  # fmt: skip
+            "observations": about["observations"], "loss, not trained on": _digits(losses.get(NEW)),
+            "of the round before": _digits(losses.get(BEFORE))}  # fmt: skip
+
+
+def _digits(loss: float | None) -> str | None:
+    return None if loss is None else f"{loss:.4g}"

@@ -18,6 +18,7 @@ from vlatool.data import kept_rows, recorded_observations
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
+from vlatool.files.edited import whole_file
 from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
@@ -35,6 +36,7 @@ from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
 from vlatool.training.teacher import Teacher
+from vlatool.training.unseen import KEY, unseen_losses
 from vlatool.training.yielded import write_yielded
 
 ROUND = "round-{:03d}.json"
@@ -179,6 +181,7 @@ class Session:
         if self._plays:
             with self._forecast.pause():
                 next_round(self._frames, number, partial(self._students, number))
+                self._try(number)
             self._note(number)
         patience, best = self._plan.patience, self._trainer.best
         if not patience:
@@ -189,6 +192,17 @@ class Session:
                 self._trainer.judge(score)
                 self._trainer.save()
         return best.unimproved(number) >= patience
+
+    def _try(self, number: int) -> None:
+        """Note how far the student is from its teacher in the round that it has just played, before it trains on it."""
+        about = self._round(number)
+        if KEY in about or about["step"] != self._trainer.step or self._settings.shard:
+            return  # an earlier run did, or cannot: the weights of then are gone
+        how = self._lesson.loss, self._plan.batch, self._settings.device
+        with self._trainer.averaged():
+            about[KEY] = unseen_losses(self._frames, number, *how)
+        self._events.add(about["step"], {f"loss on {name} rows": loss for name, loss in about[KEY].items()})
+        self._keep(number, about)
 
     def _score(self, number: int) -> float:
         """Return how well the averaged weights do: the share of episodes that succeed, or less the held-out loss."""
@@ -224,6 +238,10 @@ class Session:
     def _round(self, number: int) -> dict[str, Any]:
         about: dict[str, Any] = json.loads((self._place / ROUND.format(number)).read_text())
         return about
+
+    def _keep(self, number: int, about: dict[str, Any]) -> None:
+        with whole_file(self._place / ROUND.format(number)) as draft:
+            draft.write_text(json.dumps(about))
 
     def _note(self, number: int) -> None:
         """Remember for the progress how well the student did."""
@@ -277,7 +295,7 @@ class Session:
         about["observations"] = joined((target / "recorded", target / "yielded", *sorted(folder.glob("*"))), target)
         for part in ("recorded", "yielded", "episodes", "actor"):
             shutil.rmtree(target / part, ignore_errors=True)
-        (self._place / ROUND.format(number)).write_text(json.dumps(about))
+        self._keep(number, about)
         self._label(target, number)
 
     def _label(self, target: Path, *seed: int) -> None:

@@ -32,6 +32,7 @@ from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
 from vlatool.training.teacher import Teacher, check_teacher, teacher_source
 from vlatool.training.torchrun import launched
+from vlatool.training.unseen import unseen_lines
 from vlatool.training.yielded import rows_asked
 from vlatool.user_code import trust
 
@@ -176,6 +177,7 @@ class TrainingStage(ModuleStage):
         return (
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
+            *unseen_lines(training["rounds"]),
             *_compared(training.get("hints", {})),
             *teacher_lines(training),
             *_judged(training.get("judged")),
