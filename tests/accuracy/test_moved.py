@@ -142,5 +142,11 @@ def test_what_the_baseline_has_none_of_is_told_though_it_has_no_ratio():
         added.note == "mean of 39 episodes in which both succeed: above 0 in 10 of them, and in none of the baseline's"
     )
     assert row.get("reversals_added") is None, "neither has any"
-    sentence = "Where both succeed, the baseline has none of these: collisions (0.513 in an episode)."
+    sentence = (
+        "Where both succeed, the baseline has none of these: collisions (in 10 of 39 episodes, 0.513 on average)."
+    )
     assert sentence in told((baseline, row), "")
+    few = [outcome("a", seed, True, 10, collisions=2.0 if seed < 5 else 0.0) for seed in range(40)]
+    baseline, row = rows([outcome("a", seed, True, 10, collisions=0.0) for seed in range(40)], few)
+    assert row.value("collisions_added") == 0.25
+    assert not any("collisions" in said for said in told((baseline, row), "")), "five may be chance"

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vlatool.accuracy.disturbed import worst_record
-from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST
+from vlatool.accuracy.moved import ADDED, RATIO, STEPS, WORST, pairs_above_none
 from vlatool.evaluate._late import LATE
 from vlatool.report import Measurement, Row
 
 LEAST = 1.005
 """Ratio below which two decimals say 1.00, and nothing is worth a sentence."""
+FEWEST_ADDED = 6
+"""Pairs in which the variant alone has something, so that an exact two-sided sign test gives less than 5 %."""
 
 
 def told(rows: Sequence[Row], board: str) -> Iterator[str]:
@@ -28,9 +30,8 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
     if rougher := [item for item in changed if _is_more(item)]:
         words = (f"{item.name.removesuffix(RATIO).replace('_', ' ')} {_times(item.value)}" for item in rougher)
         yield f"Where both succeed, more than the baseline's: {', '.join(words)}."
-    if new := [item for item in row.measurements if item.name.endswith(ADDED)]:
-        words = (f"{item.name.removesuffix(ADDED).replace('_', ' ')} ({item.value:.3g} in an episode)" for item in new)
-        yield f"Where both succeed, the baseline has none of these: {', '.join(words)}."
+    if new := list(_added(rows)):
+        yield f"Where both succeed, the baseline has none of these: {', '.join(new)}."
     if steps and _is_more(steps):
         yield f"Over all episodes, it needs {_times(steps.value)} the steps."
     yield from _disturbed(row)
@@ -39,6 +40,16 @@ def told(rows: Sequence[Row], board: str) -> Iterator[str]:
         late = ", ".join(f"{name} {ms:.3g} ms" for name, ms in latencies.items())
         where = f"predicted for {board}" if board else "measured here"
         yield f"Actions come as late as inferences take ({where}): {late}."
+
+
+def _added(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield what the baseline has nothing of, and the variant in so many pairs that chance is no explanation."""
+    if len(rows) < 2:
+        return
+    added = {item.name.removesuffix(ADDED): item for item in rows[-1].measurements if item.name.endswith(ADDED)}
+    for name, (some, count) in pairs_above_none(rows[0], rows[-1], added).items():
+        if some >= FEWEST_ADDED:
+            yield f"{name.replace('_', ' ')} (in {some} of {count} episodes, {added[name].value:.3g} on average)"
 
 
 def _disturbed(row: Row) -> Iterator[str]:
