@@ -73,7 +73,8 @@ class PrunedSearch:
         study.begin(space)
         while (asked := study.ask(pruning.trials)) is not None:
             number, shape = asked
-            self.context.tell(f"trial {number + 1}, {pruning.trials} in all: {space.name(shape)}", None)
+            place = len(study.tried()) + 1  # numbers of the study count shapes that were asked for twice, too
+            self.context.tell(f"trial {place} of {pruning.trials}: {space.name(shape)}", None)
             study.tell(number, self._try(shape, space))
         tried = study.tried()
         chosen = self._finalists(tried, space)
