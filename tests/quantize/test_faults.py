@@ -215,7 +215,7 @@ WARNINGS = [
         lambda b: b.on(proprio=lambda v: v.astype(np.float64))),
     Row("fewer samples than asked for", "96 calibration samples were asked for; .*mine.npz holds 24",
         lambda b: b.on({"samples": 96})),
-    Row("hardly any samples", "ranges from 5 calibration samples are unreliable; use 8 or more",
+    Row("hardly any samples", "ranges from 5 calibration samples are unreliable; use 64 or more, from every task",
         lambda b: b.on({"samples": 5})),
     Row("a recording of hardly any samples", "ranges from 3 calibration samples are unreliable",
         lambda b: b.on(**every(3))),

@@ -62,7 +62,7 @@ def _of_count(recording: Recording, count: int, requested: int) -> Iterator[str]
     if count < requested:
         yield f"{requested} calibration samples were asked for; {recording.path} holds {count}"
     if count < FEW:
-        yield f"ranges from {count} calibration samples are unreliable; use {FEW} or more, better 64"
+        yield f"ranges from {count} calibration samples are unreliable; use 64 or more, from every task"
 
 
 def _of_names(recording: Recording, spec: PolicySpec) -> Iterator[str]:
