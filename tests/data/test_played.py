@@ -11,13 +11,14 @@ import pytest
 
 from tests._reach import folder_of
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import MOST, PLAYED, Encoded, kept_rows, played_observations, recorded_observations, write_played
+from vlatool.data import MOST, PLAYED, Encoded, kept_rows, played_observations, recorded_observations
 from vlatool.errors import DataError
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context, SampleSet, build_stage
+from vlatool.stage.finish import save_npz
 from vlatool.stage.run import run_transform
 
 QUICK = {"steps": 4, "batch": 16, "episodes": 6, "student_episodes": 2, "every": 2, "threads": 1}
@@ -34,7 +35,7 @@ def test_what_was_written_is_read_and_gives_the_statistics_of_the_raw_observatio
 ):
     bundle = copied(float_bundle)
     assert played_observations(bundle) == []
-    write_played(encoded_rows(bundle), bundle.path)
+    save_npz(bundle.path / PLAYED, encoded_rows(bundle))
     bundle = resealed(bundle)
     played = played_observations(bundle)
     assert len(played) == 12
@@ -67,7 +68,7 @@ def test_a_wrong_file_is_refused(
     bundle = copied(float_bundle)
     rows = encoded_rows(bundle)
     change(rows)
-    write_played(rows, bundle.path)
+    save_npz(bundle.path / PLAYED, rows)
     with pytest.raises(DataError, match=why):
         run_transform(StaticInt8(), resealed(bundle), tmp_path / "int8", Context())
 
@@ -76,7 +77,7 @@ def test_a_damaged_file_is_refused(
     float_bundle: Bundle, copied: Callable[[Bundle], Bundle], resealed: Callable[[Bundle], Bundle], tmp_path: Path
 ):
     bundle = copied(float_bundle)
-    write_played(encoded_rows(bundle), bundle.path)
+    save_npz(bundle.path / PLAYED, encoded_rows(bundle))
     whole = (bundle.path / PLAYED).read_bytes()
     (bundle.path / PLAYED).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"played\.npz"):
@@ -109,6 +110,22 @@ def test_ranges_cover_what_the_training_saw_and_the_recording_did_not(tmp_path: 
     assert high > 10 * np.abs(near).max(), "episodes go farther than what was recorded"
     int8 = run_transform(StaticInt8(), exported, tmp_path / "int8", Context())
     assert int8.manifest.made_by["calibration"]["samples"] == 16 + MOST, "half of a recording is held out"
+
+
+def test_an_input_may_be_called_as_it_likes_and_a_second_training_keeps_its_own(tmp_path: Path):
+    folder = folder_of(tmp_path / "policy")
+    for name in ("policy.yaml", "policy.py", "environment.py"):
+        text = (folder / name).read_text()
+        (folder / name).write_text(text.replace("name: state", "name: file").replace('"state"', '"file"')
+                                   .replace("def forward(self, state)", "def forward(self, file)")
+                                   .replace("(state)", "(file)").replace("state[", "file["))  # fmt: skip
+    source = run_transform(TorchModule(policy=folder), None, tmp_path / "source", Context())
+    once = run_transform(build_stage("quantize.qat", QUICK), source, tmp_path / "once", Context())
+    before = (once.path / PLAYED).read_bytes()
+    other = {**QUICK, "first_seed": 2_000_000}
+    twice = run_transform(build_stage("quantize.qat", other), once, tmp_path / "twice", Context())
+    assert [set(bundle) for bundle in played_observations(twice)[:1]] == [{"file"}]
+    assert (once.path / PLAYED).read_bytes() == before != (twice.path / PLAYED).read_bytes()
 
 
 def test_a_policy_without_recordings_calibrates_on_its_training(tmp_path: Path):

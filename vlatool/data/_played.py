@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.spec import PolicySpec
+from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import DataError
 from vlatool.files.npz import open_npz
 
@@ -32,18 +31,6 @@ def kept_rows(most: int, row_bytes: int) -> int:
     return min(most, max(LEAST, BYTES // max(1, row_bytes)))
 
 
-def write_played(rows: Mapping[str, Array], out: Path) -> None:
-    """Keep rows of a training in the bundle that is written.
-
-    Args:
-        rows: Input name -> (N, ...).
-        out: Directory of the bundle.
-    """
-    (out / PLAYED).parent.mkdir(exist_ok=True)
-    (out / PLAYED).unlink(missing_ok=True)  # it may be the file of the bundle before
-    np.savez_compressed(out / PLAYED, allow_pickle=False, **rows)
-
-
 def played_observations(source: Bundle) -> list[Encoded]:
     """Return the observations that a bundle's training kept; none where it kept none.
 
@@ -55,15 +42,15 @@ def played_observations(source: Bundle) -> list[Encoded]:
     path = source.file(PLAYED)
     arrays = open_npz(path)
     for tensor in source.manifest.spec.inputs:
-        _check(path, tensor.name, arrays.get(tensor.name), source.manifest.spec)
+        _check(path, tensor, arrays.get(tensor.name))
     names = [tensor.name for tensor in source.manifest.spec.inputs]
     if len({len(arrays[name]) for name in names}) > 1:
         raise _broken(path, "its inputs have different numbers of rows")
     return [Encoded({name: arrays[name][row : row + 1] for name in names}) for row in range(len(arrays[names[0]]))]
 
 
-def _check(path: Path, name: str, array: Array | None, spec: PolicySpec) -> None:
-    tensor = next(tensor for tensor in spec.inputs if tensor.name == name)
+def _check(path: Path, tensor: TensorSpec, array: Array | None) -> None:
+    name = tensor.name
     if array is None:
         raise _broken(path, f"it has no '{name}'")
     if array.shape[1:] != tensor.shape[1:] or array.dtype != np.dtype(tensor.dtype) or not array.ndim:

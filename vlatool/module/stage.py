@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from vlatool.bundle.bundle import LOCATION, Bundle, seal
 from vlatool.bundle.program import ProgramStep
 from vlatool.bundle.unexported import export_command
-from vlatool.data import observations_for, write_played
+from vlatool.data import PLAYED, observations_for
 from vlatool.errors import BundleError, GraphError, SourceError, VlatoolError, require
 from vlatool.files.printable import message_of
 from vlatool.module.description import read_location
@@ -24,7 +24,7 @@ from vlatool.module.origin import factory_of
 from vlatool.module.stored import stored_modules, takes_shards, weights_read
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy
 from vlatool.stage.base import Context, Transform, source_of
-from vlatool.stage.finish import SEED, carry_over, history
+from vlatool.stage.finish import SEED, carry_over, history, save_npz
 
 if TYPE_CHECKING:
     from torch import nn
@@ -219,7 +219,9 @@ def write_changed(
         (out / TRAINING).write_text(json.dumps(training) + "\n", encoding="utf-8")
     carry_over(source, out)
     if played is not None:
-        write_played(played, out)
+        (out / PLAYED).parent.mkdir(exist_ok=True)
+        (out / PLAYED).unlink(missing_ok=True)  # carried over, it may be the file of the bundle before
+        save_npz(out / PLAYED, played)
     shutil.copyfile(source.path / LOCATION, out / LOCATION)
     build = (*history(source), {**made_by, "input": source.hash})
     program = source.manifest.program if program is None else program

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.errors import require
+from vlatool.training.device import Device
 from vlatool.training.frames import Frames
 from vlatool.training.group import Group
 from vlatool.training.mixture import Draw, Mixture, Part
@@ -54,6 +56,23 @@ class Batches:
 
     def _loss(self, rows: NDArray[Any]) -> Tensor:
         return self._of_rows(self._frames.batch(rows))
+
+
+def mean_loss(frames: Frames, places: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
+    """Return the mean loss of rows, without gradients.
+
+    Args:
+        frames: Where they are.
+        places: Their numbers over all rounds.
+        loss: Of a batch.
+        rows: At a time.
+        device: As in training.
+    """
+    total = 0.0
+    with require("torch", "build").no_grad(), device.computing(), device.casting():
+        for part in np.array_split(places, -(-len(places) // rows)):
+            total += float(loss(frames.batch(part))) * len(part)
+    return total / len(places)
 
 
 def draw_of(taught: Batches, alpha: float, loss: Loss | None, shown: Frames) -> Draw:

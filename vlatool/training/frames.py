@@ -77,6 +77,11 @@ class Frames:
         return self._folder / f"round-{number:03d}"
 
 
+def spread(count: int, most: int) -> Array:
+    """Return the places of ``most`` of so many rows, or of all, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
 def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
     """Return an array in a new ``.npy`` file, whose place on the disk is taken: a full disk would kill a later write.
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Recording
-from vlatool.errors import DataError, require
-from vlatool.training.batches import Loss
+from vlatool.errors import DataError
+from vlatool.training.batches import Loss, mean_loss
 from vlatool.training.device import Device
 from vlatool.training.expert import Expert, at_most
 from vlatool.training.frames import Frames
@@ -87,7 +87,7 @@ class HeldOut:
             rows: At a time.
             device: As in training.
         """
-        return _mean(self._frames, loss, rows, device)
+        return mean_loss(self._frames, np.arange(len(self._frames)), loss, rows, device)
 
     def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
         """Return the same as a mixture of both terms.
@@ -101,16 +101,8 @@ class HeldOut:
         total = alpha * self.loss(loss, rows, device) if alpha else 0.0
         if expert is None:
             return total
-        return total + (1 - alpha) * _mean(self.expert.frames, expert, rows, device)
-
-
-def _mean(frames: Frames, loss: Loss, rows: int, device: Device) -> float:
-    torch, total = require("torch", "build"), 0.0
-    parts = np.array_split(np.arange(len(frames)), -(-len(frames) // rows))
-    with torch.no_grad(), device.computing(), device.casting():
-        for part in parts:
-            total += float(loss(frames.batch(part))) * len(part)
-    return total / len(frames)
+        shown = self.expert.frames
+        return total + (1 - alpha) * mean_loss(shown, np.arange(len(shown)), expert, rows, device)
 
 
 def _required(instead: Callable[[Path], bool], recorded: int, target: Path) -> None:

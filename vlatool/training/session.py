@@ -29,7 +29,7 @@ from vlatool.training.crew import Crew
 from vlatool.training.events import Events
 from vlatool.training.expert import Expert, at_most
 from vlatool.training.forecast import Forecast
-from vlatool.training.frames import Frames, joined
+from vlatool.training.frames import Frames, joined, spread
 from vlatool.training.held_out import HeldOut
 from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, Trainer
@@ -152,7 +152,7 @@ class Session:
         names = [tensor.name for tensor in self._spec.inputs]
         first = self._frames.batch(np.zeros(1, int))
         count = kept_rows(most, sum(first[name].nbytes for name in names))
-        held = self._frames.batch(np.unique(np.linspace(0, len(self._frames) - 1, count).astype(int)))
+        held = self._frames.batch(spread(len(self._frames), count))
         return {name: held[name] for name in names}
 
     def _show(self) -> None:

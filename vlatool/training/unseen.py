@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-
-from vlatool.errors import require
+from vlatool.training.batches import Loss, mean_loss
 from vlatool.training.device import Device
-from vlatool.training.frames import Frames
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from vlatool.training.frames import Frames, spread
 
 MOST = 1024
 """Rows of a round that are looked at."""
@@ -23,9 +17,7 @@ NEW, BEFORE = "new", "before"
 """Of a round that the student has just played, and of its round before, on which it has trained since."""
 
 
-def unseen_losses(
-    frames: Frames, number: int, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, device: Device
-) -> dict[str, float]:
+def unseen_losses(frames: Frames, number: int, loss: Loss, rows: int, device: Device) -> dict[str, float]:
     """Return the mean losses of rows of the student's last two rounds; of the last one alone where it is the first.
 
     Args:
@@ -35,8 +27,9 @@ def unseen_losses(
         rows: At a time.
         device: As in training.
     """
-    losses = {NEW: _mean(frames, number, loss, rows, device)}
-    return losses | ({BEFORE: _mean(frames, number - 1, loss, rows, device)} if number > 1 else {})
+    played = {NEW: number} | ({BEFORE: number - 1} if number > 1 else {})
+    places = {name: frames.places(round_) for name, round_ in played.items()}
+    return {name: mean_loss(frames, each[spread(len(each), MOST)], loss, rows, device) for name, each in places.items()}
 
 
 def unseen_lines(rounds: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -47,13 +40,3 @@ def unseen_lines(rounds: list[dict[str, Any]]) -> tuple[str, ...]:
     new, before = told[-1][NEW], told[-1][BEFORE]
     more = "; more episodes may help (--episodes, --student-episodes)" if new > APART * before else ""
     return (f"loss on new episodes of the student's {new:.4g}, on those before, trained on since, {before:.4g}{more}",)
-
-
-def _mean(frames: Frames, number: int, loss: Callable[[Mapping[str, Any]], Tensor], rows: int, device: Device) -> float:
-    torch, total = require("torch", "build"), 0.0
-    places = frames.places(number)
-    chosen = places[np.unique(np.linspace(0, len(places) - 1, min(MOST, len(places))).astype(int))]
-    with torch.no_grad(), device.computing(), device.casting():
-        for part in np.array_split(chosen, -(-len(chosen) // rows)):
-            total += float(loss(frames.batch(part))) * len(part)
-    return total / len(chosen)
