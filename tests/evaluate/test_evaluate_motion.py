@@ -110,10 +110,17 @@ def test_disturbances_are_the_same_again_and_change_with_their_strength(bundles:
     assert evaluated(bundles, "good", 6, disturb=("push",), strength=0.0).rows[-1].value("success_disturbed") == 1.0
 
 
+def test_disturbances_follow_each_other_with_commas_or_one_by_one(bundles: dict[str, Bundle]):
+    for kinds in ("push, delay", ("push,delay",), ["push", "delay"]):
+        row = evaluated(bundles, "good", 6, disturb=kinds).rows[-1]
+        assert {record["disturbance"] for record in row.details["under disturbances"]} == {"push", "delay"}
+
+
 @pytest.mark.parametrize(
-    ("kinds", "says"), [(("pushh",), "There is no disturbance 'pushh'.*push"), (("",), "There is no")]
+    ("kinds", "says"),
+    [(("pushh",), "There is no disturbance 'pushh'.*push"), (("",), "There is no"), ("push,,delay", "There is no")],
 )
-def test_an_unknown_disturbance_is_refused(bundles: dict[str, Bundle], kinds: tuple[str, ...], says: str):
+def test_an_unknown_disturbance_is_refused(bundles: dict[str, Bundle], kinds: object, says: str):
     with pytest.raises(UsageError, match=says):
         evaluated(bundles, "good", 2, disturb=kinds)
 

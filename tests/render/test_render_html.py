@@ -126,6 +126,16 @@ def test_measured_and_predicted_never_share_a_section() -> None:
             assert "on this host: AMD EPYC" in text or "by dimension" in text
 
 
+def test_a_reason_in_brackets_breaks_anywhere_and_an_interval_does_not() -> None:
+    """One line of it is wider than a phone."""
+    note = "no interval: too few pairs in which the baseline's is not 0"
+    shown = (Measurement("jerk_ratio", 2.0, "x", samples=9, note=note), Measurement("path_ratio", 1.0, "x", samples=9))
+    page = render(Report("evaluate", "Motion", "info", ("Seen.",), (Row("int8", measurements=shown),)), "html")
+    assert "no interval: too few pairs" in page
+    assert "<b>(no interval" not in page
+    assert "<b>n = 9)</b>" in page
+
+
 def test_headline_numbers_with_intervals_and_counts() -> None:
     page = render(optimize(), "html")
     assert "98.4 %" in page

@@ -74,7 +74,9 @@ class ClosedLoop(Measure):
         description="stop when it is decided whether the drop is above this share (0.03 = 3 points)",
     )
     disturb: tuple[str, ...] = Field(
-        (), description="disturbances to play as well: all, or some of delay, dropped_frames and the environment's own"
+        (),
+        description="disturbances to play as well: all, or some of delay, dropped_frames and the environment's own, "
+        "such as light,delay",
     )
     strength: tuple[float, ...] = Field(
         (1.0,),
@@ -86,6 +88,15 @@ class ClosedLoop(Measure):
         "",
         description="profile whose predicted latency that is; --profile sets it; measured here when empty",
     )
+
+    @field_validator("disturb", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """Names may follow each other with commas, as strengths do."""
+        given = [value] if isinstance(value, str) else value
+        if not isinstance(given, list | tuple) or not all(isinstance(part, str) for part in given):
+            return value
+        return tuple(name.strip() for part in given for name in part.split(","))
 
     @field_validator("strength", mode="before")
     @classmethod

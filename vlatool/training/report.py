@@ -64,5 +64,5 @@ def _round(about: Record) -> Record:
             "of the round before": _digits(losses.get(BEFORE))}  # fmt: skip
 
 
-def _digits(loss: float | None) -> str | None:
-    return None if loss is None else f"{loss:.4g}"
+def _digits(loss: float | None) -> float | None:
+    return None if loss is None else float(f"{loss:.4g}")

@@ -81,7 +81,7 @@ def examine(
     words = [lost.told(claim.max_drop) for lost in drops]
     measured = tuple(
         Measurement(lost.name, lost.value, "1", samples=lost.samples, low=finite(lost.low), high=finite(lost.high),
-                    confidence=CONFIDENCE, note=lost.words)
+                    confidence=CONFIDENCE, note=lost.words.rstrip(":"))
         for lost in drops
     )  # fmt: skip
     measured += tuple(number for lost in drops for number in lost.candidate)
