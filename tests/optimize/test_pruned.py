@@ -15,7 +15,7 @@ from vlatool.optimize.pipeline import _write_bundle
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.pruned import PrunedSearch, front_of
 from vlatool.optimize.recipe import read_recipe
-from vlatool.optimize.space import FLOAT32, Shape
+from vlatool.optimize.space import FLOAT32, Shape, Space
 from vlatool.optimize.study import Tried
 from vlatool.report import Report, Row, read_report
 from vlatool.stage.base import Context
@@ -84,7 +84,7 @@ def test_without_episodes_the_error_on_recorded_observations_decides(
     asked = asked.model_copy(update={"effort": asked.effort.model_copy(update={"episodes": 0})})
     plan = make_plan(str(policy_template), None, asked, tmp_path / "cache")
     search = PrunedSearch(plan, float_bundle, float_bundle, Context())
-    drop = search._drop(int8_bundle)
+    drop, _ = search._judged(int8_bundle)
     assert 0 < drop < 0.2
     assert search._told(drop) == f"{drop:.4g}"
     assert search._told(float("inf")) == ""
@@ -193,3 +193,17 @@ def test_the_front_is_what_no_other_beats_in_both() -> None:
     slow, fast, beaten, even = _tried(1, 0), _tried(4, 0.02), _tried(2, 0.03), _tried(4, 0.02, 0.7)
     failed = Tried(Shape(0.4, 1, 1, FLOAT32), note="no")
     assert front_of([slow, fast, beaten, failed, even]) == [slow, fast, even]
+
+
+def test_what_moves_well_is_judged_before_what_is_faster(
+    policy_template: Path, float_bundle: Bundle, recipe: Path, tmp_path: Path
+) -> None:
+    """The judge would refuse all three fastest for their motion, and nothing pruned would be left."""
+    plan = make_plan(str(policy_template), None, read_recipe(recipe), tmp_path / "cache")
+    search = PrunedSearch(plan, float_bundle, float_bundle, Context())
+    space = Space((1.0, 0.7, 0.55), 4, 1, {FLOAT32: ()}, ())
+    rough = [Tried(Shape(0.55, blocks, 1, FLOAT32), 9.0 - blocks, 0.0, refused="jerk is 2x") for blocks in (1, 2, 3)]
+    calm = Tried(Shape(0.7, 1, 1, FLOAT32), 2.0, 0.0)
+    assert search._finalists([*rough, calm], space) == [calm, *rough[:2]]
+    (line,) = (line for line in search._table([*rough, calm], space) if line["speed-up"] == "8.00x")
+    assert (line["within"], line["note"]) == ("no", "jerk is 2x")

@@ -108,6 +108,16 @@ def test_what_another_machine_has_under_way_is_left_to_it(url: str, monkeypatch:
     assert len(shapes) == 2
 
 
+def test_what_moves_worse_than_allowed_is_kept_with_the_reason(url: str) -> None:
+    study = opened(url)
+    number, shape = study.ask(9) or pytest.fail("no trial")
+    study.tell(number, Tried(shape, 3.0, 0.0, refused="it needs 1.11x the steps", miss=0.05))
+    drained(study, 9)
+    assert [each.refused for each in study.tried()] == ["it needs 1.11x the steps", *8 * [""]]
+    constraints = [trial.constraints["moves"] for trial in study._trials() if "moves" in trial.constraints]
+    assert constraints == [0.05, *8 * [0.0]]
+
+
 def test_what_could_not_be_made_says_why(url: str) -> None:
     study = opened(url)
     for note, drop in (("no room", math.inf), ("", math.nan), ("", math.inf)):

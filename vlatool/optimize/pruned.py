@@ -18,6 +18,7 @@ from vlatool.files.work import work_directory
 from vlatool.machine.version import VERSION
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.made import candidate
+from vlatool.optimize.moves import Moves, refused_by_few
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
@@ -108,7 +109,9 @@ class PrunedSearch:
         """Make a policy of a shape, time it and see what it loses; failures say why."""
         try:
             made = self._made(space.stages(shape))
-            return Tried(shape, self._speedup(made[-1]), self._drop(made[-1]), _training_s(made))
+            drop, moves = self._judged(made[-1])
+            return Tried(shape, self._speedup(made[-1]), drop, _training_s(made), refused="; ".join(moves.reasons),
+                         miss=moves.miss)  # fmt: skip
         except VlatoolError as failure:
             if failure.exit_code not in (3, 4):
                 raise
@@ -123,16 +126,20 @@ class PrunedSearch:
         timing = Latency(against=(bundle.path,), iterations=TIMED, threads=threads, engine=engine, **QUICK)
         return cached_measure(timing, self.baseline, self.plan.cache, self.context).rows[-1].value("speedup")
 
-    def _drop(self, bundle: Bundle) -> float:
-        """Return what a policy loses in paired episodes; without an environment, its error on recorded observations."""
+    def _judged(self, bundle: Bundle) -> tuple[float, Moves]:
+        """Return what a policy loses in paired episodes, and whether it moves worse than allowed.
+
+        Without an environment, it is the error on recorded observations.
+        """
         loop = self.plan.closed_loop
         if loop is None or self.plan.recipe.limits.metric:
-            return self._error(bundle)
+            return self._error(bundle), Moves()
         loop = loop.model_copy(
             update={"episodes": self.plan.recipe.pruning.episodes, "first_seed": SELECTION_SEEDS, "baseline": None}
         )
         rows = [cached_measure(loop, each, self.plan.cache, self.context).rows[-1] for each in (self.baseline, bundle)]
-        return compare_success(*rows).value("success_drop")
+        compared = compare_success(*rows)
+        return compared.value("success_drop"), refused_by_few(compared, self.plan.recipe.limits)
 
     def _error(self, bundle: Bundle) -> float:
         if not carries_recordings(self.baseline):
@@ -148,9 +155,10 @@ class PrunedSearch:
         return limits.max_metric or 0.0 if limits.metric else limits.max_drop
 
     def _finalists(self, tried: list[Tried], space: Space) -> list[Tried]:
-        """Return the fastest pruned ones within the budget; the most accurate where none is."""
+        """Return the fastest pruned ones within the budget, first those that move well; else the most accurate."""
         pruned = [each for each in _best_of_each(tried) if each.speedup > 0 and not space.is_whole(each.shape)]
-        inside = sorted((each for each in pruned if each.drop <= self._allowed), key=lambda each: -each.speedup)
+        inside = [each for each in pruned if each.drop <= self._allowed]
+        inside.sort(key=lambda each: (bool(each.refused), -each.speedup))
         return inside[:FINALISTS] or sorted(pruned, key=lambda each: each.drop)[:1]
 
     def _told(self, drop: float) -> str:
@@ -166,10 +174,12 @@ class PrunedSearch:
                 "policy": space.name(each.shape),
                 "speed-up": f"{each.speedup:.2f}x" if each.speedup else "",
                 "drop": self._told(each.drop),
-                "within": "yes" if each.drop <= self._allowed else "no",
+                "within": "yes" if each.drop <= self._allowed and not each.refused else "no",
                 "on the front": "yes" if each in front else "",
                 "training": f"{each.training_s / 60:.1f} min" if each.training_s else "",
-                "note": each.note or ("another process" if each.elsewhere else ""),
+                "note": "; ".join(
+                    filter(None, (each.note or each.refused, "another process" if each.elsewhere else ""))
+                ),
             }
             for each in sorted(tried, key=lambda each: -each.speedup)
         ]

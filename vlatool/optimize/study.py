@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 STARTUP = 6
 """Trials after which what was found says what is tried next; before, the first shapes, then random ones."""
 QUANTIZED = "quantized"
-NOTE, AGAIN, WORKER, TRAINING = "note", "again", "worker", "training_s"
+NOTE, AGAIN, WORKER, TRAINING, REFUSED = "note", "again", "worker", "training_s", "refused"
 REPEATS = 10
 """Shapes that are drawn in the hope of one that was not tried yet; after that, the first such one is taken."""
 LONGEST = 400
@@ -41,6 +41,8 @@ class Tried:
         training_s: Seconds that its training took, wherever that was; 0 for none.
         note: Why it could not be made.
         elsewhere: Whether another machine or process tried it.
+        refused: Why it moves worse than the limits allow, or loses more on one task; empty when it does not.
+        miss: By how much, as a multiple of the limits.
     """
 
     shape: Shape
@@ -49,6 +51,8 @@ class Tried:
     training_s: float = 0.0
     note: str = ""
     elsewhere: bool = False
+    refused: str = ""
+    miss: float = 0.0
 
 
 class Study:
@@ -169,7 +173,9 @@ class Study:
                 trial.set_user_attr(NOTE, tried.note[:LONGEST] or "its accuracy could not be measured")
                 self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
             else:
+                trial.set_user_attr(REFUSED, tried.refused[:LONGEST])
                 trial.set_constraint("drop", tried.drop - self._allowed)
+                trial.set_constraint("moves", tried.miss)
                 self._study.tell(number, [tried.speedup, tried.drop])
 
     def tried(self) -> list[Tried]:
@@ -212,7 +218,8 @@ class Study:
         try:
             shape = Shape(**trial.params)
             speedup, drop = trial.values or (0.0, math.inf)
-            seconds, note = float(trial.user_attrs.get(TRAINING, 0.0)), str(trial.user_attrs.get(NOTE, ""))
+            seconds = float(trial.user_attrs.get(TRAINING, 0.0))
+            note, refused = (str(trial.user_attrs.get(name, ""))[:LONGEST] for name in (NOTE, REFUSED))
         except (TypeError, ValueError) as error:
             raise DataError(f"Trial {trial.number} of the study is no trial of vlatool: {error}.") from error
         if not self._space.holds(shape) or not speedup >= 0 or math.isnan(drop):
@@ -221,7 +228,7 @@ class Study:
                 "name another study",
             )
         elsewhere = trial.user_attrs.get(WORKER) != self._worker
-        return Tried(shape, speedup, drop, seconds, note[:LONGEST], elsewhere)
+        return Tried(shape, speedup, drop, seconds, note, elsewhere, refused)
 
 
 def worker() -> str:
