@@ -12,7 +12,7 @@ from vlatool.cli import app
 from vlatool.errors import RecipeError, UsageError
 from vlatool.optimize.choice import choose
 from vlatool.optimize.judge import Judged, judge
-from vlatool.optimize.moves import refused_by_few, slower_task
+from vlatool.optimize.moves import slower_task
 from vlatool.optimize.plan import make_plan
 from vlatool.optimize.recipe import Effort, Limits, default_recipe
 from vlatool.report import Measurement, Row
@@ -51,25 +51,6 @@ def test_jerk_path_and_task_time_may_be_limited(found: list[Measurement], within
     if not within:
         assert "(--max-motion)" in judged.row.reason
         assert "allowed 5 %" in judged.row.reason
-
-
-@pytest.mark.parametrize(("found", "limits", "refused"), [
-    (ratio("jerk", 1.2, 0.1), {"max_motion": 0.05}, True),
-    (ratio("jerk", 1.2, 0.3), {"max_motion": 0.05}, False),
-    (Measurement("jerk_ratio", 1.2, "x", samples=6), {"max_motion": 0.05}, False),
-    (ratio("jerk", 1.2, 0.1), {}, False),
-    (ratio("steps", 1.11, 0.07), {}, True),
-    (ratio("steps", 1.11, 0.12), {}, False),
-    (Measurement("worst_task_drop", 0.1, "1", samples=50, low=0.01, high=0.2, note="near"), {"worst_task": 0.03}, True),
-    (Measurement("worst_task_drop", 0.1, "1", samples=50, low=-0.1, high=0.3, note="near"), {"worst_task": 0.03}, False),
-])  # fmt: skip
-def test_few_episodes_refuse_what_is_worse_for_sure(found: Measurement, limits: dict[str, float], refused: bool):
-    """Chance moves the ratios of a trial by more than a limit allows."""
-    still = ratio("task_time", 1.0)
-    moves = refused_by_few(row("int8", 5.0, still, found), Limits(**limits))
-    assert bool(moves.reasons) == refused
-    assert (moves.miss > 0) == refused
-    assert not moves.warnings
 
 
 def test_motion_that_the_episodes_cannot_decide_is_a_warning():

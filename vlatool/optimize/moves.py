@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from vlatool.accuracy.moved import RATIO, SPEEDUP, STEPS, WORST
 from vlatool.optimize.recipe import Limits
@@ -43,23 +43,6 @@ def judge_moves(row: Row, limits: Limits) -> Moves:
     found = (*_motion(row, limits), *_steps(row, limits), *_worst(row, limits))
     reasons = tuple(reason for one in found for reason in one.reasons)
     return Moves(reasons, sum(one.miss for one in found), tuple(text for one in found for text in one.warnings))
-
-
-def refused_by_few(row: Row, limits: Limits) -> Moves:
-    """Judge a row of few episodes: what chance alone may have made is left out, and warnings are, too.
-
-    A number refuses when its interval says that it is worse than float32's, and its value is above the limit.
-    """
-    moves = judge_moves(replace(row, measurements=tuple(map(_if_sure, row.measurements))), limits)
-    return replace(moves, warnings=())
-
-
-def _if_sure(item: Measurement) -> Measurement:
-    """Return a comparison with float32 as it is, or as none where its interval does not exclude that."""
-    if not item.name.endswith((RATIO, WORST, "success_drop")):
-        return item
-    same = 1.0 if item.name.endswith(RATIO) else 0.0
-    return item if item.low is not None and item.low > same else replace(item, value=min(item.value, same))
 
 
 def _motion(row: Row, limits: Limits) -> Iterator[Moves]:

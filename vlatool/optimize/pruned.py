@@ -18,7 +18,7 @@ from vlatool.files.work import work_directory
 from vlatool.machine.version import VERSION
 from vlatool.optimize.budget import budget_of
 from vlatool.optimize.made import candidate
-from vlatool.optimize.moves import Moves, refused_by_few
+from vlatool.optimize.moves import Moves, judge_moves
 from vlatool.optimize.plan import Plan, transforms
 from vlatool.optimize.recipe import StageList
 from vlatool.optimize.search import QUICK
@@ -139,7 +139,7 @@ class PrunedSearch:
         )
         rows = [cached_measure(loop, each, self.plan.cache, self.context).rows[-1] for each in (self.baseline, bundle)]
         compared = compare_success(*rows)
-        return compared.value("success_drop"), refused_by_few(compared, self.plan.recipe.limits)
+        return compared.value("success_drop"), judge_moves(compared, self.plan.recipe.limits)
 
     def _error(self, bundle: Bundle) -> float:
         if not carries_recordings(self.baseline):
