@@ -108,11 +108,14 @@ def test_layers_of_the_same_name_in_two_graphs_are_two(tmp_path: Path):
     modules = load_modules(source)
     modules["prefix"].body = torch.nn.Sequential(torch.nn.Linear(3, 3))
     layers = sparse_layers(modules, source, (), ())
-    assert list(layers) == ["head.body.0", "head.body.2", "prefix.see", "prefix.body.0"]
-    assert list(sparse_layers(modules, source, ("body.0",), ())) == ["head.body.0", "prefix.body.0"]
-    assert list(sparse_layers(modules, source, ("prefix.*",), ("see",))) == ["prefix.body.0"]
+    assert list(layers.chosen) == ["head.body.0", "prefix.see", "prefix.body.0"]
+    assert layers.dense == ("head.body.2",), "it gives the action"
+    assert list(sparse_layers(modules, source, ("body.0",), ()).chosen) == ["head.body.0", "prefix.body.0"]
+    assert list(sparse_layers(modules, source, ("prefix.*",), ("see",)).chosen) == ["prefix.body.0"]
     modules["prefix"].body = modules["head"].body
-    assert list(sparse_layers(modules, source, ("body.*",), ())) == ["head.body.0", "head.body.2"], "shared ones once"
+    assert list(sparse_layers(modules, source, ("body.*",), ()).chosen) == ["head.body.0", "head.body.2"], (
+        "shared ones once"
+    )
 
 
 @pytest.mark.parametrize(("options", "says"), [

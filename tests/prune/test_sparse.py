@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from vlatool.data import recorded_observations
 from vlatool.errors import RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.module.torch_policy import load_modules
-from vlatool.prune._sparse import Sparse, _rows
+from vlatool.prune._sparse import Layers, Sparse, _rows, sparse_layers
 from vlatool.prune.magnitude import Magnitude
 from vlatool.prune.sparsegpt import SparseGpt
 from vlatool.prune.wanda import Wanda
@@ -89,6 +90,35 @@ def test_a_policy_is_exported_with_its_zeros_and_nobody_is_told_that_it_is_faste
     if method is Wanda:
         made = run_transform(ExportOnnx(), pruned, tmp_path / "out", Context())
         assert load(made.path).infer(recorded_observations(made, 1)[0]).chunk.shape == (4, 2)
+
+
+def test_what_gives_the_action_stays_dense_whatever_it_is_called(source_bundle: Bundle):
+    modules = load_modules(source_bundle)
+    policy = modules["main"]
+    policy.last, policy.head = policy.head, nn.Sequential(nn.Linear(16, 16), nn.ReLU())
+    policy.head[0].weight.data.copy_(torch.eye(16))
+    policy.forward = lambda *inputs: policy.last(type(policy).forward(policy, *inputs).flatten(1)[:, :8].repeat(1, 2))
+    policy.head.append(nn.Linear(16, 8))
+    found = sparse_layers(modules, source_bundle, (), ())
+    assert {"vision", "state", "blocks.0.query"} <= set(found.chosen)
+    assert set(found.dense) == {"last", "head.0", "head.2"}
+    assert list(sparse_layers(modules, source_bundle, ("last",), ()).chosen) == ["last"]
+    context = Context()
+    Magnitude().change(modules, source_bundle, context)
+    assert context.said == ["left dense: head.0, head.2, last (--include names what else may go)"]
+    assert int((policy.last.weight == 0).sum()) == 0
+
+
+def test_many_dense_layers_are_counted():
+    assert Layers({}, ()).told() == ()
+    (told,) = Layers({}, tuple(map(str, range(10)))).told()
+    assert told.startswith("left dense: 0, 1, 2, 3, 4, 5, 6, 7 and 2 more (")
+
+
+def test_a_part_that_the_description_names_so_stays_dense(source_bundle: Bundle):
+    described = replace(source_bundle, manifest=replace(source_bundle.manifest, parts={"action_expert": ["blocks.*"]}))
+    found = sparse_layers(load_modules(described), described, (), ())
+    assert set(found.chosen) == {"vision", "state"}
 
 
 @pytest.mark.parametrize(("options", "says"), [

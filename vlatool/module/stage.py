@@ -64,6 +64,8 @@ class ModuleStage(Transform):
     takes_modules: ClassVar[bool] = True
     keeps_weights: ClassVar[bool] = False
     """Whether it takes whole blocks away or changes the program alone, so that weights in shards can stay there."""
+    leaves_zeros: ClassVar[bool] = False
+    """Whether it sets single weights to zero, which a training after it keeps as they are."""
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The bundle has modules, and no graphs yet."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -12,10 +13,11 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.edits import read_tensors
 from vlatool.module.feeds import recorded_inputs
 from vlatool.module.stage import Changed, ModuleStage
-from vlatool.prune._selection import Selection
+from vlatool.module.zeros import zero_share
+from vlatool.prune._last import last_layers
+from vlatool.prune._selection import Selection, protected_parts
 from vlatool.runtime.engine import usable_engines
 from vlatool.stage.base import Context
 
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 PATTERNS = {"2:4": (2, 4), "4:8": (4, 8)}
 """Pattern -> how many of how many neighbours along the inputs stay."""
 Pattern = Literal["unstructured", "2:4", "4:8"]
+SHOWN = 8
+"""Layers that are named; the others are counted."""
 PROTECTED = ("embed", "norm", "head", "action")
 """Parts of names of layers that stay dense unless --include names them."""
 
@@ -32,6 +36,7 @@ PROTECTED = ("embed", "norm", "head", "action")
 class Sparse(ModuleStage):
     """Sets single weights of Linear and convolution layers to zero; shapes stay, and so does the time on processors."""
 
+    leaves_zeros: ClassVar[bool] = True
     looks: ClassVar[bool] = True
     """Whether the method looks at what layers are given."""
 
@@ -51,7 +56,9 @@ class Sparse(ModuleStage):
             RecipeError: when no layer is chosen, or the ratio is not that of the pattern.
         """
         check_pattern(self.pattern, self.ratio)
-        layers = sparse_layers(modules, source, self.include, self.exclude)
+        found = sparse_layers(modules, source, self.include, self.exclude)
+        context.said.extend(found.told())
+        layers = found.chosen
         given = self._given(layers, modules, source, context) if self.looks else {}
         for number, (name, layer) in enumerate(layers.items()):
             context.tell(f"pruning {name}", number / len(layers))
@@ -145,25 +152,40 @@ def least(score: Tensor, pattern: Pattern, share: float, *, rows: bool) -> Tenso
 
 def zeros_told(made: Bundle, pattern: Pattern) -> tuple[str, str]:
     """Say how many weights of a bundle are zero, and which engine gains by it."""
-    zeros = total = 0
-    for name in made.manifest.files:
-        for tensor in read_tensors(made.file(name)).values() if name.endswith(".safetensors") else ():
-            zeros += int((tensor == 0).sum()) if tensor.dim() > 1 else 0
-            total += tensor.numel() if tensor.dim() > 1 else 0
     engines = usable_engines().values()
     gains = [engine.title for engine in engines if pattern in engine.sparse]
     others = " and ".join(engine.title for engine in engines)
     return (
-        f"{zeros / max(1, total):.1%} of the weights are zero; no tensor is smaller",
+        f"{zero_share(made):.1%} of the weights are zero; no tensor is smaller",
         f"faster in {', '.join(gains)}" if gains else f"{others} multiply zeros like other numbers: nothing is "
         "faster (measure it: vlatool compare). 2:4 is for sparse tensor cores; for speed: vlatool prune structured",
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Layers:
+    """Linear and convolution layers by name; ``GRAPH.name`` in a policy of several graphs.
+
+    Args:
+        chosen: Whose weights may become zero.
+        dense: Names of the others.
+    """
+
+    chosen: dict[str, Any]
+    dense: tuple[str, ...]
+
+    def told(self) -> tuple[str, ...]:
+        """Say which layers stay dense, where some do."""
+        some, more = ", ".join(self.dense[:SHOWN]), len(self.dense) - SHOWN
+        return (
+            f"left dense: {some}{f' and {more} more' if more > 0 else ''} (--include names what else may go)",
+        ) * bool(self.dense)
+
+
 def sparse_layers(
     modules: Mapping[str, nn.Module], source: Bundle, include: tuple[str, ...], exclude: tuple[str, ...]
-) -> dict[str, Any]:
-    """Return name -> Linear or convolution layer whose weights may become zero; ``GRAPH.name`` of several graphs.
+) -> Layers:
+    """Choose whose weights become zero; embeddings, norms, heads and what gives the action stay, unless included.
 
     A layer that several graphs share is the first one's.
 
@@ -179,12 +201,18 @@ def sparse_layers(
                 found.setdefault(id(part), ((graph, name), part))
     named = dict(found.values())
     full = {(graph, name): f"{graph}.{name}" if len(modules) > 1 else name for graph, name in named}
-    selection = Selection(include, exclude, PROTECTED)
+    selection = Selection(include, exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
     selection.check([*full.values(), *(name for _, name in named)], "layer")
-    chosen = {full[place]: part for place, part in named.items() if selection.has({place[1], full[place]})}
+    acts = last_layers(modules, source, named.values()) if not include else set()
+    chosen = {
+        full[place]: part
+        for place, part in named.items()
+        if id(part) not in acts and selection.has({place[1], full[place]})
+    }
     if not chosen:
         raise RecipeError(f"{source.manifest.name} has no layer to prune.", "look at --include and --exclude")
-    return chosen
+    dense = [name for place, name in full.items() if name not in chosen]
+    return Layers(chosen, tuple(dense))
 
 
 def _rows(layer: Any, given: Tensor) -> Tensor:

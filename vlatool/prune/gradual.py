@@ -10,7 +10,9 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
+from vlatool.module.stage import Changed
 from vlatool.prune._sparse import Pattern, check_pattern, least, sparse_layers, zeros_told
+from vlatool.stage.base import Context
 from vlatool.training.constraint import GrowingZeros
 from vlatool.training.imitation import ImitationStage
 
@@ -32,6 +34,7 @@ class Gradual(ImitationStage):
     """
 
     changed_first: ClassVar[bool] = False
+    leaves_zeros: ClassVar[bool] = True
 
     ratio: float = Field(0.5, gt=0, lt=1, description="share of each layer's weights that is zero in the end")
     pattern: Pattern = Field(
@@ -63,9 +66,14 @@ class Gradual(ImitationStage):
         numbers = [*range(self.interval, last, self.interval), last]
         return {number: self.ratio * (1 - (1 - number / last) ** 3) for number in numbers}
 
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+        """Train, and say which layers stay dense."""
+        context.said.extend(sparse_layers(modules, source, self.include, self.exclude).told())
+        return super().change(modules, source, context)
+
     def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
         """The student does what the teacher does, with more and more zeros."""
-        layers = sparse_layers(modules, source, self.include, self.exclude).values()
+        layers = sparse_layers(modules, source, self.include, self.exclude).chosen.values()
         zeros = GrowingZeros([layer.weight for layer in layers], self._goes, self.shares())
         return replace(super().lesson(modules, source, teacher), constraint=zeros)
 

@@ -31,10 +31,36 @@ class Constraint:
         """Change the average of a weight in place, after it followed."""
 
 
-class GrowingZeros(Constraint):
-    """What is zero stays zero, and from step to step more of the smallest weights become zero.
+class KeptZeros(Constraint):
+    """What is zero stays zero.
 
     Zeros are their own mask: what is exactly zero before an update is zero after it.
+
+    Args:
+        weights: That are sparse, (outputs, ...).
+    """
+
+    def __init__(self, weights: Sequence[Tensor]) -> None:
+        self._weights = list(weights)
+        self._known = {id(weight) for weight in weights}
+
+    @contextlib.contextmanager
+    def step(self, number: int) -> Iterator[None]:
+        """Keep the zeros."""
+        zeros = [weight == 0 for weight in self._weights]
+        yield
+        with require("torch", "build").no_grad():
+            for weight, zero in zip(self._weights, zeros, strict=True):
+                weight.masked_fill_(zero, 0)
+
+    def average(self, weight: Tensor, average: Tensor) -> None:
+        """Give an average the zeros of its weight."""
+        if id(weight) in self._known:
+            average.masked_fill_(weight == 0, 0)
+
+
+class GrowingZeros(KeptZeros):
+    """What is zero stays zero, and from step to step more of the smallest weights become zero.
 
     Args:
         weights: That become sparse, (outputs, ...).
@@ -46,22 +72,15 @@ class GrowingZeros(Constraint):
     def __init__(
         self, weights: Sequence[Tensor], goes: Callable[[Tensor, float], Tensor], shares: dict[int, float]
     ) -> None:
-        self._weights, self._goes, self._shares = list(weights), goes, shares
-        self._known = {id(weight) for weight in weights}
+        super().__init__(weights)
+        self._goes, self._shares = goes, shares
 
     @contextlib.contextmanager
     def step(self, number: int) -> Iterator[None]:
         """Keep the zeros, and add some."""
-        zeros = [weight == 0 for weight in self._weights]
-        yield
+        with super().step(number):
+            yield
         with require("torch", "build").no_grad():
-            for weight, zero in zip(self._weights, zeros, strict=True):
-                weight.masked_fill_(zero, 0)
-                if number in self._shares:
-                    sizes = weight.abs().reshape(len(weight), -1)
-                    weight.masked_fill_(self._goes(sizes, self._shares[number]).reshape(weight.shape), 0)
-
-    def average(self, weight: Tensor, average: Tensor) -> None:
-        """Give an average the zeros of its weight."""
-        if id(weight) in self._known:
-            average.masked_fill_(weight == 0, 0)
+            for weight in self._weights if number in self._shares else ():
+                sizes = weight.abs().reshape(len(weight), -1)
+                weight.masked_fill_(self._goes(sizes, self._shares[number]).reshape(weight.shape), 0)

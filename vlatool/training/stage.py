@@ -19,8 +19,10 @@ from vlatool.machine import host
 from vlatool.module.description import description_file
 from vlatool.module.edits import is_changed
 from vlatool.module.stage import TRAINING, Changed, ModuleStage
+from vlatool.module.zeros import has_zeros, sparse_weights, zero_share
 from vlatool.stage.base import Context, source_of
 from vlatool.stage.cache import STREAMS
+from vlatool.training.constraint import KeptZeros
 from vlatool.training.crew import crew_of
 from vlatool.training.device import Asked, Device, device_of
 from vlatool.training.events import check_events
@@ -124,7 +126,7 @@ class TrainingStage(ModuleStage):
                 f"{self.accumulate}).",
                 "take a larger --batch, or fewer parts",
             )
-        self._check_shard(parts)
+        self._check_shard(source, parts)
         rounds = len(self.pauses()) + bool(self.patience)
         last = self.first_seed + self.episodes + rounds * self.student_episodes
         if max(self.first_seed + 1, last) > EVALUATION_SEEDS:
@@ -141,8 +143,14 @@ class TrainingStage(ModuleStage):
                 "first (vlatool prune structured), or name a --teacher",
             )
 
-    def _check_shard(self, parts: int) -> None:
+    def _check_shard(self, source: Bundle | None, parts: int) -> None:
         """Refuse parts of weights where nobody holds the others, or where processes would not gather equally often."""
+        if self.shard and source is not None and has_zeros(source):
+            raise RecipeError(
+                f"--shard cuts layers into parts, and {source.manifest.name} has weights that pruning set to zero and "
+                "that stay zero.",
+                "leave --shard out",
+            )
         if self.shard and self.processes == 1:
             raise RecipeError(
                 "--shard lets several processes hold a part of the weights each; there is one.",
@@ -181,6 +189,11 @@ class TrainingStage(ModuleStage):
             *_compared(training.get("hints", {})),
             *teacher_lines(training),
             *_judged(training.get("judged")),
+            *(
+                [f"weights that pruning set to zero are still zero: {zero_share(made):.1%} of all"]
+                if has_zeros(made) and not self.leaves_zeros
+                else []
+            ),
             *([f"loss curve: {page}"] if (page := made.path / REPORTS / "report.html").is_file() else []),
             *super().lines(made),
         )
@@ -220,7 +233,10 @@ class TrainingStage(ModuleStage):
     def prepared(self, modules: Mapping[str, nn.Module], source: Bundle) -> tuple[Teacher, Lesson]:
         """Return the teacher of a student's modules, and what it teaches; every process of a training has its own."""
         teacher = Teacher.of(source, self.teacher, modules)
-        return teacher, self.lesson(modules, source, teacher)
+        lesson = self.lesson(modules, source, teacher)
+        if lesson.constraint is None and has_zeros(source):
+            lesson = replace(lesson, constraint=KeptZeros(sparse_weights(modules.values())))
+        return teacher, lesson
 
     def settings(self) -> Settings:
         """Return how long and how fast is trained."""

@@ -1,0 +1,60 @@
+"""Which layers give the action, whatever they are called."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.errors import require
+from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.feeds import recorded_inputs
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+
+def last_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collection[nn.Module]) -> set[int]:
+    """Return ``id`` of the layers after which no other layer computes the action.
+
+    They are found by going back from the action through what autograd recorded; none where a policy gives its action
+    without gradients.
+
+    Args:
+        modules: Graph name -> module.
+        source: For the program and an observation.
+        layers: With a ``weight``, such as Linear and convolution layers.
+    """
+    torch = require("torch", "build")
+    program = BatchedProgram(source.manifest.program, modules)
+    noise = drawn(program.noise, 1, np.random.default_rng(0))
+    with torch.enable_grad():
+        action = program.run(recorded_inputs(source, 1)[0], noise)[source.manifest.spec.action.name]
+    owners = {id(layer.weight): id(layer) for layer in layers}
+    return set(_owners(action, owners))
+
+
+def _owners(action: Tensor, owners: Mapping[int, int]) -> Iterator[int]:
+    """Yield the owners of the weights that are reached first on the ways back from an action."""
+    seen, open_ = set(), [action.grad_fn] if action.grad_fn is not None else []
+    while open_:
+        node = open_.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        before: list[Any] = [earlier for earlier, _ in node.next_functions if earlier is not None]
+        found = [owners[id(weight)] for each in before if id(weight := _weight(each)) in owners]
+        yield from found
+        open_ += [] if found else before
+
+
+def _weight(node: Any) -> Any:
+    """Return the weight that a node passes on, as it is or transposed; None where it computes something."""
+    while not hasattr(node, "variable"):
+        before = [earlier for earlier, _ in node.next_functions if earlier is not None]
+        if len(before) != 1:
+            return None
+        node = before[0]
+    return node.variable
