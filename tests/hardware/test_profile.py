@@ -296,7 +296,12 @@ def test_references_inside_a_profile_must_exist(tmp_path: Path, valid: dict[str,
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [("- a\n- b\n", "must be a mapping; got list"), ("a: [1", "not valid YAML"), ("", "NoneType")]
+    ("content", "words"),
+    [
+        ("- a\n- b\n", "must be a mapping; got list"),
+        ("a: [1", "not valid YAML"),
+        ("", "is empty; it must be a mapping"),
+    ],
 )
 def test_what_is_no_profile_is_refused(tmp_path: Path, content: str, words: str) -> None:
     assert words in problems(tmp_path, content)

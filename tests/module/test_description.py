@@ -74,7 +74,8 @@ def test_no_description(tmp_path: Path, named):
     [
         ("name: [", "is not valid YAML"),
         ("name: !!python/object/apply:os.getcwd []", "only plain values are read"),
-        ("", "must be a mapping; got NoneType"),
+        ("", "is empty; it must be a mapping"),
+        ("chunk: 1" + 5000 * "0", "has a whole number of more than 4,300 digits"),
         ("- name", "must be a mapping; got list"),
         ({"spec": SPEC}, "has no 'name'"),
         ({"name": "tiny"}, "has no 'spec'"),
@@ -92,6 +93,22 @@ def test_no_description(tmp_path: Path, named):
         ({"name": "tiny", "spec": SPEC, "training": "/train.py:batches"}, "must be a function in a file"),
         ({"name": "tiny", "spec": SPEC, "training": {"make": "train.py:batches"}}, "must be a function in a file"),
         ({"name": "tiny", "spec": SPEC, "training": None}, "got None"),
+        ({"name": "tiny", "spec": SPEC, "source": "../policy.py:make"}, "'source' names a file outside the folder"),
+        ({"name": "tiny", "spec": SPEC, "source": "a/../../policy.py:make"}, "'source' names a file outside the fold"),
+        ({"name": "tiny", "spec": SPEC, "source": "/tmp/policy.py:make"}, "'source' names a file outside the folder"),
+        (
+            {"name": "tiny", "spec": SPEC, "environment": {"make": "../environment.py:make", "tasks": ["a"]}},
+            "'environment' names a file outside the folder of the policy: ../environment.py:make",
+        ),
+        ({"name": "", "spec": SPEC}, "'name' must be text of 1 to 100 characters"),
+        ({"name": 100 * "ab", "spec": SPEC}, "'name' must be text of 1 to 100 characters.*got 'abab.*200 characters"),
+        ({"name": "a\x1b[2J", "spec": SPEC}, "'name' must be text of 1 to 100 characters without control characters"),
+        ({"name": "a\u202eb", "spec": SPEC}, "'name' must be text .* without control characters"),
+        ({"name": "tiny", "version": "1\n2", "spec": SPEC}, "'version' must be text .* without control characters"),
+        (
+            {"name": "tiny", "spec": {**SPEC, "outputs": [{"name": "y", "shape": [1, 3], "labels": ["l", "l", "f"]}]}},
+            "the labels of 'y' name 'l' 2 times",
+        ),
     ],
 )
 def test_a_description_that_is_wrong(tmp_path: Path, data, message):

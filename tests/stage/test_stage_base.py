@@ -74,6 +74,12 @@ def test_every_wrong_option_is_listed():
     assert "activations = 'int4'" in caught.value.message
 
 
+@pytest.mark.parametrize("given", [float("nan"), 5])
+def test_a_number_outside_its_range_is_told_both_ends(given: float):
+    with pytest.raises(RecipeError, match=rf"learning_rate = {given}: input should be .*; allowed: above 0, at most 1"):
+        build_stage("distill.policy", {"learning_rate": given})
+
+
 def test_a_truth_value_is_no_number():
     with pytest.raises(RecipeError, match="samples = True: input should be a number, not a truth value"):
         build_stage("quantize.static_int8", {"samples": True})

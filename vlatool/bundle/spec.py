@@ -9,7 +9,7 @@ from typing import Any
 
 from vlatool.errors import SpecError, nearest
 from vlatool.files.limits import check
-from vlatool.files.typed import finite, known, mapping, outside, shown, text, whole
+from vlatool.files.typed import known, mapping, outside, shown, text, whole
 
 DTYPES = ("float32", "float16", "int64", "int32", "uint8", "bool")
 KINDS = ("tensor", "text", "discrete")
@@ -18,6 +18,9 @@ STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "ma
 MODES = ("", "delta", "absolute", "velocity", "relative")
 MOST_INDICES = 2**18
 """Labels that are made up for a discrete output that names none: more than any vocabulary of tokens has."""
+
+
+MOST_HZ = 100_000
 
 
 @dataclass(frozen=True)
@@ -192,8 +195,9 @@ class PolicySpec:
                 raise SpecError(
                     f"The name '{name}' occurs {names.count(name)} times; each input and output needs its own."
                 )
-        if not 0 < finite(self.control_hz, "control_hz", SpecError) < 1e5:
-            raise SpecError(f"control_hz is {shown(self.control_hz)}; allowed: a rate in Hz above 0.")
+        if isinstance(self.control_hz, bool) or not _between(self.control_hz, 0, MOST_HZ):
+            allowed = f"a rate in Hz above 0 and below {MOST_HZ:,}"
+            raise SpecError(f"control_hz is {shown(self.control_hz)}; allowed: {allowed}.")
         whole(self.chunk, "chunk", SpecError, 1)
         check("elements", self.chunk, "chunk", SpecError)
         if whole(self.execute, "execute", SpecError) > self.chunk:
@@ -237,6 +241,10 @@ class PolicySpec:
         plain["inputs"] = [tensor.to_dict() for tensor in self.inputs]
         plain["outputs"] = [tensor.to_dict() for tensor in self.outputs]
         return plain
+
+
+def _between(value: Any, low: float, high: float) -> bool:
+    return isinstance(value, int | float) and low < value < high
 
 
 def _known_only(cls: type, data: Any, where: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from vlatool.cli._document import document
 from vlatool.cli._options import AsJson, Force, Raw, Workers
 from vlatool.errors import BundleError, GateFailed, MissingExtra, UsageError
 from vlatool.files.outputs import BUNDLE
-from vlatool.files.printable import printable
+from vlatool.files.printable import one_line, printable
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.optimize.choice import foretold
@@ -126,7 +126,7 @@ def transform(
         return
     graphs = f"graphs {result.graph_bytes / 1e6:.2f} MB, " if result.manifest.graphs else ""
     sizes = f"{graphs}in all {result.size_bytes / 1e6:.1f} MB"
-    typer.echo(f"{out}: {result.manifest.name} {result.manifest.version}, {sizes}")
+    typer.echo(f"{out}: {one_line(result.manifest.name)} {one_line(result.manifest.version)}, {sizes}")
     for line in (*map(printable, context.said), *stage.lines(result), *(controls(bundle) if bundle else ())):
         typer.echo(f"  {line}")
     for name, shares in precision.items():

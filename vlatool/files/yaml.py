@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,11 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
         raise raised(f"{what} cannot be read: {error.strerror or error}.") from error
     except UnicodeDecodeError as error:
         raise raised(f"{what} is not valid YAML: it cannot be read as UTF-8: {error}.") from error
-    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
+    except ValueError as error:
+        if "integer string conversion" not in str(error):
+            raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.") from error
+        raise raised(f"{what} has a whole number of more than {sys.get_int_max_str_digits():,} digits.") from error
+    except (yaml.YAMLError, TypeError, LookupError, AttributeError, OverflowError) as error:
         raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.") from error
 
 
@@ -58,6 +63,8 @@ def read_mapping(path: Path, what: str, raised: type[InputError]) -> dict[str, A
         InputError: of the class ``raised``, when ``read_yaml`` raises, or the file holds something else.
     """
     data = read_yaml(path, what, raised)
+    if data is None:
+        raise raised(f"{what} is empty; it must be a mapping.")
     if not isinstance(data, dict):
         raise raised(f"{what} must be a mapping; got {type(data).__name__}.")
     odd = [key for key in data if not isinstance(key, str)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +17,14 @@ from vlatool.bundle.program import ProgramStep, check_program, program_from, sin
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import MissingExtra, SourceError, SpecError, nearest
 from vlatool.files.kept import carry
+from vlatool.files.printable import one_line, shortened
 from vlatool.files.yaml import read_mapping
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 
 FILE = "policy.yaml"
+LONGEST = 100
+"""Characters of a policy's name, and of its version."""
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
     "parts", "calibration", "evaluation", "weights", "files", "training",
@@ -107,7 +111,11 @@ def read_description(path: Path) -> Description:
     for key in ("name", "spec"):
         if key not in data:
             raise SourceError(f"{file} has no '{key}'.", "see docs/guides/your-own-policy.md for a complete example")
+    for key in ("name", "version"):
+        _check_label(file, key, data.get(key, "0.0.0"))
+    _check_code(file, data)
     spec = PolicySpec.from_dict(data["spec"])
+    _check_labels(file, spec)
     program = program_from(data["program"]) if "program" in data else single_graph(spec)
     check_program(program, {step.graph for step in program}, spec)
     return Description(
@@ -128,6 +136,36 @@ def read_description(path: Path) -> Description:
         files=_files(file, data.get("files")),
         training=_training(file, data.get("training", "")),
     )
+
+
+def _check_label(file: Path, key: str, value: Any) -> None:
+    """Refuse a name or version that could not stand in a line of a report."""
+    label = str(value)
+    if not (0 < len(label) <= LONGEST and one_line(label, LONGEST) == label):
+        raise SourceError(
+            f"{file}: '{key}' must be text of 1 to {LONGEST} characters without control characters; got "
+            f"{shortened(label, 40)!r}."
+        )
+
+
+def _check_code(file: Path, data: Mapping[str, Any]) -> None:
+    """Refuse code of another folder: only that of the one that is named, or trusted with all that is in it, may run."""
+    named = {"source": data.get("source"), "environment": (data.get("environment") or {}).get("make")}
+    for key, factory in named.items():
+        where = str(factory or "").rpartition(":")[0]
+        if where.endswith(".py") and not _inside(where):
+            raise SourceError(
+                f"{file}: '{key}' names a file outside the folder of the policy: {shortened(str(factory), 200)}.",
+                "copy or link what runs into the folder, or name an importable package: package.module:make",
+            )
+
+
+def _check_labels(file: Path, spec: PolicySpec) -> None:
+    """Refuse two elements of one name: a controller could not tell them apart."""
+    for tensor in (*spec.inputs, *spec.outputs):
+        label, count = next(iter(Counter(tensor.labels).most_common(1)), ("", 0))
+        if count > 1:
+            raise SourceError(f"{file}: the labels of '{tensor.name}' name '{label}' {count} times; name each once.")
 
 
 def _files(file: Path, patterns: Any) -> tuple[str, ...] | None:

@@ -33,6 +33,8 @@ Tell = Callable[[str, float | None], None]
 AnyStage = TypeVar("AnyStage", bound="Stage")
 BEFORE_ENGINES = ("sources", "export")
 """Kinds of stages whose output is the same whatever OpenVINO computes in."""
+ENDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+"""How pydantic calls the limits of a number, and how a message does."""
 UNFINISHED = "define it; docs/guides/add-a-method.md shows a complete stage"
 RECORD = 2
 """Version of what a manifest holds, part of the cache key: an output of an older one is not taken for one of this."""
@@ -318,15 +320,23 @@ def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> A
     try:
         return kind.model_validate(dict(options))
     except ValidationError as error:
-        problems = [_problem(item, list(kind.model_fields)) for item in error.errors()]
+        problems = [_problem(item, kind) for item in error.errors()]
         raise RecipeError(f"{where}: " + "; ".join(problems) + ".") from error
 
 
-def _problem(item: Mapping[str, Any], known: list[str]) -> str:
+def _problem(item: Mapping[str, Any], kind: type[Stage]) -> str:
     field_name = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        return f"unknown option '{field_name}'; {nearest(field_name, known)}"
-    return f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
+        return f"unknown option '{field_name}'; {nearest(field_name, list(kind.model_fields))}"
+    problem = f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
+    ends = _ends(kind, field_name) if set(item.get("ctx", {})) & set(ENDS) else []
+    return f"{problem}; allowed: {', '.join(ends)}" if len(ends) > 1 else problem
+
+
+def _ends(kind: type[Stage], field_name: str) -> list[str]:
+    """Return the limits of a numeric option in words."""
+    limits = kind.model_fields[field_name].metadata if field_name in kind.model_fields else []
+    return [f"{word} {getattr(limit, end):g}" for limit in limits for end, word in ENDS.items() if hasattr(limit, end)]
 
 
 def installed_version(package: str) -> str | None:
