@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
 from vlatool.cli._run import following
 from vlatool.data import recorded_observations
-from vlatool.errors import RecipeError
+from vlatool.errors import BundleError, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.hardware.profile import load_profile
 from vlatool.module.to_onnx import quiet_exporter
@@ -140,6 +140,26 @@ def test_what_follows_is_as_the_board_runs_it_unless_it_is_said(
     export, quantization = following(Qat(**given), load_profile(board) if board else None)
     assert export.name() == "export.onnx"
     assert quantization.options() == wanted
+
+
+def test_the_bundle_tells_how_it_was_trained_and_is_not_quantized_again(
+    policy_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    quick = "--steps 4 --batch 4 --episodes 0 --student-episodes 0 --threads 1"
+    for line in (f"quantize qat {policy_dir} -o {out} {quick}", f"quantize qat {policy_dir} -o {out} {quick} --force"):
+        with pytest.raises(SystemExit) as left:
+            main(line.split())
+        assert not left.value.code
+        told = capsys.readouterr().out
+        assert "in 4 steps on" in told
+        assert "not exported yet" not in told
+        assert f"loss curve: {out / 'reports/report.html'}" in told
+        assert "quantize.qat" in (out / "reports" / "report.md").read_text()
+    bundle = Bundle.open(out)
+    with pytest.raises(BundleError, match="is int8 already") as caught:
+        build_stage("quantize.static_int8", {}).check(bundle, None)
+    assert caught.value.fix.startswith("quantize qat has quantized it: this bundle is its result")
 
 
 def test_a_command_line_with_a_board_makes_what_the_board_runs(policy_dir: Path, tmp_path: Path):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from vlatool.bundle.bundle import REPORTS as REPORTS_FOLDER
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import _complete
 from vlatool.cli._board_summary import board_summary
@@ -110,10 +111,14 @@ def transform(
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         context = replace(context, events=str(events.absolute()) if events else "")
         stage, bundle = first_steps(stage, bundle, cache_directory(), context)
+        reports = None
         for other in then:
             bundle = cached_transform(stage, bundle, cache_directory(), context)
+            if told := stage.told(bundle):
+                context.said.extend((*told, f"loss curve: {out / REPORTS_FOLDER / 'report.html'}"))
+                reports = bundle.path / REPORTS_FOLDER
             stage = other
-        result = run_transform(stage, bundle, out, context, force=force)
+        result = run_transform(stage, bundle, out, context, force=force, reports=reports)
         on_board = board_summary(result, bundle, board, context) if board else None
     baseline = source if is_bundle(source) else ""
     precision = {name: graph.precision for name, graph in result.manifest.graphs.items()}

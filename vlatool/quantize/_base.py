@@ -25,7 +25,7 @@ from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import precision_shares
 from vlatool.stage.base import Context, Transform, source_of
-from vlatool.stage.finish import TRIALS, carry_over, finish
+from vlatool.stage.finish import TRIALS, carry_over, finish, history
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 QuantizeGraph = Callable[[str, Path, Path], str | None]
 """Graph name, original file, new file -> dtype of what is not quantized (float32 when None)."""
 QUANTIZED_OPS = ("MatMul", "Gemm", "Conv")
+TRAINED = "quantize.qat"
+"""Stage after which the command line quantizes at once."""
 FLOATS = ("float64", "float32", "float16")
 """Precisions of a graph that is not quantized yet."""
 
@@ -61,10 +63,12 @@ class Quantization(Transform):
             quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
             lower = quantized or [graph.compute]
             if lower != ["float32"] and lower != [""]:
+                trained = any(entry.get("stage") == TRAINED for entry in history(source))
+                again = "quantize the float32 bundle that this one was made from, or leave the graph out with --graphs"
                 raise BundleError(
                     f"The graph '{name}' of {source.path} is {' and '.join(lower)} already; {self.name()} starts from "
                     "float32.",
-                    "quantize the float32 bundle that this one was made from, or leave the graph out with --graphs",
+                    "quantize qat has quantized it: this bundle is its result" if trained else again,
                 )
 
     def transform(

@@ -27,10 +27,11 @@ class Qat(ImitationStage):
 
     The teacher is the policy in float32 before any edit, or ``--teacher``: no labels are needed. What is trained are
     the weights; they are rounded to the same grid as by ``quantize static-int8`` (int8, with activations) or
-    ``quantize weight-only`` (int4, in blocks of 32), which follow, and write the same form of bundle. Ranges of
+    ``quantize weight-only`` (int4, in blocks of 32). The command quantizes them by that method when they are trained:
+    what it writes is a quantized bundle, and nothing else is to be done (a recipe names both). Ranges of
     activations are taken from what the training saw, too: up to 128 observations, spread over its episodes, stay in the
     bundle (``data/played.npz``) and calibrate beside the recorded ones. Try the methods alone first: they take seconds,
-    and most policies lose nothing. In a recipe, name the method that follows.
+    and most policies lose nothing.
     """
 
     changed_first: ClassVar[bool] = False

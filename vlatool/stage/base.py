@@ -210,6 +210,10 @@ class Transform(Stage):
         """Return the stages that the command line runs after this one, each with its options; a recipe names them."""
         return ()
 
+    def told(self, bundle: Bundle) -> tuple[str, ...]:
+        """Return what is worth telling of the new bundle even where other stages follow at once."""
+        return ()
+
     def lines(self, bundle: Bundle) -> tuple[str, ...]:
         """Return what else a person wants to know about the new bundle, a sentence for each line."""
         return ()

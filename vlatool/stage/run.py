@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.errors import BundleError, DataError, VlatoolError
 from vlatool.files.kept import tag
 from vlatool.files.locks import hold
@@ -24,7 +25,14 @@ from vlatool.stage.base import Context, Measure, Stage, Transform
 
 
 def run_transform(
-    stage: Transform, source: Bundle | None, out: Path, context: Context, *, force: bool = False, damaged: bool = False
+    stage: Transform,
+    source: Bundle | None,
+    out: Path,
+    context: Context,
+    *,
+    force: bool = False,
+    damaged: bool = False,
+    reports: Path | None = None,
 ) -> Bundle:
     """Run a stage that makes a bundle; ``out`` appears whole or not at all.
 
@@ -37,6 +45,7 @@ def run_transform(
         context: For progress.
         force: Replace a directory that vlatool wrote.
         damaged: See ``vlatool.files.writing.writing``.
+        reports: Directory of reports of a stage before it, which come along where this one writes none.
 
     Raises:
         VlatoolError: what the stage raises, and OutputError when the output cannot be written.
@@ -49,6 +58,8 @@ def run_transform(
             run_apart(stage, source, draft, context)
         else:
             stage.run(source, draft, context)
+        if reports is not None and reports.is_dir() and not (draft / REPORTS).exists():
+            shutil.copytree(reports, draft / REPORTS)
     return Bundle.open(out, verify=False)
 
 

@@ -172,7 +172,7 @@ class TrainingStage(ModuleStage):
         """Return what the student does with a batch, and how far that is from what the teacher says of it."""
         raise NotImplementedError(self.name())
 
-    def lines(self, made: Bundle) -> tuple[str, ...]:
+    def told(self, made: Bundle) -> tuple[str, ...]:
         """Say what the student learnt from, and how far it came."""
         training = json.loads(made.file(TRAINING).read_bytes())
         losses, last = training["losses"], max(1, len(training["losses"]) // 20)
@@ -194,9 +194,11 @@ class TrainingStage(ModuleStage):
                 if has_zeros(made) and not self.leaves_zeros
                 else []
             ),
-            *([f"loss curve: {page}"] if (page := made.path / REPORTS / "report.html").is_file() else []),
-            *super().lines(made),
         )
+
+    def lines(self, made: Bundle) -> tuple[str, ...]:
+        """Say how it was trained, where the loss curve is, and how to go on."""
+        return (*self.told(made), *curve_lines(made), *super().lines(made))
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
         """Train the modules in place."""
@@ -277,6 +279,12 @@ class TrainingStage(ModuleStage):
 
     def _place(self, source: Bundle) -> Path:
         return host.cache_directory() / STREAMS / f"{self.name()}-{self.key(source.hash)}"
+
+
+def curve_lines(made: Bundle) -> tuple[str, ...]:
+    """Say where the report of a training is, where there is one."""
+    page = made.path / REPORTS / "report.html"
+    return (f"loss curve: {page}",) if page.is_file() else ()
 
 
 def _compared(hints: Mapping[str, Any]) -> tuple[str, ...]:
