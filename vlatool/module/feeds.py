@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for
+from vlatool.data import CALIBRATION, observations_for
 from vlatool.errors import require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.runtime.observation import ObservationEncoder
@@ -25,6 +25,14 @@ def recorded_inputs(bundle: Bundle, count: int) -> list[dict[str, Tensor]]:
         {name: torch.from_numpy(np.array(value)) for name, value in encode(observation).items()}
         for observation in observations_for(bundle, count)
     ]
+
+
+def unrecorded(bundle: Bundle, count: int) -> tuple[str, ...]:
+    """Say that a choice rests on random observations, where nothing is recorded."""
+    if CALIBRATION in bundle.manifest.files:
+        return ()
+    words = f"nothing is recorded: chosen by {count} random observations, which are none that the robot meets"
+    return (f"{words}; record some, and name them in policy.yaml (calibration: FILE.npz)",)
 
 
 def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, list[Tensor]]:

@@ -13,7 +13,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.feeds import recorded_inputs
+from vlatool.module.feeds import recorded_inputs, unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._last import last_layers
@@ -59,6 +59,7 @@ class Sparse(ModuleStage):
         found = sparse_layers(modules, source, self.include, self.exclude)
         context.said.extend(found.told())
         layers = found.chosen
+        context.said.extend(unrecorded(source, self.samples) if self.looks else ())
         given = self._given(layers, modules, source, context) if self.looks else {}
         for number, (name, layer) in enumerate(layers.items()):
             context.tell(f"pruning {name}", number / len(layers))

@@ -12,6 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import BLOCKS, Edit
+from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._ranking import Place, Ranking, Stack
 from vlatool.prune._selection import Selection, protected_parts
@@ -104,6 +105,7 @@ class Depth(ModuleStage):
             raise RecipeError(f"{asked} removes no block of {_listed(sizes)}.", "ask for more")
         if self.rank == "even":
             return {stack: spread(sizes[stack], sizes[stack] - count) for stack, count in goes.items()}
+        context.said.extend(unrecorded(source, self.samples))
         ranking = Ranking(modules, source, self.samples)
         left = {stack: list(range(sizes[stack])) for stack in goes}
         for (graph, name), block in self._going(ranking, left, goes, context):

@@ -19,6 +19,7 @@ from vlatool.latency_model.measured import calibrations
 from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
+from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._clock import BoardClock, Clock
 from vlatool.prune._prices import (
@@ -145,6 +146,7 @@ class LatencyPruning(ModuleStage):
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
+        context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)

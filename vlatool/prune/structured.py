@@ -9,6 +9,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
+from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._selection import Selection
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
@@ -47,6 +48,7 @@ class Structured(ModuleStage):
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
+        context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         self._remove(
             groups, Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups), context
