@@ -206,7 +206,7 @@ def test_inspect_verifies_and_describes(vlatool, int8_bundle):
     text = "\n".join(lines)
     assert "10 Hz control, 2 of 4 actions executed: 5 inferences per second" in text
     assert "input      image: uint8 1x8x8x3 [rgb]" in text
-    assert "input      proprio: float32 1x3 [m,rad] mean_std" in text
+    assert "input      proprio: float32 1x3 [m x2, rad] mean_std" in text
     assert "input      instruction: text -> int64 1x4" in text
     assert "output     action: float32 1x4x2 (dx, dy) [m] delta mean_std" in text
     assert "graph      main: " in text

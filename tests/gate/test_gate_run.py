@@ -185,3 +185,7 @@ def test_other_work_before_the_gate_is_noted(float_bundle: Bundle, as_fast, monk
     assert [(each.effect, "1.2 of 2 processors" in each.reason) for each in report.findings] == [("note", True)]
     assert report.validity == "valid"
     assert report.environment == machine
+    untimed = run_gate(
+        float_bundle, float_bundle, QUICK.model_copy(update={"accuracy": None, "latency": None}), Context()
+    )
+    assert not untimed.findings, "no time is claimed"

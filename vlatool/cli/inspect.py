@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -102,9 +103,17 @@ def _megabytes(bundle: Bundle, file: str) -> str:
     return f"{bundle.manifest.files[file].bytes / 1e6:.2f} MB"
 
 
+def _units(units: tuple[str, ...]) -> str:
+    """Return the units of the elements in their order; what repeats is counted, and one that all have named once."""
+    if len(set(units)) == 1:
+        return units[0]
+    runs = [(unit, len(list(same))) for unit, same in itertools.groupby(units)]
+    return ", ".join(f"{unit or '-'} x{count}" if count > 1 else unit or "-" for unit, count in runs)
+
+
 def _tensor(tensor: TensorSpec) -> str:
     shape = "x".join(str(axis) for axis in tensor.shape)
-    unit = ",".join(dict.fromkeys(tensor.units())) if tensor.unit else ""
+    unit = _units(tensor.units()) if tensor.unit else ""
     rest = " ".join(
         part for part in (unit and f"[{unit}]", tensor.mode, tensor.normalisation.replace("none", "")) if part
     )

@@ -74,6 +74,7 @@ def run_gate(candidate: Bundle, baseline: Bundle, gate: Gate, context: Context, 
     if gate.answers:
         results.append(answers.examine(agreement, timed, gate.answers))
     seen = (*throttled(board.recorded.throttling), *(replace(finding, effect="note") for finding in busy(host)))
+    seen = seen if gate.latency or gate.deadline else ()  # findings about times
     name = candidate.manifest.name
     row = _row("candidate", candidate, timed, results)
     row = replace(row, details={**row.details, "measured with": _measured_with(gate, inputs, agreement)})

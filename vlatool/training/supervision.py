@@ -90,13 +90,16 @@ def size_line(parameters: Mapping[str, int]) -> str:
     Example:
         >>> size_line({"student": 1_900_000, "teacher": 7_800_000})
         '1.9 M of 7.8 M parameters (24 %)'
+        >>> size_line({"student": 166_204, "teacher": 237_000})
+        '0.166 M of 0.237 M parameters (70 %)'
     """
     ours, theirs = parameters["student"], parameters["teacher"]
     return f"{_count(ours)} of {_count(theirs)} parameters ({100 * ours / max(1, theirs):.0f} %)"
 
 
 def _count(number: int) -> str:
-    return f"{number / 1e6:.1f} M" if number >= 1e5 else f"{number:,}"
+    millions = number / 1e6
+    return f"{number:,}" if number < 1e5 else f"{millions:.3g} M" if millions < 1e3 else f"{millions:,.0f} M"
 
 
 def _gradient(about: Mapping[str, Any]) -> str:

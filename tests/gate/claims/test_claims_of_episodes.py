@@ -62,6 +62,19 @@ def test_rougher_motion_fails(jerk: float, verdict: str):
         assert "path" not in result.sentence, "only what fails is told"
 
 
+def test_what_is_undecided_says_how_many_episodes_would_decide():
+    claim = MotionClaim(margin=0.03)
+    result = motion.examine(episodes(played(1, 20), played(2, 20, jerk=1.01)), claim)
+    assert result.verdict == "inconclusive", result.sentence
+    (count,) = re.findall(r"common successes; allowed: \+3.0%; about ([\d,]+) would decide", result.sentence)
+    wanted = int(count.replace(",", ""))
+    assert wanted > 20
+    more = 9 * wanted  # the estimate is as rough as the ratio that it rests on
+    assert motion.examine(episodes(played(1, more), played(2, more, jerk=1.01)), claim).verdict == "pass"
+    few = motion.examine(episodes(played(1, 5), played(2, 5)), MotionClaim())
+    assert "would decide" not in few.sentence, "without an interval nobody knows"
+
+
 def test_honest_candidates_are_not_called_rougher():
     verdicts = [
         motion.examine(episodes(played(10 + trial, 150), played(500 + trial, 150)), MotionClaim(margin=0.0)).verdict
