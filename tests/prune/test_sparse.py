@@ -14,6 +14,7 @@ from vlatool.data import recorded_observations
 from vlatool.errors import RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.module.torch_policy import load_modules
+from vlatool.prune._last import last_layers
 from vlatool.prune._sparse import Layers, Sparse, _rows, sparse_layers
 from vlatool.prune.magnitude import Magnitude
 from vlatool.prune.sparsegpt import SparseGpt
@@ -107,6 +108,14 @@ def test_what_gives_the_action_stays_dense_whatever_it_is_called(source_bundle: 
     Magnitude().change(modules, source_bundle, context)
     assert context.said == ["left dense: head.0, head.2, last (--include names what else may go)"]
     assert int((policy.last.weight == 0).sum()) == 0
+
+
+def test_frozen_weights_are_found_and_stay_frozen(source_bundle: Bundle):
+    modules = load_modules(source_bundle)
+    policy = modules["main"].requires_grad_(False)
+    layers = [policy.head, policy.state, policy.vision]
+    assert last_layers(modules, source_bundle, layers) == {id(policy.head)}
+    assert not any(weight.requires_grad for weight in policy.parameters())
 
 
 def test_many_dense_layers_are_counted():

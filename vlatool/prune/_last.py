@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
 
-def last_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collection[nn.Module]) -> set[int]:
+def last_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collection[Any]) -> set[int]:
     """Return ``id`` of the layers after which no other layer computes the action.
 
     They are found by going back from the action through what autograd recorded; none where a policy gives its action
@@ -30,10 +30,17 @@ def last_layers(modules: Mapping[str, nn.Module], source: Bundle, layers: Collec
     torch = require("torch", "build")
     program = BatchedProgram(source.manifest.program, modules)
     noise = drawn(program.noise, 1, np.random.default_rng(0))
-    with torch.enable_grad():
-        action = program.run(recorded_inputs(source, 1)[0], noise)[source.manifest.spec.action.name]
-    owners = {id(layer.weight): id(layer) for layer in layers}
-    return set(_owners(action, owners))
+    weights = {layer.weight: id(layer) for layer in layers if layer.weight.is_floating_point()}
+    frozen = [weight for weight in weights if not weight.requires_grad]
+    try:
+        for weight in frozen:
+            weight.requires_grad_()
+        with torch.enable_grad():
+            action = program.run(recorded_inputs(source, 1)[0], noise)[source.manifest.spec.action.name]
+        return set(_owners(action, {id(weight): owner for weight, owner in weights.items()}))
+    finally:
+        for weight in frozen:
+            weight.requires_grad_(False)
 
 
 def _owners(action: Tensor, owners: Mapping[int, int]) -> Iterator[int]:
