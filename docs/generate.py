@@ -23,7 +23,8 @@ from vlatool.bundle import manifest, spec
 from vlatool.cli._schemas import COMMANDS, definitions
 from vlatool.gate import config
 from vlatool.hardware.profile import load_profile, names
-from vlatool.stage.base import Stage, stage_kinds
+from vlatool.stage.base import Stage
+from vlatool.stage.build import stage_kinds
 
 REFERENCE = Path(__file__).parent / "reference"
 NOTE = "<!-- written by docs/generate.py from the code; do not edit -->\n"

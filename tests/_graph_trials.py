@@ -17,7 +17,8 @@ from vlatool.errors import VlatoolError
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.onnx import OnnxFile
-from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 INT4, INT8 = 0.6, 0.15

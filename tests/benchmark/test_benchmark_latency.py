@@ -22,7 +22,8 @@ from vlatool.measurement.cold_start import ColdStart, cold_start, run
 from vlatool.measurement.interleaved import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.measurement.jobs import ColdStartJob, LatencyJob
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 

@@ -17,7 +17,8 @@ from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, SampleSet, build_stage
+from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.build import build_stage
 from vlatool.stage.finish import save_npz
 from vlatool.stage.run import run_transform
 

@@ -12,7 +12,8 @@ import psutil
 import pytest
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.loop import Trainer
 

@@ -19,7 +19,8 @@ from vlatool.rebuild.rebuild import rebuild
 from vlatool.report import read_report
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.yielded import ROWS
 from vlatool.user_code import trust

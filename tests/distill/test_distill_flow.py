@@ -19,7 +19,8 @@ from vlatool.prune.neurons import Neurons
 from vlatool.prune.steps import Steps
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.flow import flow_loss
 from vlatool.training.losses.l1 import L1

@@ -22,7 +22,8 @@ from vlatool.prune.neurons import Neurons
 from vlatool.prune.steps import Steps
 from vlatool.prune.structured import Structured
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.rounds import LABEL
 from vlatool.training.stage import TrainingStage

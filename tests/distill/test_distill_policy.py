@@ -24,7 +24,8 @@ from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.loop import Trainer
 from vlatool.training.teacher import Teacher

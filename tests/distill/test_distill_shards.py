@@ -23,7 +23,8 @@ from vlatool.errors import RecipeError, SourceError
 from vlatool.machine.processes import import_path
 from vlatool.prune.neurons import Neurons
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 pytestmark = pytest.mark.usefixtures("in_this_process")

@@ -22,7 +22,8 @@ from vlatool.optimize.plan import transforms
 from vlatool.prune.neurons import Neurons
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import first_steps, run_transform
 from vlatool.training.supervision import parameters
 

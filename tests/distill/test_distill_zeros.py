@@ -14,7 +14,8 @@ from vlatool.errors import RecipeError
 from vlatool.module.torch_policy import load_modules
 from vlatool.module.zeros import has_zeros, sparse_weights, zero_share
 from vlatool.prune.magnitude import Magnitude
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 SHORT = {"steps": 6, "batch": 6, "episodes": 0, "student_episodes": 0, "learning_rate": 0.01, "average": 0.5,

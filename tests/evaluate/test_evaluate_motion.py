@@ -18,7 +18,8 @@ from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import load_profile
 from vlatool.report import Measurement, Report, Row
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import cached_measure
 
 

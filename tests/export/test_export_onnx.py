@@ -16,7 +16,8 @@ from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 
 PLAIN_YAML = """\
 name: plain

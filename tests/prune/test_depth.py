@@ -17,7 +17,8 @@ from vlatool.module.edits import Edit, apply
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune.depth import PROTECTED, Depth, spread
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 SIZES = (3.0, 0.001, 0.5, 0.05)

@@ -32,7 +32,8 @@ from vlatool.rebuild.rebuild import rebuild
 from vlatool.report import Measurement
 from vlatool.runtime import load
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.controls import predicted_for
 from vlatool.stage.run import run_transform
 

@@ -21,7 +21,8 @@ from vlatool.prune.structured import Structured
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}

@@ -11,7 +11,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import CALIBRATION
 from vlatool.module.torch_policy import load_modules
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 

@@ -16,7 +16,7 @@ from vlatool.quantize._smooth_groups import find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
 from vlatool.quantize.smooth_quant import SmoothQuant, _Writer
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.stage.base import build_stage
+from vlatool.stage.build import build_stage
 
 WIDTH = 6
 RANDOM = 7

@@ -11,7 +11,7 @@ from vlatool.quantize import _conv1x1
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
-from vlatool.stage.base import build_stage
+from vlatool.stage.build import build_stage
 
 
 @pytest.fixture

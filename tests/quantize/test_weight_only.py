@@ -22,7 +22,8 @@ from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.samples._language import DecoderShape
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 SHAPE = DecoderShape(width=128, layers=2, heads=4, shared_heads=2, head_width=32, hidden=352)

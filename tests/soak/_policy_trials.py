@@ -19,7 +19,8 @@ from vlatool.module.torch_policy import torch_policy
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.sources import source_stage
-from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 
 ENGINES = ("ort_cpu", "openvino")

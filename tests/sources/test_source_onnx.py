@@ -11,7 +11,8 @@ from vlatool.graph.workload import graph_workload
 from vlatool.runtime import load
 from vlatool.sources import is_bundle, source_stage
 from vlatool.sources.onnx import OnnxFile
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 
 
 def build(out: Path, model: Path, **options: object) -> Bundle:

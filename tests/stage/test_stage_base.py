@@ -17,7 +17,8 @@ from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.sources.onnx import OnnxFile
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, Measure, Stage, Transform, build_stage, source_of, stage_class, stage_kinds
+from vlatool.stage.base import Context, Measure, Stage, Transform, source_of
+from vlatool.stage.build import build_stage, stage_class, stage_kinds
 
 
 def test_a_stage_is_named_after_its_file():

@@ -21,7 +21,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.torch_policy import load_modules
 from vlatool.sources.torch_module import TorchModule
-from vlatool.stage.base import Context, build_stage
+from vlatool.stage.base import Context
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training import device as device_module
 from vlatool.training.device import CPU, Device, device_in_use, device_of, on_device

@@ -11,7 +11,7 @@ from typer.core import TyperGroup
 from vlatool import registry
 from vlatool.cli._stages import DEFAULTS, StageGroup, built, failing
 from vlatool.errors import PluginError, UsageError, nearest
-from vlatool.stage.base import stage_kinds
+from vlatool.stage.build import stage_kinds
 
 FIRST = "optimize"
 """What most people want comes first in the help."""

@@ -25,7 +25,8 @@ from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.optimize.choice import foretold
 from vlatool.report import Report
-from vlatool.stage.base import Context, Measure, Stage, Transform, build_stage
+from vlatool.stage.base import Context, Measure, Stage, Transform
+from vlatool.stage.build import build_stage
 from vlatool.stage.controls import controls
 from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured_with, run_transform
 

@@ -18,7 +18,8 @@ from vlatool import registry
 from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
 from vlatool.errors import PluginError, UsageError, nearest
-from vlatool.stage.base import Measure, Stage, Transform, validated
+from vlatool.stage.base import Measure, Stage, Transform
+from vlatool.stage.build import validated
 
 DEFAULTS = {
     "export": "onnx",

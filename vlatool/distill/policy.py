@@ -13,7 +13,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import CALIBRATION
 from vlatool.distill._student import DEPTH, student_steps
 from vlatool.errors import DataError, RecipeError
-from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.build import build_stage
 from vlatool.training.expert import RECORD, expert_loss
 from vlatool.training.imitation import ImitationStage
 from vlatool.training.supervision import Supervision

@@ -13,7 +13,8 @@ from vlatool.data import recorded_observations, synthetic_observations
 from vlatool.errors import BundleError, VlatoolError
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.stage.base import Stage, stage_class, validated
+from vlatool.stage.base import Stage
+from vlatool.stage.build import stage_class, validated
 from vlatool.stage.run import cache_directory
 
 EVALUATION = "data/evaluation.npz"

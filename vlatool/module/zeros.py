@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.module.edits import read_tensors
 from vlatool.module.stage import ModuleStage
-from vlatool.stage.base import stage_class
+from vlatool.stage.build import stage_class
 from vlatool.stage.finish import history
 
 if TYPE_CHECKING:

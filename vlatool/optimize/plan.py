@@ -16,7 +16,8 @@ from vlatool.module.description import read_description
 from vlatool.optimize.place import check_place
 from vlatool.optimize.recipe import Limits, Pruning, Recipe, StageList, stage_entries
 from vlatool.sources import Source, source_stage
-from vlatool.stage.base import Stage, Transform, build_stage
+from vlatool.stage.base import Stage, Transform
+from vlatool.stage.build import build_stage
 
 BASELINE = "float32"
 

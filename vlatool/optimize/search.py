@@ -36,7 +36,8 @@ from vlatool.optimize.recipe import Limits, StageList
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
 from vlatool.runtime.policy import refuse_findings
-from vlatool.stage.base import Context, stage_class
+from vlatool.stage.base import Context
+from vlatool.stage.build import stage_class
 from vlatool.stage.run import cached_measure, cached_transform
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from vlatool.measurement.jobs import LatencyJob
 from vlatool.module.edits import Edit, apply, joined_edits, read_edits
 from vlatool.module.stage import write_changed
 from vlatool.module.torch_policy import load_modules
-from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.build import build_stage
 
 CALLS, SECONDS = 200, 3.0
 """Of each policy in a run, at least."""

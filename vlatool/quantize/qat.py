@@ -9,7 +9,7 @@ from pydantic import Field
 
 from vlatool.data import MOST
 from vlatool.runtime.engine import layouts
-from vlatool.stage.base import build_stage
+from vlatool.stage.build import build_stage
 from vlatool.training.fake_quantization import BLOCK, fake_quantization
 from vlatool.training.imitation import ImitationStage
 

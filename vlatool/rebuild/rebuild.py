@@ -20,7 +20,8 @@ from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
 from vlatool.rebuild.differences import Compared, compare_bundles
 from vlatool.sources import source_stage
-from vlatool.stage.base import Context, Transform, build_stage, installed_version, source_of, stage_class
+from vlatool.stage.base import Context, Transform, installed_version, source_of
+from vlatool.stage.build import build_stage, stage_class
 from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust

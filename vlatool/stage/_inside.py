@@ -10,7 +10,8 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.report import Report
-from vlatool.stage.base import Context, Measure, Stage, Transform, build_stage
+from vlatool.stage.base import Context, Measure, Stage, Transform
+from vlatool.stage.build import build_stage
 from vlatool.user_code import children
 
 PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)

@@ -13,7 +13,7 @@ from typing import Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError, require
 from vlatool.module.torch_policy import load_modules
-from vlatool.stage.base import build_stage
+from vlatool.stage.build import build_stage
 from vlatool.training.batches import Batches, draw_of
 from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames

@@ -17,7 +17,8 @@ from vlatool.module.edits import Edit, read_edits
 from vlatool.module.origin import origin_of
 from vlatool.module.torch_policy import load_modules, unedited_modules
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.stage.base import Context, Transform, build_stage
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.build import build_stage
 from vlatool.stage.run import cached_transform
 from vlatool.user_code import trust
 
