@@ -30,10 +30,6 @@ class Constraint:
     def average(self, weight: Tensor, average: Tensor) -> None:
         """Change the average of a weight in place, after it followed."""
 
-    def since(self, number: int) -> int:
-        """Return the last step, up to one, that took freedom from weights: the average begins again there; else 0."""
-        return 0
-
 
 class KeptZeros(Constraint):
     """What is zero stays zero.
@@ -88,7 +84,3 @@ class GrowingZeros(KeptZeros):
             for weight in self._weights if number in self._shares else ():
                 sizes = weight.abs().reshape(len(weight), -1)
                 weight.masked_fill_(self._goes(sizes, self._shares[number]).reshape(weight.shape), 0)
-
-    def since(self, number: int) -> int:
-        """Return the last step, up to one, in which zeros were added: weights from before are those of another net."""
-        return max((at for at in self._shares if at <= number), default=0)

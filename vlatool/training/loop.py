@@ -202,9 +202,8 @@ class Trainer:
         self.best.look(score, self.step, self._average)
 
     def _follow(self) -> None:
-        """Let the average follow the weights, closely in the first steps, and in those after a loss of weights."""
-        steps = self.step + 1 - self._constraint.since(self.step + 1)
-        decay = min(self._settings.average, steps / (9 + steps))
+        """Let the average follow the weights, closely in the first steps."""
+        decay = min(self._settings.average, (1 + self.step) / (10 + self.step))
         with require("torch", "build").no_grad():
             for name, value in self._weights.items():
                 self._average[name].lerp_(value, 1 - decay)
