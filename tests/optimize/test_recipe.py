@@ -65,7 +65,7 @@ def test_a_directory(tmp_path: Path):
     ("data", "message"),
     [
         ("a: [1", "not valid YAML"),
-        ("", "must be a mapping; got NoneType"),
+        ("", "is empty; it must be a mapping"),
         ("- a", "must be a mapping; got list"),
         ({"schema": 1}, "candidates: Field required"),
         ({"schema": 1, "candidates": {}}, "candidates: Dictionary should have at least 1 item"),

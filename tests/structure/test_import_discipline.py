@@ -92,7 +92,7 @@ def test_what_measures_on_a_target_imports_numpy_alone():
 
 
 def test_stages_are_imported_without_torch_onnx_and_engines():
-    statement = "from vlatool.stage import base as stage\n" + "\n".join(
+    statement = "from vlatool.stage import build as stage\n" + "\n".join(
         f"stage.stage_class('{name}')"
         for name in ("sources.torch_module", "sources.onnx", "export.onnx", "quantize.static_int8")
     )

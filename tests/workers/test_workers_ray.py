@@ -52,6 +52,8 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
     paths = [str(ROOT), os.pathsep.join((str(ROOT), str(old.parent)))]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_TMPDIR", sockets)  # where it notes the address of the cluster, in a folder that must be there
+        Path(sockets, "ray").mkdir()
         arguments = [
             {"num_cpus": 1, "node_ip_address": LOOPBACK, "object_store_memory": 80 << 20,
              "env_vars": {"VLATOOL_CACHE": str(cache), "PYTHONPATH": path}}
