@@ -208,7 +208,7 @@ def test_one_environment_is_open_at_a_time(float_bundle, int8_bundle, world):
     ("options", "error", "says"),
     [
         ({"tasks": ("raech",)}, UsageError, "There is no task 'raech'; did you mean 'reach'"),
-        ({"environment": "none.py:make"}, SourceError, "No such file"),
+        ({"environment": "none.py:make"}, SourceError, r"No such file: .*none.py \(--environment none.py:make\)"),
         ({"environment": "environment.py:mak"}, SourceError, "did you mean 'make'"),
         ({"environment": "environment.py"}, SourceError, "names a file but no function"),
         ({"environment": "no_such_package.module:make"}, MissingExtra, "no_such_package"),

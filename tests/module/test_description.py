@@ -1,13 +1,14 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from vlatool.bundle.bundle import LOCATION
 from vlatool.bundle.program import single_graph
-from vlatool.errors import SourceError, SpecError
-from vlatool.module.description import read_description, read_location, write_location
+from vlatool.errors import DataError, SourceError, SpecError
+from vlatool.module.description import copy_assets, read_description, read_location, write_location
 
 SPEC = {
     "inputs": [{"name": "x", "shape": [1, 2]}],
@@ -114,6 +115,18 @@ def test_no_description(tmp_path: Path, named):
 def test_a_description_that_is_wrong(tmp_path: Path, data, message):
     with pytest.raises(SourceError, match=message):
         read_description(write(tmp_path, data))
+
+
+def test_a_recording_without_an_input_is_named_as_the_user_knows_it(policy_dir: Path, tmp_path: Path):
+    described = read_description(policy_dir)
+    with np.load(policy_dir / "evaluation.npz") as stored:
+        arrays = {name: value for name, value in stored.items() if name != "proprio"}
+    np.savez(policy_dir / "evaluation.npz", **arrays)
+    with pytest.raises(DataError, match=rf"^{policy_dir}/evaluation.npz has no 'proprio'; .*known: ") as caught:
+        copy_assets(described, tmp_path / "out")
+    assert caught.value.fix.startswith("record every input of the spec under its name")
+    (policy_dir / "evaluation.npz").write_bytes(b"PK")
+    copy_assets(described, tmp_path / "other")  # whoever reads it says what is wrong
 
 
 def test_text_that_is_no_utf8(tmp_path: Path):

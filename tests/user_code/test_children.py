@@ -25,9 +25,27 @@ server.process.wait = interrupted
 """
 
 
+REPORTED = """
+stop = server.stop
+server.stop = lambda: (stop(), print(server.process.returncode))
+"""
+
+
 def test_ctrl_c_while_the_children_end_is_no_traceback() -> None:
     done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_while_the_children_end_ends_them_at_once_without_a_traceback(name: str) -> None:
+    code = ENDING.replace("import os, signal", "import os, signal\nfrom vlatool.cli import _end_on_signals")
+    code = code.replace("signal.signal(signal.SIGINT, signal.default_int_handler)", "_end_on_signals()")
+    code = code.replace(
+        "os.kill(os.getpid(), signal.SIGINT)",
+        f"os.kill(server.process.pid, signal.SIGSTOP)\n    os.kill(os.getpid(), signal.{name})",
+    )
+    done = subprocess.run([sys.executable, "-c", code + REPORTED], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, done.stdout) == (0, "", "-9\n")
 
 
 def test_what_vlatools_own_code_raises_is_named_and_not_blamed_on_the_policy() -> None:

@@ -23,5 +23,6 @@ from vlatool.data._played import PLAYED as PLAYED
 from vlatool.data._played import Encoded as Encoded
 from vlatool.data._played import kept_rows as kept_rows
 from vlatool.data._played import played_observations as played_observations
+from vlatool.data._recording import RECORD_ALL as RECORD_ALL
 from vlatool.data._recording import Recording as Recording
 from vlatool.data._recording import read_recording as read_recording

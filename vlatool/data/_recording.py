@@ -19,6 +19,7 @@ from vlatool.files.rows import Rows, blocks
 Array = NDArray[Any]
 Values = Array | Rows
 """An input of all samples: in memory, or on the disk, where it is large."""
+RECORD_ALL = "record every input of the spec under its name, a row for each sample"
 EXPERT = ("action", "episode")
 """Arrays that a recording may hold beside the inputs."""
 
@@ -116,7 +117,7 @@ def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recor
     inputs = {}
     for tensor in spec.inputs:
         if tensor.name not in arrays:
-            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.")
+            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, arrays)}.", RECORD_ALL)
         inputs[tensor.name] = _checked_input(path, tensor, arrays[tensor.name], spec)
     actions, episodes = _in_memory(arrays, spec.action.name, "action"), _in_memory(arrays, "episode")
     lengths = {name: len(values) for name, values in inputs.items()}

@@ -273,6 +273,11 @@ class ClosedLoop(Measure):
         """
         where, function = split_factory(job.environment)
         file = factory_file(job.environment, Path(job.folder))
+        if self.environment and file is not None and not file.is_file():
+            raise SourceError(
+                f"No such file: {file} (--environment {self.environment}).",
+                f"name it relative to {Path(job.folder).resolve()}, or by its full path",
+            )
         if self.policy or self.environment:
             if file or self.policy:  # a package that is named makes no code of the current directory run
                 trust.name(file.parent if file else Path(job.folder))

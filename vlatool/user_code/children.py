@@ -90,11 +90,19 @@ def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, st
 
 @atexit.register
 def _stop() -> None:
-    with contextlib.suppress(ValueError):  # Ctrl-C once more: the process ends already
+    own = [server for kind, server in _servers.items() if kind[0] == str(os.getpid())]
+
+    def hasten(_number: int, _frame: object) -> None:
+        for server in own:
+            server.process.kill()
+
+    with contextlib.suppress(ValueError):  # the process ends already, and what it was asked for is done
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for kind, server in _servers.items():
-        if kind[0] == str(os.getpid()):
-            server.stop()
+        for name in ("SIGTERM", "SIGHUP") if own else ():
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), hasten)
+    for server in own:
+        server.stop()
 
 
 class Apart:
