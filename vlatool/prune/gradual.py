@@ -29,8 +29,10 @@ class Gradual(ImitationStage):
 
     After step t of n the share of zeros is ``s (1 - (1 - t/n)^3)`` (Zhu and Gupta, arXiv 1710.01878, from no zeros at
     the start): many early, when there are many weights to spare, and few in the end. What is zero stays zero. The rest
-    of the training goes on with the zeros as they are. Shapes stay: processors multiply zeros like other numbers, so
-    that nothing is faster there; --pattern 2:4 is for sparse tensor cores.
+    of the training goes on with the zeros as they are. The learning rate is lower than that of ``distill policy``: the
+    student begins as the teacher itself, and larger steps move it away before there is anything to learn. Shapes stay:
+    processors multiply zeros like other numbers, so that nothing is faster there; --pattern 2:4 is for sparse tensor
+    cores.
     """
 
     changed_first: ClassVar[bool] = False
@@ -41,6 +43,7 @@ class Gradual(ImitationStage):
         "unstructured",
         description="2:4 is for sparse tensor cores (NVIDIA Ampere and later); it keeps half",
     )
+    learning_rate: float = Field(1e-4, gt=0, le=1, description="its highest value; it warms up, and falls as a cosine")
     until: float = Field(0.6, gt=0, le=1, description="share of the steps after which no more weights become zero")
     interval: int = Field(10, ge=1, description="steps from one time that weights become zero to the next")
     include: tuple[str, ...] = Field((), description="globs of layers; all but embeddings and heads when empty")
