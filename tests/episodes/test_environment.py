@@ -102,8 +102,14 @@ BROKEN = {
     "cannot disturb": (
         "def reset(",
         "disturbances = ('push',)\n    def disturb(self, *_):\n        [][1]\n    def reset(",
-        "failed at seed 7: IndexError",
-        "correct what fails",
+        "failed at seed 7 under push, strength 1: IndexError",
+        "call e = make(task='reach'), then e.disturb('push', 1, 7) and e.reset(seed=7) of the environment yourself",
+    ),
+    "disturbed into another shape": (
+        "def reset(",
+        "disturbances = ('push',)\n    def disturb(self, *_): self.reset = lambda seed: ({}, {})\n    def reset(",
+        "Under push, strength 1: The environment, in task 'reach' at seed 7, step 1, gives",
+        "",
     ),
     "too large": ("np.zeros(3)", "np.full(3, 1e300)", "too large for float32", "unit"),
 }
@@ -121,7 +127,7 @@ ENDS = {
 def test_a_breach_of_the_contract_is_told_with_its_remedy(tmp_path, float_bundle, name):
     old, new, says, fix = BROKEN[name]
     with pytest.raises(DataError) as caught:
-        played(tmp_path, float_bundle, old, new, disturb="push" if name == "cannot disturb" else "")
+        played(tmp_path, float_bundle, old, new, disturb="push" if "disturb" in name else "")
     assert says in caught.value.message
     assert fix in caught.value.fix
     assert caught.value.message.count("task 'reach'") == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -119,6 +120,43 @@ def test_it_goes_on_where_it_was_to_the_same_rows(bundles, world, cache, played)
     assert played() == COUNT - taken, "what was finished is not played again"
     assert again.warnings[:-1] == whole.warnings
     assert f"{taken} episodes are of an interrupted run" in told
+
+
+def test_a_bundle_beside_one_with_the_same_content_plays_for_itself(bundles, world, cache, played, tmp_path):
+    """Episodes that decide by chance would look repeatable, and nothing was interrupted."""
+    twin = shutil.copytree(bundles["good"].path, tmp_path / "twin")
+    stage = evaluation(world, baseline=twin)
+    report = run(stage, bundles["good"])
+    assert not any("interrupted" in warning for warning in report.warnings)
+    controls = 2 * 20
+    again = 2
+    assert played() == 2 * COUNT + controls + again
+    interrupted_after(stage, bundles["good"], 6)
+    played()
+    report = run(stage, bundles["good"])
+    assert taken_of(report)[0] >= COUNT + 10, "of both"
+
+
+def test_episodes_that_their_seed_does_not_decide_are_noticed(bundles, world, cache):
+    code = (world / "environment.py").read_text()
+    (world / "environment.py").write_text(code.replace("np.random.default_rng(seed)", "np.random.default_rng()"))
+    for kind in ("trembles", "good"):
+        report = evaluation(world, baseline=bundles["good"].path, episodes=8).run(bundles[kind], Context())
+        (noticed,) = [line for line in report.warnings if "other episodes for the same seed" in line]
+        assert "played again with" in noticed
+    (world / "environment.py").write_text(code)
+    report = evaluation(world, baseline=bundles["good"].path, episodes=8).run(bundles["trembles"], Context())
+    assert not any("for the same seed" in line for line in report.warnings)
+
+
+def test_an_environment_may_leave_the_directory(bundles, world, cache, monkeypatch):
+    code = (world / "environment.py").read_text()
+    changed = code.replace("self.steps += 1", 'self.steps += 1; __import__("os").chdir("/")')
+    (world / "environment.py").write_text(changed)
+    monkeypatch.chdir(world.parent)
+    stage = ClosedLoop(environment=f"{world.name}/environment.py:make", tasks=("near", "far"), episodes=8)
+    rows = [stage.run(bundles["good"], Context(workers=workers)).rows for workers in (1, 2)]
+    assert rows[0] == rows[1]
 
 
 def test_a_comparison_goes_on_with_its_controls_and_disturbances(bundles, world, cache, played):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+from vlatool.episodes.disturbed import OWN
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.printable import message_of
 from vlatool.module.factory import exits_caught
@@ -16,31 +17,34 @@ def under_way(task: str, seed: int) -> str:
 
 
 @contextlib.contextmanager
-def named(task: str, seed: int | None = None) -> Iterator[None]:
+def named(task: str, seed: int | None = None, under: tuple[str, float] | None = None) -> Iterator[None]:
     """Turn whatever is raised in this block into an error that names task, seed and remedy.
 
     Args:
         task: Of the environment.
         seed: Of the episode; None before there is one.
+        under: Disturbance and strength; None where there is none.
 
     Raises:
         VlatoolError: of the class that was raised.
         DataError: for every other exception.
         SourceError: for what is raised beside ``Exception``.
     """
-    at = "" if seed is None else f" at seed {seed}"
+    at = "" if seed is None else f" at seed {seed}{_under(under)}"
     try:
         with exits_caught(f"the environment of task '{task}'{at and f',{at},'}"):
             yield
     except VlatoolError as error:
-        locate(error, task, seed)
+        locate(error, task, seed, under=under)
         raise
     except Exception as error:  # the seam: a user's environment may raise anything
         said = f"The environment of task '{task}' failed{at}: {type(error).__name__}: {message_of(error)}."
-        raise DataError(said, _remedy(task, seed)) from error
+        raise DataError(said, _remedy(task, seed, under)) from error
 
 
-def locate(error: VlatoolError, task: str, seed: int | None, seeds: str = "") -> None:
+def locate(
+    error: VlatoolError, task: str, seed: int | None, seeds: str = "", under: tuple[str, float] | None = None
+) -> None:
     """Add to an error what of task and seed it does not name, and what to do where it does not say it.
 
     Args:
@@ -48,6 +52,7 @@ def locate(error: VlatoolError, task: str, seed: int | None, seeds: str = "") ->
         task: Of the environment.
         seed: Of the episode; None where it is not known.
         seeds: Which ones come into question then, a part of a sentence.
+        under: Disturbance and strength; None where there is none.
     """
     message = str(error.message)
     words = [] if f"task '{task}'" in message else [f"in task '{task}'"]
@@ -55,13 +60,21 @@ def locate(error: VlatoolError, task: str, seed: int | None, seeds: str = "") ->
         words.append(f"at seed {seed}")
     elif seed is None and seeds:
         words.append(seeds)
+    if under and f"under {under[0]}" not in message:
+        words.append(_under(under).strip())
     if words:
         start = " ".join(words)
         error.message = f"{start[:1].upper()}{start[1:]}: {message}"
     if not error.fix and isinstance(error, DataError | SourceError):
-        error.fix = _remedy(task, seed)
+        error.fix = _remedy(task, seed, under)
 
 
-def _remedy(task: str, seed: int | None) -> str:
+def _under(under: tuple[str, float] | None) -> str:
+    return f" under {under[0]}, strength {under[1]:g}" if under else ""
+
+
+def _remedy(task: str, seed: int | None, under: tuple[str, float] | None = None) -> str:
     call = f"make(task={task!r})" + ("" if seed is None else f".reset(seed={seed})")
+    if under and under[0] not in OWN and seed is not None:
+        call = f"e = make(task={task!r}), then e.disturb({under[0]!r}, {under[1]:g}, {seed}) and e.reset(seed={seed})"
     return f"call {call} of the environment yourself, and correct what fails; VLATOOL_DEBUG=1 shows where it was raised"

@@ -219,7 +219,7 @@ class _Kept:
         if self._store is None:
             return
         around = circumstances(bundle, engine, jobs[0])
-        self._keys = [key_of(around, job) for job in jobs]
+        self._keys = [self._store.turn(key_of(around, job)) for job in jobs]
         for number, job in enumerate(jobs):
             with contextlib.suppress(DataError):  # not what that job gives: played again
                 if (value := self._store.get(self._keys[number])) is not None:

@@ -7,6 +7,7 @@ changes the directory does that there (see ``vlatool.user_code.children``).
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -157,6 +158,7 @@ class Worker:
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
         self._environment: Any = None
+        self._home = Path.cwd()
 
     def environment(self, job: EpisodesJob) -> Any:
         """Return the environment of a job; one is open at a time, since some renderers allow no more."""
@@ -171,6 +173,7 @@ class Worker:
     def play(self, job: EpisodesJob, limit: int = STEP_LIMIT, tell: Tell = lambda *_: None) -> list[Outcome]:
         """Play the episodes of a job; tell of each that it begins."""
         spec = self.queue.policy.spec
+        os.chdir(self._home)  # an environment before may have changed it, and the next one's file is named from here
         world = world_of(self.environment(job), job.task, spec, job.film)
         with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
             outcomes = []
@@ -257,7 +260,7 @@ def close(_request: Mapping[str, Any], _tell: Tell) -> None:
 
 def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, seed: int, limit: int) -> Outcome:
     task = job.task
-    with named(task, seed):
+    with named(task, seed, (job.disturb, job.strength) if job.disturb else None):
         if job.disturb and job.disturb not in OWN:
             world.disturb(job.disturb, job.strength, seed)
         observation, info = world.reset(seed)

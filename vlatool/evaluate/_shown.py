@@ -89,7 +89,21 @@ def played_again(
             return Again(tuple(found) if paired else (), (f"{name} shows {why}: {sentence}.",))
         except Exception as error:  # a picture is not worth the measurement
             warnings = [f"{name} was not written: {_reason(error)}"]
-    return Again(_drawn(again, plays) if paired else (), warnings=tuple(warnings))
+    outcomes = _drawn(again, plays) if paired else ()
+    warnings += _unrepeatable(before, outcomes, names_of(bundles))
+    return Again(outcomes, warnings=tuple(warnings))
+
+
+def _unrepeatable(before: Sequence[Outcome], outcomes: Sequence[Outcome], names: Sequence[str]) -> Iterator[str]:
+    """Yield a warning where an episode went another way than before: its seed does not decide it."""
+    other = [name for name, one, two in zip(names, before, outcomes, strict=False)
+             if (one.success, one.steps, one.motion) != (two.success, two.steps, two.motion)]  # fmt: skip
+    if other:
+        where = f"task '{before[-1].task}' at seed {before[-1].seed}"
+        yield (
+            f"{where}, played again with {' and '.join(other)}, went another way: the environment gives other episodes "
+            "for the same seed, so that pairs differ by chance; let reset(seed=...) decide all that it draws"
+        )
 
 
 def _place(played: Sequence[list[Outcome]]) -> tuple[int, str]:

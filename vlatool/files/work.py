@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,7 @@ class Store:
         """How many things (episodes, say) were taken from an earlier run; counted by whoever takes them."""
         self.asked = 0
         """How many there are in all."""
+        self._turns: Counter[str] = Counter()
 
     @classmethod
     @contextlib.contextmanager
@@ -105,6 +107,14 @@ class Store:
             except OSError as error:
                 store._failed(error)
             yield store
+
+    def turn(self, key: str) -> str:
+        """Return the key for what a run does once more under one that it had: a run never takes what is its own.
+
+        Every run of a command does the same in the same order, so that an interrupted one is gone on with.
+        """
+        self._turns[key] += 1
+        return key if self._turns[key] == 1 else f"{key} ({self._turns[key]})"
 
     def get(self, key: str) -> Any:
         """Return what is kept under a key, None for nothing; what was damaged or changed counts as nothing."""

@@ -74,6 +74,7 @@ class Study:
         self._optuna.logging.set_verbosity(self._optuna.logging.ERROR)
         self._allowed, self._seed = allowed, seed
         self._worker = worker()
+        self._left: list[int] = []
         self._space = Space((1.0,), 1, 1, {}, ())
         self._url = url
         with used(url):
@@ -110,7 +111,7 @@ class Study:
         with used(self._url):
             for shape in space.first():
                 self._study.enqueue_trial(asdict(shape), skip_if_exists=True)
-            self._again()
+            self._left = self._dead()
 
     def ask(self, trials: int) -> tuple[int, Shape] | None:
         """Return the number and shape of the next trial, None when so many are done or under way, or all was tried.
@@ -123,6 +124,9 @@ class Study:
             return self._next(trials)
 
     def _next(self, trials: int) -> tuple[int, Shape] | None:
+        while self._left:
+            if (taken := self._taken_up(self._left.pop(0), trials)) is not None:
+                return taken
         for attempt in range(REPEATS + 1):
             counted = [trial.params for trial in self._trials() if self._counts(trial)]
             if len(counted) >= trials:
@@ -205,14 +209,32 @@ class Study:
         trial: Trial = self._optuna.trial.Trial(self._study, self._trials()[number]._trial_id)
         return trial
 
-    def _again(self) -> None:
-        """Take up trials that a process of this machine had under way when it was killed."""
-        state = self._optuna.trial.TrialState
-        for trial in self._trials():
-            if trial.state == state.RUNNING and _is_dead(str(trial.user_attrs.get(WORKER, ""))):
-                self._drop(trial.number)
-                if set(trial.params) == set(Shape.__dataclass_fields__):
-                    self._study.enqueue_trial(trial.params)
+    def _dead(self) -> list[int]:
+        """Return the trials that processes of this machine had under way when they were killed."""
+        return [trial.number for trial in self._trials() if self._is_left(trial)]
+
+    def _is_left(self, trial: FrozenTrial) -> bool:
+        running = trial.state == self._optuna.trial.TrialState.RUNNING
+        return running and _is_dead(str(trial.user_attrs.get(WORKER, "")))
+
+    def _taken_up(self, number: int, trials: int) -> tuple[int, Shape] | None:
+        """Go on with a trial that was left, before any other; None where it is not wanted, or taken."""
+        trial = self._trials()[number]
+        if not self._is_left(trial):
+            return None
+        done = sum(self._counts(other) and not self._is_left(other) for other in self._trials())
+        if set(trial.params) != set(Shape.__dataclass_fields__):  # killed before it was chosen
+            self._drop(number)
+            return None
+        if done >= trials:
+            self._drop(number)
+            self._study.enqueue_trial(trial.params)
+            return None
+        shape = Shape(**trial.params)
+        if not self._space.holds(shape):
+            raise DataError(f"The study's trials are of another space: {trial.params}.", "name another study")
+        self._trial(number).set_user_attr(WORKER, self._worker)
+        return number, shape
 
     def _read(self, trial: FrozenTrial) -> Tried:
         try:
