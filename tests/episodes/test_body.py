@@ -76,7 +76,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
     "a mapping": ({"position": {"x": 1.0}}, "position", "dict and no number"),
     "an object": ({"joints": object()}, "joints", "object and no number"),
     "ragged": ({"joints": ((1.0, 2.0), (3.0,))}, "joints", "no number"),
-    "complex": ({"position": (1j, 0.0)}, "position", "no number"),
+    "complex": ({"position": np.array([1j, 0.0])}, "position", "ndarray and no number, or not a real one"),
     "four axes": ({"position": (0.0,) * 4}, "position", r"shape \[4\]"),
     "a pose matrix": ({"position": np.eye(4)}, "position", r"shape \[4, 4\]"),
     "nothing": ({"position": ()}, "position", r"shape \[0\]"),
@@ -92,6 +92,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
     "a shortest path of NaN": ({"shortest_path": float("nan")}, "shortest_path", "NaN"),
     "a clock that stands": ({"time": 1.0}, "time", "alike"),
     "a clock that changes its pace": ({"time": [0.0, 0.1, 0.2, 0.5, 0.6, 0.7, 0.8]}, "time", "alike"),
+    "a clock that runs backwards": ({"time": [-float(step) for step in range(7)]}, "time", "above 0"),
     "a clock that goes back": ({"time": [0.0, 0.1, 0.2, 0.1, 0.2, 0.3, 0.4]}, "time", "alike"),
     "a clock that is told now and then": ({"time": [0.0, None, 0.2, None, 0.4, None, 0.6]}, "time", "4 of 7"),
 }  # fmt: skip

@@ -181,7 +181,7 @@ def test_what_was_told_and_cannot_be_used_is_said(bundles: dict[str, Bundle], tm
     file.write_text(file.read_text().replace('{"position": self.at, "success"', '{"position": "here", "success"'))
     (row,) = ClosedLoop(policy=folder, episodes=2).run(bundles["good"], Context()).rows
     assert row.details["unmeasured"] == [
-        {"what": "motion from info['position']", "why": "it is str and no number (2 of 2 episodes)"}
+        {"what": "motion from info['position']", "why": "it is str and no number, or not a real one (2 of 2 episodes)"}
     ]
     assert {name for name in row.raw if name.startswith("motion.")} == {"motion.task_time", "motion.action_rate",
                                                                        "motion.reversals"}  # fmt: skip

@@ -89,7 +89,7 @@ class Body:
                 raise TypeError
             array = array.astype(np.float64)
         except (TypeError, ValueError, RuntimeError):
-            self.refused[name] = f"it is {type(value).__name__} and no number"
+            self.refused[name] = f"it is {type(value).__name__} and no number, or not a real one"
             return None
         if array.size == 1 and SERIES.get(name, 0) == 0:
             array = array.reshape(())
@@ -128,7 +128,7 @@ class Body:
         if len(self._times) != self._looks and len(self._times) != self._looks - 1:
             self.refused[TIME] = f"it is told at {len(self._times)} of {self._looks} moments"
         elif steps.min() <= 0 or steps.max() - steps.min() > UNEVEN * steps.mean():
-            self.refused[TIME] = f"its steps go from {steps.min():g} to {steps.max():g} s; they must all be alike"
+            self.refused[TIME] = f"its steps go from {steps.min():g} to {steps.max():g} s; all must be alike, above 0"
         else:
             return float(1 / steps.mean())
         return self._hz
