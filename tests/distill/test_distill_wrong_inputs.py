@@ -102,8 +102,8 @@ class Workshop:
         (folder / "policy.yaml").write_text("".join(line for line in lines if not line.startswith("source:")))
         return folder
 
-    def teacher(self, *swaps: tuple[str, str, str]) -> Line:
-        return self.line("--teacher", self.source(*swaps), "--trust", self.root / "changed")
+    def teacher(self, *swaps: tuple[str, str, str], drop: tuple[str, ...] = ()) -> Line:
+        return self.line("--teacher", self.source(*swaps, drop=drop), "--trust", self.root / "changed")
 
     def student(self, *swaps: tuple[str, str, str], drop: tuple[str, ...] = (), options: Line = ALONE) -> Line:
         """Distil a changed policy after it was pruned."""
@@ -266,7 +266,7 @@ ROWS = [
     Row("a teacher that acts in another way", "have another unit or mode for 'action'", 3,
         lambda at: at.teacher(("policy.yaml", "mode: delta", "mode: absolute"))),
     Row("a teacher without one of the inputs", "is given 'proprio' as nothing", 3, lambda at: at.teacher(
-        ("policy.yaml", "- {name: proprio,", "- {name: state,"))),
+        ("policy.yaml", "- {name: proprio,", "- {name: state,"), drop=("calibration.npz", "evaluation.npz"))),
     Row("a teacher whose action is not finite", "The teacher gives an action that is not finite", 3,
         lambda at: at.code(WHOLE_FAILS)),
     # ---- the student
