@@ -126,6 +126,11 @@ def test_a_recording_without_an_input_is_named_as_the_user_knows_it(policy_dir: 
         copy_assets(described, tmp_path / "out")
     assert caught.value.fix.startswith("record every input of the spec under its name")
     (policy_dir / "evaluation.npz").write_bytes(b"PK")
+    copy_assets(described, tmp_path / "broken")
+    data = bytearray((policy_dir / "calibration.npz").read_bytes())
+    at = data.rindex(b"PK\x01\x02")  # the last entry of the directory: a version that nobody reads yet
+    data[at + 6 : at + 8] = b"\xff\xff"
+    (policy_dir / "evaluation.npz").write_bytes(data)
     copy_assets(described, tmp_path / "other")  # whoever reads it says what is wrong
 
 

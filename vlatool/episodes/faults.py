@@ -60,7 +60,7 @@ def locate(
         words.append(f"at seed {seed}")
     elif seed is None and seeds:
         words.append(seeds)
-    if under and f"under {under[0]}" not in message:
+    if under and f"under {under[0]}" not in message.replace("Under", "under"):
         words.append(_under(under).strip())
     if words:
         start = " ".join(words)

@@ -101,7 +101,7 @@ def _located(job: EpisodesJob, begun: Set[str], *, away: bool) -> Iterator[None]
         if seed is not None or isinstance(error, DataError | SourceError):
             known = seed is not None or any(f"seed {other}" in str(error.message) for other in job.seeds)
             seeds = f"(one of the seeds {job.seeds[0]} to {job.seeds[-1]})" if away and not known else ""
-            locate(error, job.task, seed, seeds)
+            locate(error, job.task, seed, seeds, (job.disturb, job.strength) if job.disturb else None)
         raise
 
 
