@@ -22,7 +22,7 @@ STYLES = {
     "symmetric": Style("symmetric", unsigned_convolutions=True),
     "int8 but for convolutions": Style("int8", unsigned_convolutions=True),
     "per tensor": Style(per_channel=False),
-    "seven bits": Style(reduce_range=True),
+    "no pair saturates": Style(reduce_range=True),
     "fused": Style(fused_convolutions=True),
     "hoist": Style("symmetric", hoist=True, unsigned_convolutions=True),
 }
@@ -77,10 +77,23 @@ def rounded(values: Array, style: Style, low: float = -3.0, high: float = 3.0, c
 
 def rounded_weight(values: Array, style: Style, axis: int) -> Array:
     """Reference: a weight after quantization."""
-    highest = 63 if style.reduce_range else 127
     others = tuple(index for index in range(values.ndim) if index != axis) if style.per_channel else None
-    scale = np.abs(values).max(axis=others, keepdims=True).astype(np.float32) / np.float32(highest)
-    return (np.clip(np.rint(values / scale), -highest, highest) * scale).astype(np.float32)
+    scale = np.abs(values).max(axis=others, keepdims=True).astype(np.float32) / np.float32(127)
+    if style.reduce_range:
+        scale = np.maximum(scale, largest_pair(values, axis).reshape(scale.shape) / np.float32(126))
+    return (np.clip(np.rint(values / scale), -127, 127) * scale).astype(np.float32)
+
+
+def largest_pair(values: Array, axis: int) -> Array:
+    """Reference: for each output, the largest magnitude of a sum of two weights that an engine adds up in one step."""
+    found = []
+    for weights in np.moveaxis(values, axis, 0):
+        summed = weights.transpose(1, 2, 0) if weights.ndim == 3 else weights
+        orders = [summed.ravel()]
+        if weights.ndim == 3 and len(weights) % 2:
+            orders.append(np.pad(summed, ((0, 0), (0, 0), (0, 1))).ravel())
+        found.append(max(abs(row[at] + row[at + 1]) for row in orders for at in range(0, len(row) - 1, 2)))
+    return np.array(found, np.float32)
 
 
 def kinds(model: Any) -> dict[str, int]:

@@ -173,14 +173,14 @@ def test_a_weight_that_is_not_finite_is_named(bad: float) -> None:
     with pytest.raises(GraphError, match=r"The weight 'w' of the layer 'MatMul_0' .* \(1 of 30 values\)"):
         check_weights(graph(text, w=w), find_layers(graph(text, w=w), OPS))
     with pytest.raises(GraphError, match="'w'"):
-        quantize_weight(w, 1, 127, "w")
+        quantize_weight(w, 1, "w")
 
 
 @pytest.mark.parametrize("axis", [None, 0, 1])
 @pytest.mark.parametrize("scale", [1.0, 1e-30, 1e30, 1e-44, 0.0])
 def test_weights_of_any_size(axis: int | None, scale: float) -> None:
     values = (weight(7, 5).astype(np.float64) * scale).astype(np.float32)
-    codes, scales = quantize_weight(values, axis, 127, "w")
+    codes, scales = quantize_weight(values, axis, "w")
     assert codes.dtype == np.int8
     assert scales.shape == (() if axis is None else (values.shape[axis],))
     assert np.abs(codes.astype(int)).max() <= 127

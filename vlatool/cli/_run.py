@@ -98,7 +98,7 @@ def transform(
     if events is not None and out.absolute() in (events.absolute(), *events.absolute().parents):
         raise UsageError(f"--events {events} is in the output {out}, which appears whole or not at all.")
     board = load_profile(profile) if profile else None
-    stage = stage.on(board) if board else stage
+    stage = stage.on(board) if board else stage.on_this_host()
     then = following(stage, board)
     with progress() as context:
         if is_bundle(source):
@@ -148,7 +148,7 @@ def transform(
 def following(stage: Transform, board: Profile | None) -> list[Transform]:
     """Return the stages that the command line runs after one, with the options that the board needs."""
     stages = [cast(Transform, build_stage(name, options)) for name, options in stage.then()]
-    return [each.on(board) if board else each for each in stages]
+    return [each.on(board) if board else each.on_this_host() for each in stages]
 
 
 def _onnx_source(export: Transform, source: Transform) -> Transform:

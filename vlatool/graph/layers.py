@@ -51,7 +51,7 @@ class Style:
         activations: ``uint8`` with a zero point, ``int8`` symmetric, or ``symmetric``: int8, and uint8 with the zero
             point 0 for what is never negative.
         per_channel: One weight scale for each output channel.
-        reduce_range: 7-bit weights.
+        reduce_range: Weights of which no pair saturates 16 bits (``weights.pairs``).
         fused_convolutions: Quantize a convolution's bias and output too: ONNX Runtime then computes it in int8.
         hoist: Quantize before operators that only move values, so that they move bytes instead of floats.
         signed_second: Write the second of two activations that are multiplied (keys and values of attention) in 7 bits

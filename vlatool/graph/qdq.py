@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from vlatool.errors import GraphError
 from vlatool.graph.layers import Layer, Style, convolved, hoisted, signed
 from vlatool.graph.onnx_graph import OnnxGraph
+from vlatool.weights.pairs import LARGEST_SUM, largest_sums
 
 Array = NDArray[Any]
 Range = tuple[float, float]
 ACTIVATION = {"uint8": (0, 255, np.uint8), "int8": (-127, 127, np.int8), "int7": (-63, 63, np.int8)}
+HIGHEST = 127
+"""Largest magnitude of an int8 weight."""
 INT32 = float(2**31 - 1)
 TINY = np.finfo(np.float32).tiny
 
@@ -138,9 +141,10 @@ class QdqWriter(OnnxGraph):
 
     def weight_codes(self, layer: Layer, least: Array | None) -> tuple[str, Array, Array]:
         """Return the name of a quantized weight, its codes, and its scales: one, or one for each entry of the axis."""
-        values, highest = self.array(layer.weight), 63 if self.style.reduce_range else 127
+        values = self.array(layer.weight)
         axis = layer.axis if self.style.per_channel and 2 <= values.ndim <= 5 else None
-        return f"{layer.weight}.{layer.axis}", *quantize_weight(values, axis, highest, layer.weight, least)
+        sums = largest_sums(values, layer.kind, layer.axis) if self.style.reduce_range else None
+        return f"{layer.weight}.{layer.axis}", *quantize_weight(values, axis, layer.weight, least, sums)
 
     def add_codes(self, name: str, codes: Array) -> str:
         """Add a constant of the type that weights are stored in; return its name."""
@@ -177,16 +181,17 @@ class QdqWriter(OnnxGraph):
 
 
 def quantize_weight(
-    values: Array, axis: int | None, highest: int, name: str, least: Array | None = None
+    values: Array, axis: int | None, name: str, least: Array | None = None, sums: Array | None = None
 ) -> tuple[Array, Array]:
     """Quantize a weight symmetrically to int8.
 
     Args:
         values: float32, any shape.
         axis: Axis with one scale for each entry; one scale for all when None.
-        highest: Largest magnitude, 127 or 63.
         name: For messages.
         least: Smallest scales that are allowed, one for each entry of the axis.
+        sums: Largest magnitudes of a sum of two weights that meet, one for each output, where such a sum must fit into
+            int8, too (``weights.pairs``).
 
     Returns:
         int8 of the same shape, and float32 scales: () or (entries of the axis,).
@@ -195,12 +200,14 @@ def quantize_weight(
         GraphError: when the weight holds NaN or infinity.
     """
     largest, shape = channel_peaks(values, axis, name)
-    scales = np.where(largest > 0, largest / highest, 1.0).astype(np.float32)
+    scales = np.where(largest > 0, largest / HIGHEST, 1.0).astype(np.float32)
+    if sums is not None:
+        scales = np.maximum(scales, (sums if axis is not None else sums.max(initial=0.0)) / LARGEST_SUM)
     scales = np.where(scales > 0, scales, TINY).astype(np.float32)
     if least is not None:
         lowest = least if axis is not None else least.max(initial=0.0)
         scales = np.where((largest == 0) & (lowest > 0), lowest, np.maximum(scales, lowest)).astype(np.float32)
-    return np.clip(np.rint(values / scales.reshape(shape)), -highest, highest).astype(np.int8), scales
+    return np.clip(np.rint(values / scales.reshape(shape)), -HIGHEST, HIGHEST).astype(np.int8), scales
 
 
 def channel_peaks(values: Array, axis: int | None, name: str) -> tuple[Array, list[int]]:

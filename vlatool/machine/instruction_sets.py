@@ -157,6 +157,16 @@ def rung(features: Collection[str]) -> str:
     return next((name for name, feature in RUNGS.items() if feature in features), "")
 
 
+def saturates(features: Collection[str]) -> bool:
+    """Return whether a processor with these features adds int8 products in pairs of 16 bits: x86 with AVX2, no VNNI.
+
+    Example:
+        >>> saturates(["avx2", "fma"]), saturates(["avx2", "avx_vnni"]), saturates(["asimd"])
+        (True, False, False)
+    """
+    return rung(features) in SATURATING
+
+
 def obeyed(told: str, host: Collection[str]) -> str:
     """Return the set that oneDNN computes in when ``ONEDNN_MAX_CPU_ISA`` says ``told``, on a processor with features.
 

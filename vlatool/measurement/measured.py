@@ -76,6 +76,7 @@ class PolicyRun:
         engine: Of the runtime.
         engines: For each graph what runs it; none in eager torch.
         golden_error: Relative difference of the golden action; None without one.
+        golden_explained: The largest that rounding explains.
         answers: Of the timed calls; None when they were not looked at.
         memory: None when it was not looked for, or cannot be.
         phases: The parts of an inference; none when they were not timed.
@@ -90,6 +91,7 @@ class PolicyRun:
     engine: str = ""
     engines: tuple[GraphEngine, ...] = ()
     golden_error: float | None = None
+    golden_explained: float = 0.0
     answers: AnswerCheck | None = None
     memory: Memory | None = None
     phases: tuple[Phase, ...] = ()

@@ -23,8 +23,6 @@ GROWTH_MB = 5.0
 GROWTH = 0.05
 BUSY, BUSY_SHARE = 0.15, 0.1
 """Processors that may be busy before the run: so many, and so many more for each that there is."""
-GOLDEN = 1e-2
-"""Relative difference of the golden action that another processor's rounding explains in int8."""
 
 
 def findings(measured: Measured, job: LatencyJob, duration_is_sustained: bool = False) -> tuple[Finding, ...]:
@@ -92,10 +90,11 @@ def busy(host: Mapping[str, Any]) -> Iterator[Finding]:
 def _golden(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
     for policy in policies:
         error = policy.golden_error
-        if error is not None and error > GOLDEN:
+        if error is not None and error > policy.golden_explained:
             yield Finding(
                 "suspect",
-                f"the golden action of {policy.name} is off by {error:.2g} (relative) on this machine",
+                f"the golden action of {policy.name} is off by {error:.2g} (relative) on this machine; rounding explains "
+                f"{policy.golden_explained:.2g}",
                 "see what its engine and processor compute in: vlatool explain, vlatool doctor",
             )
         if policy.engines and policy.answers is None:

@@ -165,6 +165,7 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
         engine=policy.engine,
         engines=tuple(_engines(policy)),
         golden_error=policy.golden_error,
+        golden_explained=policy.golden_explained,
         answers=None if contestant.answers is None else contestant.answers.check(),
         memory=memory,
         phases=tuple(phases),

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import Field
 
@@ -24,17 +24,28 @@ from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import precision_shares
+from vlatool.runtime.arithmetic import EXACT
+from vlatool.runtime.engine import UNKNOWN, engine_class
 from vlatool.stage.base import Context, Transform, source_of
 from vlatool.stage.finish import TRIALS, carry_over, finish, history
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
+Reduced = TypeVar("Reduced", bound="Quantization")
 QuantizeGraph = Callable[[str, Path, Path], str | None]
 """Graph name, original file, new file -> dtype of what is not quantized (float32 when None)."""
 QUANTIZED_OPS = ("MatMul", "Gemm", "Conv")
 TRAINED = "quantize.qat"
 """Stage after which the command line quantizes at once."""
+REDUCE_RANGE = (
+    "weights of which no pair saturates, for x86 processors without VNNI: exact at full speed there, with steps up to "
+    "1.4 times as large; set where the board of --profile, or without one this host, is such a processor"
+)
+REDUCED = (
+    "weights: no pair of products saturates on processors without VNNI (--no-reduce-range: all 8 bits, which are slower "
+    "there in ONNX Runtime and wrong in OpenVINO)"
+)
 FLOATS = ("float64", "float32", "float16")
 """Precisions of a graph that is not quantized yet."""
 
@@ -182,6 +193,18 @@ def check_ops(ops: Iterable[str]) -> None:
     for name in ops:
         if name not in QUANTIZED_OPS:
             raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
+
+
+def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:
+    """Return a stage with ``reduce_range`` where int8 products saturate on this host, unless the option was given.
+
+    Args:
+        stage: Has the option.
+        engine: What will run the bundle; the default engine when empty.
+    """
+    if "reduce_range" in stage.model_fields_set or engine_class(engine).arithmetic() in (EXACT, UNKNOWN):
+        return stage
+    return stage.model_copy(update={"reduce_range": True})
 
 
 @contextlib.contextmanager

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import Layer, check_weights, part_inner_gemms, split_gemm
-from vlatool.quantize._base import Quantization, quiet_quantizer
+from vlatool.graph.onnx_graph import OnnxGraph
+from vlatool.graph.qdq import quantize_weight
+from vlatool.machine.instruction_sets import saturates
+from vlatool.quantize._base import REDUCE_RANGE, REDUCED, Quantization, quiet_quantizer, reduced_on_this_host
 from vlatool.runtime.engines import build_tool
 from vlatool.stage.base import Context, source_of
+from vlatool.weights.pairs import largest_sums
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from vlatool.hardware.profile import Profile
 
 OPS = ("MatMul", "Gemm")
+CODES, SCALES = "_quantized", "_scale"
+"""Endings of the names that ONNX Runtime's quantizer gives to what it stores of a weight."""
 
 
 class DynamicInt8(Quantization):
@@ -27,7 +38,7 @@ class DynamicInt8(Quantization):
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
 
     per_channel: bool = Field(True, description="one weight scale for each output channel")
-    reduce_range: bool = Field(False, description="7-bit weights, for x86 processors without VNNI")
+    reduce_range: bool = Field(False, description=REDUCE_RANGE)
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Quantize every selected graph."""
@@ -53,9 +64,38 @@ class DynamicInt8(Quantization):
                 scratch / "model.onnx",
                 op_types_to_quantize=list(OPS),
                 per_channel=self.per_channel,
-                reduce_range=self.reduce_range,
                 weight_type=quantization.QuantType.QInt8,
                 nodes_to_exclude=[*excluded, *(f"{name}_MatMul" for name in excluded)],
                 extra_options={"MatMulConstBOnly": True},
             )
-            save(load(scratch / "model.onnx"), target)
+            quantized = load(scratch / "model.onnx")
+            if self.reduce_range:
+                self._fit_pairs(quantized, OnnxGraph(model))
+            save(quantized, target)
+
+    def _fit_pairs(self, quantized: Any, original: OnnxGraph) -> None:
+        """Replace the codes of weights and their scales by those of which no pair saturates, in place."""
+        graph = OnnxGraph(quantized)
+        for name in [name.removesuffix(CODES) for name in graph.constants if name.endswith(CODES)]:
+            values = original.array(name)
+            last = values.ndim - 1
+            axis = last if graph.constants[f"{name}{SCALES}"].dims else None
+            codes, scales = quantize_weight(values, axis, name, sums=largest_sums(values, "MatMul", last))
+            for ending, array in ((CODES, codes), (SCALES, scales)):
+                tensor = graph.constants[f"{name}{ending}"]
+                stored = graph.onnx.numpy_helper.from_array(array.reshape(tuple(tensor.dims)), tensor.name)
+                tensor.CopyFrom(stored)
+
+    def on_this_host(self) -> Self:
+        """Write weights that do not saturate where this host would."""
+        return reduced_on_this_host(self, "")
+
+    def on(self, profile: Profile) -> Self:
+        """Write weights that do not saturate where the board would."""
+        if "reduce_range" in self.model_fields_set or not saturates(profile.units[profile.engines[profile.engine].unit].isa):
+            return self
+        return self.model_copy(update={"reduce_range": True})
+
+    def lines(self, bundle: Bundle) -> tuple[str, ...]:
+        """Say that the weights were made for processors without VNNI."""
+        return (REDUCED,) if self.reduce_range else ()

@@ -22,7 +22,8 @@ from vlatool.graph.layers import (
     split_gemm,
 )
 from vlatool.graph.qdq import Range, insert_qdq
-from vlatool.quantize._base import QUANTIZED_OPS, check_ops
+from vlatool.machine.instruction_sets import saturates
+from vlatool.quantize._base import QUANTIZED_OPS, REDUCE_RANGE, REDUCED, check_ops, reduced_on_this_host
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._conv1x1 import use_convolutions
 from vlatool.quantize._early import quantize_early
@@ -31,7 +32,15 @@ from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.quantize._ranges import Statistics, choose_range
 from vlatool.quantize._reductions import keep_axes
 from vlatool.quantize._trial_compile import open_apart
-from vlatool.runtime.engine import DEFAULT_ENGINE, Engine, Int8Layout, class_for, engine_class, layouts
+from vlatool.runtime.engine import (
+    DEFAULT_ENGINE,
+    STANDARD_LAYOUT,
+    Engine,
+    Int8Layout,
+    class_for,
+    engine_class,
+    layouts,
+)
 from vlatool.stage.base import Context, SampleSet, source_of
 
 if TYPE_CHECKING:
@@ -68,7 +77,7 @@ class StaticInt8(Calibrated):
         "(convolutions there always read uint8)",
     )
     per_channel: bool = Field(True, description="one weight scale for each output channel")
-    reduce_range: bool = Field(False, description="7-bit weights, for x86 processors without VNNI")
+    reduce_range: bool = Field(False, description=REDUCE_RANGE)
     layout: LayoutName = Field(
         "ort",
         description="ort: ONNX Runtime's integer MatMul; qdq: standard operators, for TensorRT; openvino: for OpenVINO",
@@ -112,8 +121,20 @@ class StaticInt8(Calibrated):
 
     def on(self, profile: Profile) -> Self:
         """Write the layout and the activations that the board's preferred engine takes."""
-        options = class_for(profile.engine).int8
+        options = dict(class_for(profile.engine).int8)
+        if saturates(profile.units[profile.engines[profile.engine].unit].isa):
+            options["reduce_range"] = True
         return self.model_copy(update={name: how for name, how in options.items() if name not in self.model_fields_set})
+
+    def on_this_host(self) -> Self:
+        """Write weights that do not saturate where this host would; the standard layout may be for any board."""
+        if self.layout == STANDARD_LAYOUT:
+            return self
+        return reduced_on_this_host(self, self.engine)
+
+    def lines(self, bundle: Bundle) -> tuple[str, ...]:
+        """Say that the weights were made for processors without VNNI."""
+        return (REDUCED,) if self.reduce_range else ()
 
     def used_packages(self) -> tuple[str, ...]:
         """The engine too that the layout is for."""

@@ -125,22 +125,35 @@ def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
 
 def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
     """Yield number, start and end of the fields of a message that have a length; others are passed over."""
+    return ((field, start, to) for field, start, to, number in fields(model, at, end) if number is None)
+
+
+def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int, int | None]]:
+    """Yield number, start, end and value of the fields of a message.
+
+    A number has its value, and no extent; a field with a length has an extent, and None. Numbers of fixed size, which
+    ONNX uses for floats alone, are passed over.
+    """
     while at < end:
         head = model[at : min(end, at + HEAD)]
         tag, used = varint(head, 0, 5)
         field, kind = tag >> 3, tag & 7
+        if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or tag >> 32:
+            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.")
         if kind == LENGTH:
             size, used = varint(head, used, 10)
             at += used
             if size > end - at:
                 raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.")
-            yield field, at, at + size
+            yield field, at, at + size, None
             at += size
         elif kind == VARINT:
-            at += varint(head, used, 10)[1]
-        elif kind in (FIXED32, FIXED64):
+            number, used = varint(head, used, 10)
+            at += used
+            yield field, at, at, number
+        else:
             at += used + (4 if kind == FIXED32 else 8)
-        if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or at > end or tag >> 32:
+        if at > end:
             raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.")
 
 

@@ -22,12 +22,14 @@ from vlatool.runtime.arguments import check_whole
 from vlatool.runtime.arithmetic import int8_trouble, machine
 from vlatool.runtime.contract import Outputs, allowed_mb, check_chunk, check_graphs, check_sizes, written_as_declared
 from vlatool.runtime.decoder import Decoder
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.engine import DEFAULT_ENGINE, FLOAT32, engine_class
 from vlatool.runtime.golden import GOLDEN_STEPS, golden_arrays, golden_chunks, golden_steps
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.program import Program, Session
 
+FLOAT_ROUNDING = 1e-3
+"""Relative difference of a golden action in float32 that sums in another order explain; seen up to 6e-7."""
 FIRST_RUN_S = 60.0
 """How long an inference of the warm-up may take before it is stopped: far more than a policy that a robot could use."""
 Array = NDArray[Any]
@@ -289,6 +291,18 @@ class Policy:
         manifest = self.bundle.manifest
         own = manifest.golden_tolerance or GOLDEN_TOLERANCE
         return own, manifest.golden_chunk_tolerance or own
+
+
+    @property
+    def golden_explained(self) -> float:
+        """Largest difference of a golden action that rounding explains.
+
+        What is rounded to few bits may differ as much as the manifest allows, which holds what the engine was seen to
+        differ by where the bundle was made.
+        """
+        floats = all(set(graph.precision) <= {FLOAT32} and graph.compute in ("", FLOAT32)
+                     for graph in self.bundle.manifest.graphs.values())  # fmt: skip
+        return min(FLOAT_ROUNDING, self.golden_tolerances[0]) if floats else self.golden_tolerances[0]
 
 
 def refuse_findings(bundle: Bundle, accept: Iterable[str] = ()) -> None:

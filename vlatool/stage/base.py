@@ -185,6 +185,10 @@ class Transform(Stage):
         """Return the stage with the options that a board needs; options that were given stay."""
         return self
 
+    def on_this_host(self) -> Self:
+        """Return the stage with the options that this host needs, where no board is named; given ones stay."""
+        return self
+
     def runs(self, source: Bundle | None) -> str:
         """Return whose code this stage runs on that source (``policy.py``); empty when only vlatool's own.
 

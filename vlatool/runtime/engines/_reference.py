@@ -10,6 +10,7 @@ the graph says. There the option that makes them exact is set, with the rewritin
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from vlatool.errors import require
@@ -23,7 +24,7 @@ class ReferenceSession(OrtCpuSession):
     optimized = False
 
     @staticmethod
-    def _option_sets(ort: Any, threads: int | None) -> list[Any]:
+    def _option_sets(ort: Any, threads: int | None, model: Path | bytes) -> list[Any]:
         """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
         exact_by_option = arithmetic.ort_exactness(ort, written=True) == arithmetic.EXACT_BY_OPTION
         option_sets = []

@@ -20,6 +20,7 @@ from vlatool.runtime.contract import Port, port
 from vlatool.runtime.engine import Engine, Int8Layout, Node, Profiled, Stages
 from vlatool.runtime.engines._ort_profile import OrtProfiled, precision
 from vlatool.runtime.stored_types import has_float8
+from vlatool.runtime.weight_pairs import weights_fit
 
 PROVIDER = "CPUExecutionProvider"
 CUT_OFF_REWRITES = ["ReluQuantRewrite", "ClipQuantRewrite"]
@@ -135,7 +136,7 @@ class OrtCpuSession(Engine):
     @classmethod
     def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
         """Open a session, with other options where the first break the graph; the first error is reported."""
-        first, *others = cls._option_sets(ort, threads)
+        first, *others = cls._option_sets(ort, threads, model)
         try:
             return _session(ort, model, first)
         except Exception:
@@ -145,14 +146,14 @@ class OrtCpuSession(Engine):
             raise
 
     @staticmethod
-    def _option_sets(ort: Any, threads: int | None) -> list[Any]:
+    def _option_sets(ort: Any, threads: int | None, model: Path | bytes) -> list[Any]:
         """Return the options to try, one after the other.
 
         Exact products of uint8 activations refuse a graph with int8 ones, which are exact as long as they stay int8.
-        And ONNX Runtime (1.31) takes float8 pairs around a MatMul for int8 ones and writes an integer product that has
-        no such type.
+        Weights that cannot saturate need no such option, which would make them slower. And ONNX Runtime (1.31) takes
+        float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type.
         """
-        saturates = arithmetic.ort_product(ort) < arithmetic.WANTED
+        saturates = arithmetic.ort_product(ort) < arithmetic.WANTED and not weights_fit(model)
         option_sets = []
         for entry in (*([arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]), arithmetic.UNFUSED):
             option_sets.append(session_options(ort, threads))
