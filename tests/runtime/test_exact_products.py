@@ -1,5 +1,7 @@
-"""Weights that fit in pairs are multiplied exactly by every kernel, whatever the processor: with the largest activations,
-and sums of neighbours that are as large as allowed."""
+"""Weights that fit in pairs are multiplied exactly by every kernel, whatever the processor.
+
+With the largest activations, and sums of neighbours that are as large as allowed.
+"""
 
 from pathlib import Path
 
@@ -25,9 +27,12 @@ g (float[1,{inner},9,9] x) => (float[1,{columns},N,M] y) {{
   q = QuantizeLinear(x, one, zero)  d = DequantizeLinear(q, one, zero)  v = DequantizeLinear(w, one)
   {rest}
 }}"""
-PLAIN, QUANTIZED = "y = Conv(d, v)", """c = Conv(d, v)  r = QuantizeLinear(c, step, half)  y = DequantizeLinear(r, step, half)"""
+PLAIN, QUANTIZED = (
+    "y = Conv(d, v)",
+    """c = Conv(d, v)  r = QuantizeLinear(c, step, half)  y = DequantizeLinear(r, step, half)""",
+)
 MEETS = [0, 127, 127, 0, -127, 0, 0, -127]
-"""Weights whose neighbours fit, and of which two would saturate if the first were the second of a pair; their sum is 0."""
+"""Weights whose neighbours fit, and of which two would saturate if the first were the second of a pair; they cancel."""
 
 
 def extreme(kind: str, shape: tuple[int, ...], axis: int, seed: int) -> np.ndarray:

@@ -83,7 +83,9 @@ def test_weights_within_a_branch_count() -> None:
 
 def test_two_weights_of_one_name_are_not_told_apart() -> None:
     branch = helper.make_graph([product("MatMul")], "b", [], [], [numpy_helper.from_array(FITS, "w")])
-    assert not weights_fit(model_of(helper.make_node("If", ["f"], ["c"], then_branch=branch), product("MatMul"), w=FITS))
+    assert not weights_fit(
+        model_of(helper.make_node("If", ["f"], ["c"], then_branch=branch), product("MatMul"), w=FITS)
+    )
 
 
 def test_a_graph_without_int8_weights_has_none_that_fit() -> None:
@@ -110,7 +112,9 @@ def test_what_is_no_graph_is_an_error() -> None:
         weights_fit(b"\x3a\xff\xff\xff\xff\x0f")
 
 
-def test_a_quantized_bundle_fits_when_it_was_asked_to(int8_bundle: Bundle, float_bundle: Bundle, tmp_path: Path) -> None:
+def test_a_quantized_bundle_fits_when_it_was_asked_to(
+    int8_bundle: Bundle, float_bundle: Bundle, tmp_path: Path
+) -> None:
     from vlatool.quantize.dynamic_int8 import DynamicInt8
     from vlatool.quantize.static_int8 import StaticInt8
     from vlatool.stage.base import Context

@@ -93,8 +93,8 @@ def _golden(policies: Sequence[PolicyRun]) -> Iterator[Finding]:
         if error is not None and error > policy.golden_explained:
             yield Finding(
                 "suspect",
-                f"the golden action of {policy.name} is off by {error:.2g} (relative) on this machine; rounding explains "
-                f"{policy.golden_explained:.2g}",
+                f"the golden action of {policy.name} is off by {error:.2g} (relative) on this machine; rounding "
+                f"explains {policy.golden_explained:.2g}",
                 "see what its engine and processor compute in: vlatool explain, vlatool doctor",
             )
         if policy.engines and policy.answers is None:

@@ -43,8 +43,8 @@ REDUCE_RANGE = (
     "1.4 times as large; set where the board of --profile, or without one this host, is such a processor"
 )
 REDUCED = (
-    "weights: no pair of products saturates on processors without VNNI (--no-reduce-range: all 8 bits, which are slower "
-    "there in ONNX Runtime and wrong in OpenVINO)"
+    "weights: no pair of products saturates on processors without VNNI (--no-reduce-range: all 8 bits, which are "
+    "slower there in ONNX Runtime and wrong in OpenVINO)"
 )
 FLOATS = ("float64", "float32", "float16")
 """Precisions of a graph that is not quantized yet."""

@@ -92,7 +92,8 @@ class DynamicInt8(Quantization):
 
     def on(self, profile: Profile) -> Self:
         """Write weights that do not saturate where the board would."""
-        if "reduce_range" in self.model_fields_set or not saturates(profile.units[profile.engines[profile.engine].unit].isa):
+        features = profile.units[profile.engines[profile.engine].unit].isa
+        if "reduce_range" in self.model_fields_set or not saturates(features):
             return self
         return self.model_copy(update={"reduce_range": True})
 

@@ -125,14 +125,14 @@ def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
 
 def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
     """Yield number, start and end of the fields of a message that have a length; others are passed over."""
-    return ((field, start, to) for field, start, to, number in fields(model, at, end) if number is None)
+    return ((field, start, to) for field, start, to, number in fields(model, at, end) if number < 0)
 
 
-def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int, int | None]]:
+def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int, int]]:
     """Yield number, start, end and value of the fields of a message.
 
-    A number has its value, and no extent; a field with a length has an extent, and None. Numbers of fixed size, which
-    ONNX uses for floats alone, are passed over.
+    A number has its value, and an empty extent; a field with a length has its extent, and -1. Numbers of fixed size,
+    which ONNX uses for floats alone, are passed over.
     """
     while at < end:
         head = model[at : min(end, at + HEAD)]
@@ -145,7 +145,7 @@ def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, in
             at += used
             if size > end - at:
                 raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.")
-            yield field, at, at + size, None
+            yield field, at, at + size, -1
             at += size
         elif kind == VARINT:
             number, used = varint(head, used, 10)

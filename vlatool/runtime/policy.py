@@ -292,7 +292,6 @@ class Policy:
         own = manifest.golden_tolerance or GOLDEN_TOLERANCE
         return own, manifest.golden_chunk_tolerance or own
 
-
     @property
     def golden_explained(self) -> float:
         """Largest difference of a golden action that rounding explains.

@@ -120,7 +120,9 @@ def _order(node: _Node, names: tuple[str, ...], rank: int) -> tuple[str, int] | 
 
 
 def _node(model: bytes | OpenFile, start: int, end: int) -> _Node:
-    inputs, outputs, operator, transposed = [], [], "", False
+    inputs: list[str] = []
+    outputs: list[str] = []
+    operator, transposed = "", False
     for field, at, to, _ in fields(model, start, end):
         if field in (INPUT, OUTPUT):
             (inputs if field == INPUT else outputs).append(_text(model, at, to))
@@ -147,7 +149,7 @@ def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, _Weight
     name, dtype, place = "", 0, (0, 0)
     for field, at, to, number in fields(model, start, end):
         if field == DIMS:
-            shape += [number] if at == to else list(_packed(model, at, to))
+            shape += [number] if number >= 0 else list(_packed(model, at, to))
         elif field == DATA_TYPE:
             dtype = number
         elif field == TENSOR_NAME:

@@ -3,11 +3,11 @@
 Such a processor multiplies unsigned activations with signed weights in pairs and adds both products in 16 bits, with
 saturation (``vpmaddubsw``). Both activations may be 255, so a pair is exact for all activations when the sum of its two
 weights fits into int8: 255 x 128 = 32,640 is the most that 16 bits hold. Weights of 7 bits keep to that, each alone.
-Held against the sum of the pair instead, weights may use all 8 bits, since two large neighbours of one sign are rare: of
-768 normally distributed weights the steps are 1.35 times as large as those of 8 bits, where 7 bits double them.
+Held against the sum of the pair instead, weights may use all 8 bits, since two large neighbours of one sign are rare:
+of 768 normally distributed weights the steps are 1.35 times as large as those of 8 bits, where 7 bits double them.
 
-Which weights are neighbours is a matter of the kernel. Products add up along the inner axis; convolutions of both engines
-add up all channels of a kernel position, then those of the next one.
+Which weights are neighbours is a matter of the kernel. Products add up along the inner axis; convolutions of both
+engines add up all channels of a kernel position, then those of the next one.
 """
 
 from __future__ import annotations
