@@ -39,6 +39,7 @@ def test_a_board_with_onnx_runtime_alone_gets_its_variants() -> None:
         "static_int8",
         "static_int8_mse",
         "static_int8_attention",
+        "static_int8_elementwise",
     }
     assert set(variants_for(load_profile("raspberry-pi-5"), calibrated=False)) == {"dynamic_int8"}
 
@@ -164,7 +165,7 @@ def test_finalists_are_the_fastest_inside_and_the_most_accurate(search) -> None:
     run.trials = [
         Trial("a", BAD, 4.0, 0.04, True),
         Trial("b", BAD, 3.9, 0.03, True),
-        Trial("c", BAD, 5.0, 0.09, False),
+        Trial("c", BAD, 5.0, 0.2, False),
         Trial("d", BAD, 1.5, 0.01, True),
         Trial("e", BAD, 0.5, 0.001, True),
     ]
@@ -188,8 +189,63 @@ def test_a_board_without_vnni_also_tries_products_that_do_not_saturate(tmp_path:
     text = (Path(__file__).parents[2] / "profiles/intel-nuc-13-pro.yaml").read_text(encoding="utf-8")
     (tmp_path / "board.yaml").write_text(text.replace("[avx2, fma, f16c, avx_vnni]", isa), encoding="utf-8")
     found = variants_for(load_profile(tmp_path / "board.yaml"), calibrated=True)
-    assert ("openvino_int8_reduced" in found) is tried
+    for name, (stage,) in found.items():
+        ((_, options),) = stage.items()
+        assert options.get("reduce_range", False) is (tried and name != "static_int8_all_bits"), name
     assert "openvino_int8" in found, "int8 is tried, though it may lose"
+    assert ("static_int8_all_bits" in found) is tried
+
+
+@pytest.fixture
+def made_of(search, monkeypatch):
+    """A search whose plans are as fast and as wrong as a table says of their options."""
+
+    def start(figures: dict[str, tuple[float, float]], budget: float) -> Search:
+        def fake(self: Search, name: str, stages: Any) -> Trial:
+            ((_, options),) = stages[-1].items()
+            speedup, error = figures["+".join(sorted(options))]
+            self.trials.append(Trial(name, stages, speedup, error, error <= 0.9 * budget))
+            return self.trials[-1]
+
+        monkeypatch.setattr(Search, "_try", fake)
+        run = search(metric="relative_error", max_metric=budget)
+        for options in ({}, {"method": "mse"}, {"attention": True}, {"elementwise": True}):
+            ending = "".join(f"_{value if value is not True else key}" for key, value in options.items())
+            run._try(f"int8{ending}", ({"quantize.static_int8": options},))
+        for base in list(run.trials):
+            run._combine(base)
+        return run
+
+    return start
+
+
+ALONE = {"": (2.0, 0.030), "method": (2.0, 0.028), "attention": (2.4, 0.045), "elementwise": (1.5, 0.031)}
+
+
+def test_options_that_gain_something_alone_are_tried_together(made_of) -> None:
+    run = made_of({**ALONE, "attention+method": (2.4, 0.038)}, 0.04)
+    assert [trial.name for trial in run.trials[4:]] == ["int8_attention_mse"]
+    assert [trial.name for trial in run._finalists()][:1] == ["int8_attention_mse"], "above 0.9 of the budget, below it"
+    assert run.trials[1] in run._finalists(), "a plan that is safely inside stays"
+
+
+def test_of_three_the_one_that_costs_most_is_left_out_again(made_of) -> None:
+    three = {**ALONE, "elementwise": (2.2, 0.06), "attention+elementwise+method": (2.8, 0.08)}
+    run = made_of({**three, "attention+method": (2.4, 0.038)}, 0.04)
+    assert [trial.name for trial in run.trials[4:]] == ["int8_attention_elementwise_mse", "int8_attention_mse"]
+
+
+def test_a_way_to_choose_ranges_that_is_no_more_accurate_is_not_combined(made_of) -> None:
+    run = made_of({**ALONE, "method": (2.1, 0.031)}, 0.04)
+    assert len(run.trials) == 4
+
+
+def test_finalists_reach_a_hair_beyond_the_budget_and_hold_a_plan_inside(search) -> None:
+    run = search(metric="relative_error", max_metric=0.1)
+    run.trials = [Trial(str(number), BAD, speed, error, error <= 0.09) for number, (speed, error) in enumerate(
+        [(4.0, 0.12), (3.9, 0.104), (3.8, 0.099), (3.7, 0.095), (3.0, 0.08), (2.0, 0.02)]
+    )]  # fmt: skip
+    assert [trial.name for trial in run._finalists()] == ["1", "2", "3", "4", "5"]
 
 
 def test_engines_that_cannot_be_compared_have_finalists_of_their_own(search) -> None:
@@ -197,7 +253,7 @@ def test_engines_that_cannot_be_compared_have_finalists_of_their_own(search) -> 
     run.trials = [
         Trial("a", BAD, 4.0, 0.04, True, "", "ort_cpu"),
         Trial("b", BAD, 0.7, 0.03, True, "", "openvino"),
-        Trial("c", BAD, 0.6, 0.09, False, "", "openvino"),
+        Trial("c", BAD, 0.6, 0.2, False, "", "openvino"),
         Trial("d", BAD, 2.0, 0.05, True, "", "ort_cpu"),
     ]
     assert [trial.name for trial in run._finalists()] == ["a", "b"]
@@ -236,7 +292,7 @@ def test_a_trial_is_timed_against_float32_in_its_own_engine_where_engines_are_ap
     run = search(metric="relative_error", max_metric=0.5)
     run._apart = True
     own = run._try("own", ({"quantize.dynamic_int8": {}},))
-    other = run._try("other", ({"quantize.static_int8": {"samples": 8, "layout": "openvino"}},))
+    other = run._try("other", ({"quantize.static_int8": {"samples": 8, "layout": "openvino", "reduce_range": True}},))
     assert seen == {"quantize.dynamic_int8": "ort_cpu", "quantize.static_int8": "openvino"}
     assert (own.engine, other.engine) == ("ort_cpu", "openvino")
     assert own.speedup > 0

@@ -17,6 +17,7 @@ from vlatool.cli._plan import plan_document
 from vlatool.cli._torchrun import launch_for
 from vlatool.errors import UsageError
 from vlatool.files.outputs import BUNDLE
+from vlatool.machine.host import isa
 from vlatool.report import REPORT
 from vlatool.runtime.engine import DEFAULT_ENGINE
 
@@ -153,7 +154,8 @@ def _recipe(
 
     if file is None:
         engine = board.engine if board else DEFAULT_ENGINE
-        return default_recipe(Limits(**limits), Effort(**effort), brings_calibration(source), engine)
+        features = board.units[board.engines[engine].unit].isa if board else isa() or ()
+        return default_recipe(Limits(**limits), Effort(**effort), brings_calibration(source), engine, features)
     recipe = read_recipe(file)
     update = {"limits": recipe.limits.model_copy(update=limits), "effort": recipe.effort.model_copy(update=effort)}
     return recipe.model_copy(update=update)

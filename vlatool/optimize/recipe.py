@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from vlatool.errors import RecipeError, require
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
+from vlatool.machine.instruction_sets import saturates
 from vlatool.runtime.engine import DEFAULT_ENGINE, class_for
 
 StageList = tuple[dict[str, dict[str, Any]], ...]
@@ -103,7 +105,9 @@ class Recipe(Numeric):
         return text
 
 
-def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str = DEFAULT_ENGINE) -> Recipe:
+def default_recipe(
+    limits: Limits, effort: Effort, calibrated: bool, engine: str = DEFAULT_ENGINE, features: Collection[str] = ()
+) -> Recipe:
     """Return the candidates that are tried when the user names none.
 
     Args:
@@ -112,12 +116,14 @@ def default_recipe(limits: Limits, effort: Effort, calibrated: bool, engine: str
         calibrated: Whether the policy brings calibration data, without which static quantization is impossible.
         engine: The engine of the board. One that is searched brings its own plans; others get standard QDQ operators
             with symmetric int8, as does one that vlatool does not run.
+        features: Of the processor that it runs on, as ``/proc/cpuinfo`` names them: whether int8 products saturate.
     """
     library = class_for(engine)
-    own, layout = library.searched, dict(library.int8)
+    weights = {"reduce_range": True} if saturates(features) else {}
+    own, layout = library.searched, {**library.int8, **weights}
     candidates: dict[str, StageList] = {}
     if own or not calibrated:
-        candidates["dynamic_int8"] = ({"quantize.dynamic_int8": {}},)
+        candidates["dynamic_int8"] = ({"quantize.dynamic_int8": dict(weights)},)
     if calibrated:
         candidates["static_int8"] = ({"quantize.static_int8": layout},)
         if not own:

@@ -2,10 +2,12 @@
 
 1. Every **variant** (an engine, a method, a compute dtype) is built and tried: a few timed inferences in turns with
    float32, and its error on calibration observations.
-2. Where variants faster than the best one inside the budget miss the budget, the layers that cost the accuracy are
+2. Options that gain something alone are **combined**; what was measured of each alone decides which.
+3. Where variants faster than the best one inside the budget miss the budget, the layers that cost the accuracy are
    found by running each alone in int8, and left in float in growing numbers until the budget is kept (a mixed-precision
    plan).
-3. The fastest few inside the budget become candidates, which ``optimize`` measures in full.
+4. The fastest few inside the budget, and those that miss it by a hair on calibration observations, become candidates,
+   which ``optimize`` measures in full.
 
 Each trial is a cached stage: an interrupted search goes on where it was.
 """
@@ -47,6 +49,13 @@ CALIBRATION = "data/calibration.npz"
 FINALISTS = 3
 FINE = 0.9
 """Share of the budget that a plan may use on calibration observations: those that it is judged on are others."""
+NEAR = 1.05
+"""Share of the budget up to which a fast plan is evaluated in full, though it misses the budget on calibration
+observations."""
+SLOWER = 0.97
+"""Share of a plan's speed that an option must keep to be combined with others: the noise of a few inferences."""
+COMBINED = 3
+"""Combinations of options that are tried for one plan, at most."""
 ROUNDS = 5
 """Plans that are tried for one variant, at most."""
 SECONDS = 120.0
@@ -117,6 +126,8 @@ class Search:
         self._planned = len(variants) + 2 * ROUNDS
         for name, stages in variants.items():
             self._try(name, stages)
+        for base in list(self.trials):
+            self._combine(base)
         self._repair()
         chosen = self._finalists()
         return {trial.name: trial.stages for trial in chosen if trial.name not in candidates}
@@ -179,6 +190,36 @@ class Search:
         error = self.budget.of(row)
         return math.inf if error is None or not error.known else error.value
 
+    def _combine(self, base: Trial) -> None:
+        """Try the options that gain something over a plan together, then without those that cost most accuracy."""
+        useful = {trial.name: (trial, extra) for trial, extra in self._extended(base) if _useful(base, trial, extra)}
+        chosen = sorted(useful.values(), key=lambda one: one[0].error)
+        for _ in range(COMBINED):
+            if len(chosen) < 2:
+                return
+            ((name, options),) = base.stages[-1].items()
+            together = {**options, **{key: value for _, extra in chosen for key, value in extra.items()}}
+            endings = sorted(trial.name.removeprefix(base.name) for trial, _ in chosen)
+            made = self._try(f"{base.name}{''.join(endings)}", (*base.stages[:-1], {name: together}))
+            if made.error <= NEAR * self.budget.value:
+                return
+            costly = [one for one in chosen if one[0].error > base.error]
+            if not costly:
+                return
+            chosen.remove(costly[-1])
+
+    def _extended(self, base: Trial) -> list[tuple[Trial, dict[str, Any]]]:
+        """Return the trials that are a plan with one option more, each with that option."""
+        ((name, options),) = base.stages[-1].items()
+        found = []
+        for trial in self.trials:
+            if trial.stages[:-1] != base.stages[:-1] or name not in trial.stages[-1] or not base.speedup:
+                continue
+            extra = {key: value for key, value in trial.stages[-1][name].items() if options.get(key) != value}
+            if len(extra) == 1 and options.items() <= trial.stages[-1][name].items():
+                found.append((trial, extra))
+        return found
+
     def _repair(self) -> None:
         """Leave sensitive layers in float where a plan is fast enough to be worth it, but outside the budget."""
         for trial in sorted(self.trials, key=lambda trial: -trial.speedup):
@@ -187,7 +228,7 @@ class Search:
             if trial.within or trial.speedup <= 1.05 * best or not math.isfinite(trial.error):
                 continue
             stage = transforms(trial.stages)[-1]
-            if isinstance(stage, StaticInt8) and not stage.elementwise and not stage.attention:
+            if isinstance(stage, StaticInt8):
                 self._mix(trial, stage)
 
     def _mix(self, trial: Trial, stage: StaticInt8) -> None:
@@ -227,6 +268,7 @@ class Search:
         from vlatool.sensitivity.layers import sensitivities
 
         if self._layers is None:
+            stage = stage.model_copy(update={"attention": False, "elementwise": False})
             chosen = self._observations[:: max(1, len(self._observations) // SAMPLES)][:SAMPLES]
             self._layers = sensitivities(self.baseline, stage, None, chosen, self.context, seconds=SECONDS)
         return self._layers
@@ -239,12 +281,23 @@ class Search:
 
     def _finalists_of(self, timed: list[Trial]) -> list[Trial]:
         """Return the fastest plans inside the budget, or the nearest to it when none is inside."""
-        inside = sorted((trial for trial in timed if trial.within), key=lambda trial: -trial.speedup)
-        if not inside:
+        fastest = sorted(timed, key=lambda trial: -trial.speedup)
+        near = [trial for trial in fastest if trial.error <= NEAR * self.budget.value]
+        if not near:
             return sorted(timed, key=lambda trial: trial.error)[:1]
-        fast = [trial for trial in inside if trial.speedup >= 0.8 * inside[0].speedup][:FINALISTS]
-        accurate = min(inside, key=lambda trial: trial.error)
-        return fast if accurate in fast or accurate.speedup < 1.0 else [*fast, accurate]
+        fast = [trial for trial in near if trial.speedup >= 0.8 * near[0].speedup][:FINALISTS]
+        inside = [trial for trial in near if trial.within]
+        safe = inside[:1] if not any(trial.within for trial in fast) else []
+        accurate = min(near, key=lambda trial: trial.error)
+        slow = accurate in fast or accurate in safe or accurate.speedup < 1.0
+        return [*fast, *safe, *([] if slow else [accurate])]
+
+
+def _useful(base: Trial, trial: Trial, extra: Mapping[str, Any]) -> bool:
+    """Return whether an option gains something: a way to choose ranges is more accurate, another one not slower."""
+    if trial.speedup < SLOWER * base.speedup:
+        return False
+    return trial.error < base.error if "method" in extra else trial.speedup > 0
 
 
 def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageList]:

@@ -29,7 +29,7 @@ INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "int8": {}, "int8_mse": {"method": "mse"}, "int8_attention": {"attention": True},
     "int8_elementwise": {"elementwise": True},
 }  # fmt: skip
-"""Name -> options of the int8 plans that a search begins with."""
+"""Name -> options of the int8 plans that a search begins with, and combines."""
 GRACE_MS = 1000
 """How long a run that is cancelled may take to end."""
 HINTS = {"": "f32", "float32": "f32", "bfloat16": "bf16"}
@@ -207,20 +207,19 @@ class OpenvinoSession(Engine):
         """Return bfloat16 where the processor has it, and int8 with what is not quantized in that.
 
         With matrix units (AMX) products are written as convolutions, too, as ``quantize._conv1x1`` says; where int8
-        products saturate, there is a plan of 7 bits.
+        products saturate, weights are such that none does.
         """
         plans: dict[str, Stages] = {}
         forms: dict[str, dict[str, Any]] = {"": {}, "_convolutions": {"convolutions": True}} if has(*AMX) else {"": {}}
         bfloat16 = has(*BF16)
         for form, how in forms.items() if bfloat16 else ():
             plans[f"openvino_bf16{form}"] = ({"quantize.bfloat16": how},)
-        rest = {"compute": "bfloat16"} if bfloat16 else {}
+        rest: dict[str, Any] = {"compute": "bfloat16"} if bfloat16 else {}
+        rest |= {"reduce_range": True} if has("avx2") and not has(*VNNI) else {}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
             for form, how in forms.items() if name == "int8" else list(forms.items())[-1:]:
                 stage = {"layout": "openvino", **rest, **how, **options}
                 plans[f"openvino_{name}{form}"] = ({"quantize.static_int8": stage},)
-        if calibrated and has("avx2") and not has(*VNNI):
-            plans["openvino_int8_reduced"] = ({"quantize.static_int8": {"layout": "openvino", "reduce_range": True}},)
         return plans
 
     @classmethod

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
+from vlatool.machine.host import VNNI
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port, port
 from vlatool.runtime.engine import Engine, Int8Layout, Node, Profiled, Stages
@@ -41,8 +42,10 @@ IGNORED_PROVIDERS = ("AzureExecutionProvider",)
 """ONNX Runtime lists it beside the processor in every build; it runs nothing on this machine."""
 X86 = ("x86_64", "AMD64")
 SIGNED_PRODUCT = "int8 x int8 on x86: ONNX Runtime's fast kernel takes uint8 x int8 (activations: uint8)"
-INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {"": {}, "_mse": {"method": "mse"}, "_attention": {"attention": True}}
-"""Ending of a plan's name -> options of static int8 that a search begins with."""
+INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "": {}, "_mse": {"method": "mse"}, "_attention": {"attention": True}, "_elementwise": {"elementwise": True},
+}  # fmt: skip
+"""Ending of a plan's name -> options of static int8 that a search begins with, and combines."""
 
 
 class OrtCpuSession(Engine):
@@ -181,10 +184,18 @@ class OrtCpuSession(Engine):
 
     @classmethod
     def variants(cls, has: Callable[..., bool], calibrated: bool) -> dict[str, Stages]:
-        """Return int8 at run time, and with ranges from a recording: plain, by their error, attention too."""
-        plans: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": {}},)}
+        """Return int8 at run time, and with ranges from a recording: plain, by their error, attention too.
+
+        Where int8 products saturate, weights are such that none does; all 8 bits, which take an exact mode, are one
+        more plan.
+        """
+        saturates = has("avx2") and not has(*VNNI)
+        weights = {"reduce_range": True} if saturates else {}
+        plans: dict[str, Stages] = {"dynamic_int8": ({"quantize.dynamic_int8": dict(weights)},)}
         for name, options in INT8_VARIANTS.items() if calibrated else ():
-            plans[f"static_int8{name}"] = ({"quantize.static_int8": dict(options)},)
+            plans[f"static_int8{name}"] = ({"quantize.static_int8": {**weights, **options}},)
+        if calibrated and saturates:
+            plans["static_int8_all_bits"] = ({"quantize.static_int8": {"reduce_range": False}},)
         return plans
 
     @classmethod
