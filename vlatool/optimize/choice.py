@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from vlatool.optimize.evidence import TIE
 from vlatool.optimize.judge import Judged, p50
 from vlatool.report import Row
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
 
-TIE = 1.05
 LEAST = 1.005
 """Ratio of the medians from which on two decimals do not say 1.00."""
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,24 @@ from vlatool.data import EVALUATION
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
 from vlatool.evaluate.recorded import Recorded, carries_recordings
+from vlatool.optimize.budget import distance_of
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
 from vlatool.stage.run import cached_measure
 
+TIE = 1.05
+"""Candidates whose latencies differ by less are equally fast: timing noise cannot tell them apart."""
+Enough = Callable[[Row, Row], bool]
+"""A candidate's row and float32's, both with their episodes -> whether no slower candidate can be chosen any more."""
+
 
 def with_accuracy(
-    rows: Mapping[str, Row], bundles: Mapping[str, Bundle], loop: ClosedLoop | None, cache: Path, context: Context
+    rows: Mapping[str, Row],
+    bundles: Mapping[str, Bundle],
+    loop: ClosedLoop | None,
+    cache: Path,
+    context: Context,
+    enough: Enough | None = None,
 ) -> dict[str, Row]:
     """Return the rows with what recordings and episodes say of them.
 
@@ -28,27 +40,56 @@ def with_accuracy(
         loop: The episodes; None for recordings alone.
         cache: Where measurements are kept.
         context: Progress and workers.
+        enough: Ends the episodes: candidates play in the order in which they would be chosen. All play when None.
 
     Raises:
         DataError: when the recordings or the environment cannot be used.
     """
     (base, baseline), *_ = bundles.items()
-    success: dict[str, Row] = {}
-    evaluated: dict[str, Row] = {}
-    for name, bundle in bundles.items():
-        row = rows[name]
-        evaluated[name] = replace(
-            row, measurements=(*row.measurements, *_recorded(bundle, baseline, loop, cache, context))
-        )
-        if loop is None:
+    evaluated = {
+        name: replace(row, measurements=(*row.measurements, *_recorded(bundles[name], baseline, loop, cache, context)))
+        for name, row in rows.items()
+    }
+    if loop is None:
+        return evaluated
+    own = cached_measure(loop, baseline, cache, context.about(base)).rows[-1]
+    evaluated[base] = _joined(evaluated[base], _with_controls(loop, baseline, own, cache, context))
+    others = [row for name, row in evaluated.items() if name != base]
+    found = ""
+    for row in others if enough is None else in_order(others):
+        if found:
+            reason = f"its episodes were not played: {found} keeps to the limits, and is faster or as fast and closer"
+            evaluated[row.name] = replace(row, reason=f"{reason} to float32 (--every-candidate plays all)")
             continue
-        success[name] = cached_measure(loop, bundle, cache, context.about(name)).rows[-1]
-        if name == base:
-            played = _with_controls(loop, bundle, success[name], cache, context)
-        else:
-            played = compare_success(success[base], success[name])
-        evaluated[name] = _joined(evaluated[name], played)
+        played = cached_measure(loop, bundles[row.name], cache, context.about(row.name)).rows[-1]
+        evaluated[row.name] = _joined(row, compare_success(own, played))
+        found = row.name if enough is not None and enough(evaluated[row.name], evaluated[base]) else ""
     return evaluated
+
+
+def in_order(rows: Sequence[Row]) -> list[Row]:
+    """Return candidates in the order in which they would be chosen if all kept to the limits.
+
+    Of those that are as fast as the fastest that is left, the one nearest to float32 on recorded observations is first.
+    """
+    left, ordered = list(rows), []
+    while left:
+        least = min(_latency(row) for row in left)
+        tied = [row for row in left if _latency(row) <= TIE * least] or left
+        first = min(tied, key=_distance)
+        ordered.append(first)
+        left.remove(first)
+    return ordered
+
+
+def _latency(row: Row) -> float:
+    latency = row.get("latency_p50")
+    return latency.value if latency is not None and latency.known else math.inf
+
+
+def _distance(row: Row) -> float:
+    distance = distance_of(row)
+    return distance.value if distance is not None and distance.known else math.inf
 
 
 def is_recorded(bundle: Bundle, loop: ClosedLoop | None) -> bool:

@@ -65,6 +65,8 @@ def judge(row: Row, baseline: Row, limits: Limits, profile: Profile | None, on_b
     if is_baseline:
         reason = "; ".join(rate.reasons) or "the reference"
         return Judged(replace(row, reason=reason), not rate.reasons, 0.0, rate.miss, (), rate.warnings)
+    if row.reason and baseline.get("success") is not None and row.get("success") is None:
+        return Judged(row, False, math.nan, math.inf)  # its episodes were not played, and the reason says why
     accuracy = _both(_judge_accuracy(row, decisive, limits), _judge_distance(row, decisive, limits))
     moves = judge_moves(row, limits)
     accuracy = _both(accuracy, _Verdict(moves.reasons, moves.miss, moves.warnings))

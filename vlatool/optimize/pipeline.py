@@ -24,9 +24,9 @@ from vlatool.files.writing import writing
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.optimize.budget import budget_of
-from vlatool.optimize.choice import choose, chosen_of
+from vlatool.optimize.choice import choose, chosen_of, is_faster
 from vlatool.optimize.choice_apart import choose_apart
-from vlatool.optimize.evidence import is_recorded, told_wrong, unjudged, with_accuracy
+from vlatool.optimize.evidence import Enough, is_recorded, told_wrong, unjudged, with_accuracy
 from vlatool.optimize.judge import Judged, judge
 from vlatool.optimize.made import candidate, chain
 from vlatool.optimize.plan import BASELINE, Plan, make_plan, transforms
@@ -38,7 +38,7 @@ from vlatool.optimize.timings import Timing, engine_of, foretold_by_engine, plac
 from vlatool.optimize.trained import trainings, with_trainings, with_wrong_instruction
 from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
-from vlatool.runtime.engine import DEFAULT_ENGINE
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
 from vlatool.stage.base import Context, Tell
 from vlatool.stage.controls import controls, predicted_for
 from vlatool.stage.finish import reseal
@@ -212,7 +212,7 @@ def _measured(
     """Return one row for each bundle with latency, memory, accuracy and predictions (baseline first), and warnings."""
     where = plan.board_set
     rows, warnings = Timing(plan.recipe.effort, where, plan.cache, context, plan.fresh).rows(source, bundles)
-    rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context)
+    rows = with_accuracy(rows, bundles, plan.closed_loop, plan.cache, context, _enough(plan))
     rows = {name: with_task_speedup(row) for name, row in rows.items()}
     rows = placed(rows, {name: engine_of(bundle) for name, bundle in bundles.items()}, where)
     warnings = (*warnings, *unjudged(bundles[BASELINE], plan.closed_loop, plan.cache, context))
@@ -221,6 +221,19 @@ def _measured(
         predicted = foretold_by_engine(plan.profile, bundles, where)
         rows = {name: replace(row, measurements=(*row.measurements, *predicted[name])) for name, row in rows.items()}
     return rows, warnings
+
+
+def _enough(plan: Plan) -> Enough | None:
+    """Return what ends the episodes: a candidate that keeps to the limits, where measured latencies decide."""
+    board = plan.profile.engine if plan.profile else DEFAULT_ENGINE
+    if plan.recipe.effort.every_candidate or plan.board_set.confined or board not in engine_names():
+        return None
+
+    def enough(row: Row, baseline: Row) -> bool:
+        judged = judge(with_task_speedup(row), baseline, plan.recipe.limits, plan.profile, plan.on_board)
+        return judged.within and is_faster(row, baseline)
+
+    return enough
 
 
 def judged_rows(

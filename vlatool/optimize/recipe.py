@@ -69,6 +69,9 @@ class Effort(Numeric):
     episodes: int = Field(200, ge=0, description="closed-loop episodes of each candidate; 0 for none")
     iterations: int = Field(200, ge=20, description="timed inferences of each candidate")
     threads: int = Field(1, ge=1, description="intra-op threads while timing")
+    every_candidate: bool = Field(
+        False, description="play the episodes of every candidate, also of those that a faster one rules out"
+    )
 
 
 class Pruning(Numeric):
