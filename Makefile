@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PYTHON310 ?= python3.10
 OUT ?= out
+SAMPLES := vln-babyai vla-metaworld vla-flow
 TORCH := torch==2.13.0
 SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
@@ -64,10 +65,10 @@ robot: wheels  ## run an int8 bundle as a robot would: Python 3.10, vlatool-runt
 	$(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
 
 python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundle under Python 3.10, without torch
-	$(BIN)/vlatool export sample_models/vln-babyai -o $(OUT)/python310/bundle --force
+	for sample in $(SAMPLES); do $(BIN)/vlatool export sample_models/$$sample -o $(OUT)/python310/$$sample --force || exit 1; done
 	@test -x $(OUT)/python310/venv/bin/python || $(PYTHON310) -m venv $(OUT)/python310/venv
 	$(OUT)/python310/venv/bin/python -m pip install --quiet --disable-pip-version-check -e '.[ort]' onnx onnxscript onnx-ir safetensors
-	$(OUT)/python310/venv/bin/python tests/robot/build_side.py $(OUT)/python310/bundle -o $(OUT)/python310/made
+	$(OUT)/python310/venv/bin/python tests/robot/build_side.py $(SAMPLES:%=$(OUT)/python310/%) -o $(OUT)/python310/made
 
 arm64: $(BIN)/vlatool  ## run both samples' bundles on emulated 64-bit ARM and compare with this host (ARM64="--cores cortex-a76": less of it)
 	$(BIN)/python tests/processors/arm64.py -o $(OUT)/processors $(ARM64)

@@ -12,6 +12,7 @@ import importlib
 import importlib.util
 import inspect
 import pkgutil
+import traceback
 from importlib import metadata
 from types import ModuleType
 
@@ -129,6 +130,19 @@ def owner(module_name: str) -> str:
     groups = (group for group in metadata.entry_points().groups if group.startswith("vlatool.") and top != "vlatool")
     entries = (entry for group in groups for entry in metadata.entry_points(group=group))
     return next((_title(entry) for entry in entries if entry.module.partition(".")[0] == top), "")
+
+
+def blamed(error: BaseException) -> str:
+    """Return which other package's code an exception came out of, the last before vlatool's own or a library's."""
+    frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    owners = [(name.partition(".")[0] == "vlatool", owner(name)) for name in frames]
+    return next((other for own, other in reversed(owners) if own or other), "")
+
+
+def complaint(package: str, kind: str, message: str) -> tuple[str, str]:
+    """Return message and fix of the error of another package whose code raised an exception."""
+    words = f"The package {package}, which adds to vlatool, fails: {kind}: {message}."
+    return words, "report it to its authors, with the traceback of VLATOOL_DEBUG=1"
 
 
 def _own(kind: str) -> list[str]:

@@ -7,7 +7,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.errors import GraphError
 from vlatool.runtime.external_data import SMALL
-from vlatool.runtime.stored_types import FLOAT8, has_float8
+from vlatool.runtime.stored_types import FLOAT8, has_float8, lacks_zero_point
 
 
 def tensor(dtype: int, size: int = 4) -> onnx.TensorProto:
@@ -71,3 +71,24 @@ def test_what_is_no_graph_or_too_deep_is_refused(tmp_path: Path) -> None:
         has_float8(nested(60))
     with pytest.raises(FileNotFoundError):
         has_float8(tmp_path / "none.onnx")
+
+
+@pytest.mark.parametrize(
+    ("kind", "inputs", "lacks"),
+    [
+        ("MatMulInteger", ["a", "w", "z"], True), ("MatMulInteger", ["a", "w", "", ""], True),
+        ("MatMulInteger", ["a", "w", "", "z"], True), ("MatMulInteger", ["a", "w", "y", "z"], False),
+        ("DequantizeLinear", ["w", "s"], True), ("DequantizeLinear", ["w", "s", "z"], False),
+        ("MatMul", ["a", "b"], False),
+    ],
+)  # fmt: skip
+def test_a_node_without_a_zero_point_is_found(tmp_path: Path, kind: str, inputs: list[str], lacks: bool) -> None:
+    many = [numpy_helper.from_array(np.zeros(SMALL, np.float32), f"MatMulInteger{number}") for number in range(3)]
+    model = model_of(graph_of(helper.make_node(kind, inputs, ["y"]), initializer=(*many,)))
+    (tmp_path / "model.onnx").write_bytes(model)
+    assert lacks_zero_point(model) is lacks
+    assert lacks_zero_point(tmp_path / "model.onnx") is lacks
+    within = graph_of(
+        helper.make_node("If", ["flag"], ["c"], then_branch=graph_of(helper.make_node(kind, inputs, ["y"])))
+    )
+    assert lacks_zero_point(model_of(within)) is lacks

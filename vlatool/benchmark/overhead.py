@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -36,6 +36,8 @@ class Overhead(Measure):
     overhead is the median over pairs of rounds of the difference of their medians. A second figure is the harder case:
     single calls of both kinds in turn, so that each finds the processor's caches as the other left them.
     """
+
+    runs_graphs: ClassVar[bool] = True
 
     iterations: int = Field(2000, ge=100, description="calls of each kind")
     threads: int = Field(1, ge=1, description="intra-op threads")

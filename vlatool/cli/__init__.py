@@ -15,6 +15,7 @@ import typer
 from vlatool.cli._commands import Commands
 from vlatool.cli._console import plain_warnings
 from vlatool.cli._document import Output, forget_kept, lost, output
+from vlatool.cli._early import start_early
 from vlatool.cli._failure import CLICK_EXCEPTION, INTERRUPTED, Failure, failure
 from vlatool.errors import refuse_two_distributions
 from vlatool.files.printable import printable
@@ -131,6 +132,8 @@ def main(arguments: list[str] | None = None) -> None:
     _end_on_signals()
     words = _with_trust_first(sys.argv[1:] if arguments is None else arguments)
     for_good = arguments is None
+    if for_good:
+        start_early(words)
     with output(words, for_good=for_good) as document:
         code = _run(words, document, for_good=for_good)
     unprinted = lost()

@@ -65,9 +65,8 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
     if isinstance(error, SystemExit):
         code = error.code if isinstance(error.code, int) else 1
         return Failure("Terminated", f"ended by signal {code - 128}." if code > 128 else "ended.", "", code)
-    if blamed := _plugin(error):
-        words = f"The package {blamed}, which adds to vlatool, fails: {type(error).__name__}: {message_of(error)}."
-        return Failure("PluginError", words, "report it to its authors, with the traceback of VLATOOL_DEBUG=1", INPUT)
+    if blamed := registry.blamed(error):
+        return Failure("PluginError", *registry.complaint(blamed, type(error).__name__, message_of(error)), INPUT)
     fix = "this is a bug in vlatool; run again with VLATOOL_DEBUG=1 and report the traceback"
     return Failure("InternalError", f"{type(error).__name__}: {message_of(error)}", fix, OUR_BUG)
 
@@ -75,13 +74,6 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
 def _printing(error: BaseException) -> bool:
     """Return whether an error is one of printing: it was raised in ``typer.echo``."""
     return [frame.f_code.co_name for frame, _ in traceback.walk_tb(error.__traceback__)][-1:] == ["echo"]
-
-
-def _plugin(error: BaseException) -> str:
-    """Return which other package's code an exception came out of, the last before vlatool's own or a library's."""
-    frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    owners = [(name.partition(".")[0] == "vlatool", registry.owner(name)) for name in frames]
-    return next((owner for own, owner in reversed(owners) if own or owner), "")
 
 
 def _usage(error: Any) -> Failure:

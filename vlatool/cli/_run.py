@@ -28,7 +28,7 @@ from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
 from vlatool.stage.controls import controls
-from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured_with, run_transform
+from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured, measured_with, run_transform
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -253,7 +253,7 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
     """Run a stage here; evaluate a bundle of OpenVINO in the board's instruction set, where this host has that."""
     engine = getattr(stage, "engine", "") or bundle.manifest.engine
     if board is None or stage.kind() != "evaluate" or engine != ENGINE:
-        return stage.run(bundle, context)
+        return measured(stage, bundle, context)
     computes = board_set(board)
     confine = {MAX_CPU_ISA: computes.to_set}
     report = measured_with(confine, stage, bundle, context) if computes.to_set else stage.run(bundle, context)

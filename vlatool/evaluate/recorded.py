@@ -25,6 +25,7 @@ from vlatool.machine.host import fingerprint
 from vlatool.report import Measurement, Report, Row
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context, Measure
+from vlatool.stage.tried import try_out
 from vlatool.stats.intervals import wilson
 
 if TYPE_CHECKING:
@@ -145,9 +146,10 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
     """Return the chunks of the policy: (N, T, A) float32 in physical units, or (N, T) int64.
 
     Raises:
-        GraphError: when this machine computes another golden action than recorded, or an inference takes longer than
-            ``FIRST_RUN_S``.
+        GraphError: when this machine computes another golden action than recorded, an inference takes longer than
+            ``FIRST_RUN_S``, or the engine crashes.
     """
+    try_out(bundle, engine)
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
     policy.warm_up(1)
     chunks = []

@@ -13,17 +13,19 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, require, require_present
+from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
 from vlatool.module.to_onnx import EXTERNAL_DATA_BYTES, exported_by_torch, name_by_module, strip_notes, weight_bytes
 from vlatool.module.torch_policy import TorchSession, load_modules
 from vlatool.runtime.contract import Outputs, check_chunk
+from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context, Transform, source_of
-from vlatool.stage.finish import carry_over, finish
+from vlatool.stage.finish import carry_over, finish, named
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -114,7 +116,8 @@ class ExportOnnx(Transform):
     def _compare(self, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any]) -> None:
         policy = Policy.open(exported, threads=1, seed=0)
         for number, (observation, reference) in enumerate(zip(observations, expected, strict=True)):
-            got = policy.infer(observation).outputs[exported.manifest.spec.action.name]
+            with risky(engine_class(policy.engine), f"ran {named(exported.manifest)}"):
+                got = policy.infer(observation).outputs[exported.manifest.spec.action.name]
             error = relative_error(got, reference)
             if not error <= self.tolerance:
                 raise GraphError(

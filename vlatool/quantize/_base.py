@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from pydantic import Field
 
@@ -53,6 +53,7 @@ FLOATS = ("float64", "float32", "float16")
 class Quantization(Transform):
     """Options that every quantization method has."""
 
+    runs_graphs: ClassVar[bool] = True
     include: tuple[str, ...] = Field((), description="globs of node names to quantize; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of node names to leave in float32")
     parts: tuple[str, ...] = Field(

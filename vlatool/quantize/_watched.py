@@ -11,7 +11,9 @@ from vlatool.data import Encoded
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
+from vlatool.machine.risky import risky
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
@@ -34,7 +36,9 @@ class Watcher:
         self.sample = 0
         self._outputs = [value.name for value in graph.graph.output]
         show(graph)
-        self._session = engine_class()(write_beside(graph.model, path, copy), 1)
+        self._about = f"the graph '{path.stem}' with further outputs"
+        with risky(engine_class(), f"opened {self._about}"):
+            self._session = engine_class()(write_beside(graph.model, path, copy), 1)
 
     def watch(self, feeds: Mapping[str, Any], values: Mapping[str, Any]) -> None:
         """Look at what one run was fed and gave."""
@@ -42,7 +46,8 @@ class Watcher:
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, look at the values, return the graph's own outputs."""
-        values = self._session.run(feeds)
+        with risky(engine_class(), f"ran {self._about}"):
+            values = self._session.run(feeds)
         self.watch(feeds, values)
         return {name: values[name] for name in self._outputs}
 
@@ -80,7 +85,7 @@ def run_watched(
         DataError: when an observation does not fit the spec, or a watcher refuses a value; names the sample.
     """
     graphs = bundle.manifest.graphs
-    others = {name: engine_class()(bundle.file(graphs[name].file), 1) for name in graphs if name not in watchers}
+    others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in watchers}
     policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
     policy.encode = _Passing(policy.encode)
     for place, observation in enumerate(observations):

@@ -12,6 +12,7 @@ import base64
 import functools
 import math
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,20 +20,22 @@ import numpy as np
 from vlatool.bundle.manifest import Manifest
 from vlatool.runtime.engine import UNKNOWN as UNKNOWN
 from vlatool.runtime.engine import engine_class
+from vlatool.runtime.stored_types import lacks_zero_point
 
 MODEL = (
-    "eNrtlD0OgkAQRneA6DIqGZfaQuw4go2EWBEpbO1QtiAxIIQfoZEDeECPI9JhvIG8ZJpvXv24Ltj2peMa4Y5qEkvUGpklAlLLOBZBnEeN"
-    "PESxDDLcIKQDJbRoL9OhtEKoeklA+eO9RAgRSgG1NfGD3C+uYnrLkrC45PaTc4cTqS5UXssfIyMjf4u9IHA/IfE0xtqdPSPF7bvjATuZ"
-    "Xa2EgXMOgqPCqTvn3I3110iuhozMN+NnLrw="
+    "eNrj4BRisHrNyaXIxVjBxZyfl8rFUpValC/EWKjEF1iamFeSWZXqk5mXmljEpczFWIiiJEVJwCW1EENROVRRHpAUYizDokiQizGFi7FMiLFSic03"
+    "scS3NEeIvaAoP6U0uUSrh4PDgUNAgNmJsdyrgaN+FIyCUTBigRavAKMTqDjxYmFgaLDX4hZgcgKXPl6MDEAOsxO4lAFyooSBBZgQHxcPB6MQBxcT"
+    "hwAQOyQBBSvRBAWcWLgYBIQBrr4zHA=="
 )
 """An ONNX model, compressed: float32 ``x`` (16, 64), quantized to uint8 in steps of 1, times int8 weights (64, 16) that
 are all 127, as ``y``."""
 WRITTEN = (
-    "eNrt1D0KwkAUBOC8GPDl+cO6Fgpapdwj2BjWymAKW7sVFlmQlSQbYtKYA3gIL+AdDZZewXwwzUw/GG7eIa0J7gQFQcMhi6bHUllnGn0wVqucVgQZ"
-    "QfVdTTRJlUvL6946fdE5LQgMhzoKdqpwIiTf3ZbwAp8Pq9w4p614IsbI2EBClbT46PV6f0uMGEgoksDz2q1A5ktoEvBO8+6C+JTGCBzJR9YlPndl"
-    "/VMyGZDHZh8iph5R"
+    "eNrtlD0OgkAUhBkk8fH8yboWWhgLSo5gI8FKooWtHSQbs4nBCEsQGjmAh/Acns6tvYJ8ySSTb/ohf/PxecV4MEpGK3EPpqcqzY1u1UHnKi14zbgz"
+    "arsyMgkdTI6pOVbXfW7URRW8YGiJJvB2aWlCn11zW+INVw7rQhuj8vBFFJEQgxh10tGzp6fnbwlHAjHKxHOcbhuScGO0CRzb7EFktp3n9o/klMcE"
+    "SeySsIkyK5sfKWKPHTH7AsvUIAM="
 )
-"""The same product, written as an integer operator (MatMulInteger), not as pairs around a float one."""
+"""The same product, written as an integer operator (MatMulInteger), not as pairs around a float one. In both,
+the weights have a zero point, without which ONNX Runtime up to 1.29 aborts with ``PRECISE`` (``breaks_precise``)."""
 SHAPE = (16, 64)
 WANTED = 255.0 * 127 * SHAPE[1]
 PRECISE = ("session.x64quantprecision", "1")
@@ -42,6 +45,8 @@ SIGNED = ("session.qdqisint8allowed", "1")
 uint8 otherwise, with which convolutions saturate where those of int8 are exact."""
 UNFUSED = ("session.disable_quant_qdq", "1")
 """The option of ONNX Runtime that leaves quantize/dequantize pairs what they say: float products of rounded values."""
+SETS_ZERO_POINTS = (1, 30)
+"""Release of ONNX Runtime from which on ``PRECISE`` adds a zero point where a node has none."""
 EXACT = "exact"
 EXACT_BY_OPTION = f"exact with {PRECISE[0]}={PRECISE[1]}, which is set; slower than on a processor with VNNI"
 SATURATING = "saturating: they are added in pairs of 16 bits"
@@ -55,6 +60,18 @@ def model(written: bool = False) -> bytes:
 def operand() -> Any:
     """Return the value of its input, with which every element of the product is ``WANTED``."""
     return np.full(SHAPE, 255, np.float32)
+
+
+def breaks_precise(ort: Any, model: Path | bytes) -> bool:
+    """Return whether ONNX Runtime would end the process where it opens a graph with the option ``PRECISE``.
+
+    Up to 1.29 that rewriting writes a zero point behind the end of a node's inputs where int8 weights have none: the
+    library stops with an assertion of ``vector::operator[]``.
+    """
+    release = str(getattr(ort, "__version__", "")).split(".")[:2]
+    if not all(part.isdigit() for part in release) or tuple(map(int, release)) >= SETS_ZERO_POINTS:
+        return False
+    return lacks_zero_point(model)
 
 
 @functools.lru_cache(maxsize=4)

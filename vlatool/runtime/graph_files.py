@@ -12,6 +12,7 @@ from vlatool.errors import BundleError
 from vlatool.files.limits import MIB
 from vlatool.files.sealed import open_inside
 from vlatool.files.typed import outside, shown
+from vlatool.machine.risky import risky
 from vlatool.runtime.external_data import OpenFile, external_files
 
 WHOLE = 4 * MIB
@@ -35,6 +36,11 @@ def open_graph(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads
             file that the manifest does not record.
         GraphError: when the engine refuses the graph.
     """
+    with risky(engine, f"opened the graph '{graph.file.rpartition('/')[2].removesuffix('.onnx')}'"):
+        return _opened(bundle, graph, engine, threads)
+
+
+def _opened(bundle: Bundle, graph: Graph, engine: Callable[..., Any], threads: int | None) -> Any:
     folder, _, name = graph.file.rpartition("/")
     path = bundle.path / graph.file
     record = bundle.manifest.files.get(graph.file)

@@ -1,11 +1,12 @@
-"""Whether an ONNX graph holds tensors of a type that needs other options: its bytes are walked, as for files."""
+"""Whether an ONNX graph holds tensors or nodes that need other options: its bytes are walked, as for files."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
-from vlatool.runtime.external_data import LENGTH, SMALL, VARINT, OpenFile, messages, varint
+from vlatool.runtime.external_data import LENGTH, SMALL, VARINT, OpenFile, messages, parts, varint
 
 FLOAT8 = (17, 18, 19, 20)
 """``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
@@ -13,6 +14,13 @@ DATA_TYPE = 2
 """Number of the field ``TensorProto.data_type``."""
 MARKS = tuple(bytes([DATA_TYPE << 3 | VARINT, code]) for code in FLOAT8)
 """How such a field begins: a message without these bytes holds no float8 tensor."""
+NODE_INPUT, NODE_TYPE = 1, 4
+"""Numbers of the fields ``NodeProto.input`` and ``NodeProto.op_type``."""
+WITH_ZERO_POINT = {
+    b"MatMulInteger": 4, b"DequantizeLinear": 3, b"MatMulIntegerToFloat": 6, b"DynamicQuantizeMatMul": 4, b"QGemm": 6,
+    b"QAttention": 8, b"DynamicQuantizeLSTM": 12,
+}  # fmt: skip
+"""Operator -> how many inputs it has where its weights have a zero point."""
 
 
 def has_float8(model: Path | bytes) -> bool:
@@ -30,13 +38,51 @@ def has_float8(model: Path | bytes) -> bool:
         >>> has_float8(b"")
         False
     """
+    return _asked(_holds, model)
+
+
+def lacks_zero_point(model: Path | bytes) -> bool:
+    """Return whether a node of a serialized ``ModelProto``, or of its file, has int8 weights without a zero point.
+
+    Types are not looked at: weights and values of other types may be found, too.
+
+    Raises:
+        GraphError, OSError: as ``has_float8``.
+
+    Example:
+        >>> lacks_zero_point(b"")
+        False
+    """
+    return _asked(_lacks, model)
+
+
+def _asked(question: Callable[[bytes | OpenFile], bool], model: Path | bytes) -> bool:
     if isinstance(model, bytes):
-        return _holds(model)
+        return question(model)
     handle = os.open(model, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        return _holds(OpenFile(handle))
+        return question(OpenFile(handle))
     finally:
         os.close(handle)
+
+
+def _lacks(model: bytes | OpenFile) -> bool:
+    nodes = (place for message, *place in messages(model, _may_compute) if message == "NodeProto")
+    return any(_short(model, start, end) for start, end in nodes)
+
+
+def _may_compute(model: bytes | OpenFile, start: int, end: int) -> bool:
+    """Return whether a message may have such a node in it: a large one may."""
+    return end - start > SMALL or any(name in model[start:end] for name in WITH_ZERO_POINT)
+
+
+def _short(model: bytes | OpenFile, start: int, end: int) -> bool:
+    inputs, kind = 0, b""
+    for field, at, to in parts(model, start, end):
+        inputs += field == NODE_INPUT and to > at
+        if field == NODE_TYPE:
+            kind = model[at : min(to, at + SMALL)]
+    return inputs < WITH_ZERO_POINT.get(kind, 0)
 
 
 def _holds(model: bytes | OpenFile) -> bool:

@@ -18,6 +18,7 @@ from vlatool.data import observations_for
 from vlatool.errors import GraphError, InputError, SourceError, nearest, require
 from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.precision import precision_shares
+from vlatool.machine.risky import risky
 from vlatool.module.description import FILE, Description, copy_assets, description_file, read_description
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
@@ -45,6 +46,7 @@ class OnnxFile(Source):
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
     has_graphs: ClassVar[bool] = True
+    runs_graphs: ClassVar[bool] = True
 
     model: Path = Field(description="the ONNX file; external data is found beside it")
     policy: Path | None = Field(
@@ -192,10 +194,10 @@ def _compare(
     Raises:
         SourceError: when ONNX Runtime computes something else.
     """
-    programs = [
-        Program(manifest.program, {"main": engine_class()(path, threads=1)}, SEED)
-        for path in (before, out / "graphs/main.onnx")
-    ]
+    programs = []
+    for path in (before, out / "graphs/main.onnx"):
+        with risky(engine_class(), f"opened {path.name}"):
+            programs.append(Program(manifest.program, {"main": engine_class()(path, threads=1)}, SEED))
     encode = ObservationEncoder(manifest.spec, out / "assets")
     for observation in observations:
         feeds = encode(observation)

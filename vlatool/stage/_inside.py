@@ -1,35 +1,52 @@
-"""A stage in a child process, since it runs a user's code or needs its own environment: both sides of the call."""
+"""A stage in a child process: both sides of the call.
+
+It runs a user's code, needs an environment of its own, or lets an engine open graphs that may end the process.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from vlatool import registry
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError
+from vlatool.errors import PluginError, RecipeError, VlatoolError
+from vlatool.files.printable import message_of
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
 from vlatool.user_code import children
 
 PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)
-"""What such stages need; imported once, by the server that forks the children."""
+"""What stages with a user's code need; imported once, by the server that forks the children."""
+
+
+def needed(stage: Stage) -> tuple[str, ...]:
+    """Return the modules that a child needs for a stage of vlatool's own code; the server imports them once."""
+    return (*stage.used_packages(), type(stage).__module__, __name__)
 
 
 def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
-    """Run a stage in a child process, verify what it wrote to ``draft``, and return that.
+    """Run a stage in a child process and return what it wrote to ``draft``, verified where a user's code took part.
 
     Raises:
-        VlatoolError: what the stage raises; SourceError when the child ends before it is done.
+        VlatoolError: what the stage raises; SourceError, or GraphError of an engine, when the child ends before it is
+            done.
         BundleError: when what it wrote is not a whole bundle.
     """
-    job = {**_job(stage, source, context), "out": str(draft)}
-    answer = children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), PRELOAD)
+    job, whose = {**_job(stage, source, context), "out": str(draft)}, stage.runs(source)
+    about, preload = whose or stage.name(), PRELOAD if whose else needed(stage)
+    try:
+        answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
+    except VlatoolError as error:  # the draft is gone when a person reads it
+        error.message = error.message.replace(f"{draft}/", "")
+        raise
     said = answer.get("said") if isinstance(answer, Mapping) else None
     context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
-    return Bundle.open(draft)
+    return Bundle.open(draft, verify=bool(whose))
 
 
 def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any]:
@@ -49,7 +66,8 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
         raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
     context = _context(job, tell)
-    bundle = stage.run(source, Path(job["out"]), context)
+    with _blamed():
+        bundle = stage.run(source, Path(job["out"]), context)
     return {"hash": bundle.hash, "said": context.said}
 
 
@@ -60,9 +78,10 @@ def measured_with(environment: Mapping[str, str], stage: Measure, source: Bundle
         VlatoolError: what the stage raises.
     """
     job, settings = _job(stage, source, context), " ".join(f"{name}={value}" for name, value in environment.items())
-    about = f"{stage.name()} with {settings}"
+    about = f"{stage.name()} with {settings}" if settings else stage.name()
     job["keeps"] = context.unfinished is not None
-    answer = children.call("vlatool.stage._inside:measure", job, context.tell, about, environment=environment)
+    here, preload = "vlatool.stage._inside:measure", needed(stage)
+    answer = children.call(here, job, context.tell, about, preload, environment, own=True)
     if context.unfinished is not None:
         context.unfinished.extend(map(Path, answer["unfinished"]))
     context.notes.extend(map(str, answer["notes"]))
@@ -77,8 +96,22 @@ def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     source = Bundle.open(Path(job["source"]), verify=False)
     unfinished: list[Path] = []
     context = replace(_context(job, tell), unfinished=unfinished if job["keeps"] else None)
-    report = stage.run(source, context).to_json()
+    with _blamed():
+        report = stage.run(source, context).to_json()
     return {"report": report, "unfinished": list(map(str, unfinished)), "notes": context.notes}
+
+
+@contextlib.contextmanager
+def _blamed() -> Iterator[None]:
+    """Name the package that adds a stage when that fails: the parent does not see where an exception came from."""
+    try:
+        yield
+    except (VlatoolError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        if owner := registry.blamed(error):
+            raise PluginError(*registry.complaint(owner, type(error).__name__, message_of(error))) from error
+        raise
 
 
 def _context(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> Context:

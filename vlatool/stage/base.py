@@ -178,6 +178,8 @@ class Transform(Stage):
     """Whether it starts from a source bundle without graphs, since it works on the policy's torch modules."""
     trains: ClassVar[bool] = False
     """Whether it changes weights step by step, and tells of each (``Context.events``)."""
+    runs_graphs: ClassVar[bool] = False
+    """Whether it opens or runs new graphs: it does so in a child process, since an engine may crash."""
     streams: ClassVar[bool] = False
     """Whether it can take a source bundle that has no graphs yet and read the policy's shards itself."""
 
@@ -192,7 +194,7 @@ class Transform(Stage):
     def runs(self, source: Bundle | None) -> str:
         """Return whose code this stage runs on that source (``policy.py``); empty when only vlatool's own.
 
-        Such a stage is run in a child process; see ``vlatool.user_code.children``.
+        Such a stage is run in a child process, as those that run graphs are; see ``vlatool.user_code.children``.
         """
         return ""
 
@@ -269,6 +271,8 @@ class Measure(Stage):
 
     remotely: ClassVar[bool] = False
     """Whether it can measure on another machine (``Context.elsewhere``)."""
+    runs_graphs: ClassVar[bool] = False
+    """Whether it opens graphs itself, not in processes that it starts: then it runs in a child, as above."""
     films: ClassVar[bool] = False
     """Whether it can write a video of what it measured (``Context.video``)."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,8 +15,9 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle, restate, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
+from vlatool.machine.risky import risky
 from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
-from vlatool.runtime.engine import DEFAULT_ENGINE
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.policy import Action, Policy, relative_error
@@ -246,11 +248,10 @@ def write_golden(draft: Bundle, observations: list[dict[str, Any]], out: Path) -
     """
     samples = _samples(draft.manifest, observations, GOLDEN_COUNT)
     name = draft.manifest.spec.action.name
-    expected = _outputs(
-        reference_policy(draft), samples
-    )  # closed before the engine opens: one set of weights at a time
+    # closed before the engine opens: one set of weights at a time
+    expected = _outputs(reference_policy(draft), samples, reference())
     policy = Policy.open(draft, threads=1, seed=SEED)
-    own = _outputs(policy, samples)
+    own = _outputs(policy, samples, engine_class(policy.engine))
     arrays: dict[str, list[Any]] = {}
     for (observation, noise), action in zip(samples, expected, strict=True):
         parts = (("in", observation), ("noise", noise), ("out", action.outputs), ("chunk", {name: action.chunk}))
@@ -267,9 +268,22 @@ def _worst(errors: Iterable[float]) -> float:
     return max((error if error == error else math.inf for error in errors), default=0.0)
 
 
-def _outputs(policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[Action]:
+def _outputs(
+    policy: Policy, samples: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], engine: Any = None
+) -> list[Action]:
+    """Return the action of each observation; ``engine`` is told where it runs these graphs for the first time."""
     policy.reset()
-    return [policy.infer(observation, noise=noise) for observation, noise in samples]
+    actions = []
+    for observation, noise in samples:
+        with risky(engine, f"ran {named(policy.bundle.manifest)}") if engine else contextlib.nullcontext():
+            actions.append(policy.infer(observation, noise=noise))
+    return actions
+
+
+def named(manifest: Manifest) -> str:
+    """Return the graphs of a bundle in words."""
+    names = " and ".join(f"'{name}'" for name in manifest.graphs)
+    return f"the graph{'s' if len(manifest.graphs) > 1 else ''} {names}"
 
 
 def reference_policy(bundle: Bundle) -> Policy:

@@ -19,9 +19,11 @@ from vlatool.files.work import forget_all
 from vlatool.files.writing import writing
 from vlatool.machine.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
+from vlatool.stage import tried
 from vlatool.stage._inside import measured_with as measured_with
-from vlatool.stage._inside import run_apart
+from vlatool.stage._inside import needed, run_apart
 from vlatool.stage.base import Context, Measure, Stage, Transform
+from vlatool.user_code import children
 
 
 def run_transform(
@@ -36,7 +38,7 @@ def run_transform(
 ) -> Bundle:
     """Run a stage that makes a bundle; ``out`` appears whole or not at all.
 
-    A stage that runs a user's code does so in a child process.
+    A stage that runs a user's code, or a graph that nobody has run yet, does so in a child process.
 
     Args:
         stage: What runs.
@@ -52,15 +54,21 @@ def run_transform(
     """
     if not damaged:
         refuse_replacing(out, force=force, kind=BUNDLE)
+    apart = stage.runs_graphs or bool(stage.runs(source))
+    if apart and not stage.runs(source):
+        children.prepare(needed(stage))  # while this process checks
     stage.check(source, None)
     with writing(out, force=force, damaged=damaged) as draft:
-        if stage.runs(source):
+        if apart:
             run_apart(stage, source, draft, context)
         else:
             stage.run(source, draft, context)
         if reports is not None and reports.is_dir() and not (draft / REPORTS).exists():
             shutil.copytree(reports, draft / REPORTS)
-    return Bundle.open(out, verify=False)
+    made = Bundle.open(out, verify=False)
+    if apart:
+        tried.note(made)
+    return made
 
 
 def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
@@ -115,6 +123,11 @@ def _words(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
+def measured(stage: Measure, source: Bundle, context: Context) -> Report:
+    """Run a stage that measures; in a child process where it opens graphs itself."""
+    return measured_with({}, stage, source, context) if stage.runs_graphs else stage.run(source, context)
+
+
 def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context, *, fresh: bool = False) -> Report:
     """Return the stage's report from the cache, or measure (always, when ``fresh``) and keep it."""
     path = cached_path(stage, source.hash, cache)
@@ -127,7 +140,7 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
         except DataError:
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
     own = replace(context, unfinished=[], notes=[])
-    report = replace(stage.run(source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
+    report = replace(measured(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
     tag(cache)
     with writing(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")

@@ -11,12 +11,15 @@ import math
 import signal
 import unicodedata
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from vlatool import errors
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError
+from vlatool.errors import GraphError, InputError, MissingExtra, SourceError, VlatoolError
 from vlatool.files.json import parse_json
+from vlatool.files.limits import VARIABLE, limit
 from vlatool.files.printable import TOLD, shortened
+from vlatool.machine.risky import Deed, crashed
 
 ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
@@ -24,6 +27,32 @@ ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, e
 
 LONGEST = 2 * TOLD
 """Characters of a message of a child, which may quote what foreign code says."""
+
+
+LAST_WORDS = 240
+"""Characters of the last line that a child printed, for an error: its end says more than its beginning."""
+
+
+@dataclass
+class Last:
+    """What a child was seen to do before it ended.
+
+    Args:
+        own: It runs vlatool's code alone.
+        doing: What an engine does in it.
+        told: What it told as its progress.
+        said: The last line that it printed.
+    """
+
+    own: bool = False
+    doing: Deed | None = None
+    told: str = ""
+    said: str = ""
+
+    @property
+    def words(self) -> str:
+        """The end of the last line."""
+        return self.said if len(self.said) <= LAST_WORDS else f"...{self.said[-LAST_WORDS:]}"
 
 
 class Killed(SourceError):
@@ -51,6 +80,8 @@ def _makes_sense(line: Mapping[str, Any]) -> bool:
             return True
         case {"progress": [str(), int() | float() as share]}:
             return math.isfinite(share)
+        case {"doing": None | [str(), str(), str()]}:
+            return True
         case {"error": str(), "message": str(), "fix": str()} | {"raised": str(), "message": str(), "ours": bool()}:
             return isinstance(line.get("where", ""), str)
         case {"errno": int(number), "message": str(), "file": None | str()}:
@@ -67,7 +98,7 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         own: The child runs vlatool's code alone: what fails in it is a bug of vlatool.
 
     Raises:
-        InputError, MissingExtra: of the class that is named.
+        InputError, MissingExtra: of the class that is named; any VlatoolError where ``own``.
         SourceError: for everything else that was raised, also by vlatool, which is named then; RuntimeError where
             ``own``.
         OSError, MemoryError: what the child met.
@@ -79,7 +110,7 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     message = plain(answer["message"])
     if "error" in answer:
         kind = Killed if answer["error"] == Killed.__name__ else getattr(errors, answer["error"], None)
-        if isinstance(kind, type) and issubclass(kind, InputError | MissingExtra):
+        if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra):
             raise kind(shortened(answer["message"], LONGEST), shortened(answer["fix"], LONGEST))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
         raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}")
@@ -117,26 +148,52 @@ def left(about: str, name: str, text: str) -> SourceError:
     return SourceError(f"{about} raised {name}{text and ': '}{text}.", "raise an Exception that says what is wrong")
 
 
-def ended(status: bytes, about: str) -> BaseException:
-    """Return the error of a child that ended without an answer."""
+def ended(status: bytes, about: str, last: Last) -> BaseException:
+    """Return the error of a child that ended without an answer.
+
+    Args:
+        status: Its exit code, as the server says it.
+        about: Whose code it ran.
+        last: What it did.
+    """
     text = status.decode("ascii", "replace").strip()
     if not text.lstrip("-").isdigit():
         return SourceError(f"{about}: the process that ran it was lost.", "run the command again")
     code = int(text)
     if code == -signal.SIGINT:
         return KeyboardInterrupt()
+    if last.doing and code != -signal.SIGKILL:
+        return _engine_ended(code, last.doing, last.words)
     if code >= 0:
         return SourceError(
             f"{about} ended its process with exit code {code} before it was done (os._exit, or a library's exit).",
             "let it raise an exception that says what is wrong instead",
         )
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = f"signal {-code}"
+    name = _signal(code)
     if code == -signal.SIGKILL:
         return Killed(
             f"{about}: the process that ran it was killed (SIGKILL) before it was done.",
             "where memory ran out, use a machine with more of it",
         )
+    if last.own:
+        said = f" It said last: {last.words}" if last.words else ""
+        at = f" ({last.told})" if last.told else ""
+        return GraphError(f"{about}{at} ended its process with {name}.{said}", "look for a library that crashes")
     return SourceError(f"{about} crashed its process ({name}) before it was done.", "look for a library that crashes")
+
+
+def _engine_ended(code: int, doing: Deed, said: str) -> GraphError:
+    """Return the error of an engine that did not let its process live."""
+    if code == -signal.SIGALRM:
+        seconds = limit("engine_seconds")
+        error = crashed(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
+        return GraphError(error.message, f"where it needs longer, raise it: {VARIABLE}=engine_seconds={10 * seconds}")
+    how = f"with {_signal(code)}" if code < 0 else f"with exit code {code}"
+    return crashed(doing, f"ended its process {how}", said)
+
+
+def _signal(code: int) -> str:
+    try:
+        return signal.Signals(-code).name
+    except ValueError:
+        return f"signal {-code}"

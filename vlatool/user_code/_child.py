@@ -25,7 +25,9 @@ from typing import IO, Any
 import psutil
 
 from vlatool.errors import VlatoolError
+from vlatool.files.limits import limit
 from vlatool.files.printable import message_of
+from vlatool.machine import risky
 from vlatool.machine.processes import adopt_orphans, die_with_parent
 from vlatool.user_code import trust
 from vlatool.user_code._answers import ENDINGS
@@ -95,9 +97,12 @@ def _end_all(children: Mapping[int, socket.socket]) -> None:
 
 
 def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket], own: list[int]) -> None:
+    """Import what a child needs and fork it; import alone where there is no child yet."""
     for name in preload:
         with contextlib.suppress(Exception):  # the child meets it again, and says it
             importlib.import_module(name)
+    if not fds:
+        return
     gc.collect()
     gc.freeze()
     talk, output, status = fds
@@ -139,6 +144,7 @@ def _converse(talk: socket.socket) -> int:
     """Answer request after request until there are no more."""
     requests, answers = talk.makefile("r", encoding="utf-8"), talk.makefile("w", encoding="utf-8")
     _settle(json.loads(requests.readline()))
+    risky.listen(lambda doing: _doing(answers, doing))
     for line in requests:
         request = json.loads(line)
         with _warnings_told(answers):
@@ -146,6 +152,16 @@ def _converse(talk: socket.socket) -> int:
         _flush()
         _say(answers, answer)
     return 0
+
+
+def _doing(answers: IO[str], doing: risky.Deed | None) -> None:
+    """Say what an engine does, and let the kernel end this process when that takes too long.
+
+    No thread of Python could: a library that hangs may never let one run.
+    """
+    if signal.getsignal(signal.SIGALRM) == signal.SIG_DFL:  # a policy may use it
+        signal.setitimer(signal.ITIMER_REAL, limit("engine_seconds") if doing else 0)
+    _say(answers, {"doing": doing})
 
 
 def _settle(parent: dict[str, Any]) -> None:

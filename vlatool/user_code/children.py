@@ -29,7 +29,7 @@ from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.processes import SINGLE, import_path, python_command
 from vlatool.user_code import trust
 from vlatool.user_code._answers import Killed as Killed
-from vlatool.user_code._answers import ended, plain, read
+from vlatool.user_code._answers import Last, ended, plain, read
 from vlatool.user_code._answers import left as left
 from vlatool.user_code._answers import result as result
 
@@ -46,6 +46,7 @@ class _Server:
     """The process that forks the children."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
+        self.used = False
         self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             quiet = subprocess.DEVNULL
@@ -55,12 +56,15 @@ class _Server:
             )  # fmt: skip
 
     def fork(self, preload: Sequence[str], fds: list[int]) -> None:
-        """Fork a child that gets these descriptors."""
+        """Fork a child that gets these descriptors; import alone when there are none."""
+        self.used = self.used or bool(fds)
         socket.send_fds(self.control, [json.dumps(list(preload)).encode()], fds)
 
     def stop(self) -> None:
         """End the server and with it all children."""
         self.control.close()
+        if not self.used:  # it may be in the middle of importing
+            self.process.kill()
         try:
             self.process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
@@ -86,6 +90,12 @@ def _forked(preload: Sequence[str], fds: list[int], environment: Mapping[str, st
             _servers.pop(kind).stop()
         _servers[kind] = _Server(environment)
         _servers[kind].fork(preload, fds)
+
+
+def prepare(preload: Sequence[str]) -> None:
+    """Let the server start and import what a child will need, while this process does something else."""
+    with contextlib.suppress(OSError):
+        _forked(preload, [], os.environ)
 
 
 @atexit.register
@@ -120,7 +130,8 @@ class Apart:
         self._status, status = socket.socketpair()
         self._output, output = os.pipe()
         self._open: list[Any] = [self._talk, self._output, self._status]
-        self._said = _Said(about)
+        self._last = Last()
+        self._said = _Said(about, self._last)
         self._received = b""
         variables = {**os.environ, **(environment or {})}
         try:
@@ -169,11 +180,16 @@ class Apart:
             OSError, MemoryError: what it meets.
             KeyboardInterrupt: when Ctrl-C ended the child.
         """
+        self._last.own, self._last.doing, self._last.told = own, None, ""
         self._send({"call": function, "job": dict(job)})
         while True:
             for line in self._lines():
                 if "progress" in line:
-                    tell(plain(line["progress"][0]), line["progress"][1])
+                    self._last.told = plain(line["progress"][0])
+                    tell(self._last.told, line["progress"][1])
+                elif "doing" in line:
+                    what = line["doing"]
+                    self._last.doing = what and (plain(what[0]), plain(what[1]), plain(what[2]))
                 elif "warning" in line:
                     warnings.warn(shortened(line["warning"]), UserWarning, stacklevel=2)
                 else:
@@ -196,7 +212,7 @@ class Apart:
             return [read(line, self.about) for line in whole]
         if self._status in ready and not (self._talk in self._open and self._receive()):
             self._print(last=True)
-            raise ended(_received(self._status), self.about)
+            raise ended(_received(self._status), self.about, self._last)
         if not ready:
             raise SourceError(f"{self.about} closed what its process answers with.", "let it close its own files alone")
         return []
@@ -288,23 +304,24 @@ def spread(
 class _Said:
     """What a child prints, shown on standard error as the policy's, a limited number of lines."""
 
-    def __init__(self, about: str) -> None:
-        self._about, self._rest, self._shown = about, b"", 0
+    def __init__(self, about: str, last: Last) -> None:
+        self._about, self._last, self._rest, self._shown = about, last, b"", 0
 
     def take(self, printed: bytes) -> None:
         *lines, self._rest = (self._rest + printed).split(b"\n")
         if len(self._rest) > BLOCK:
             lines, self._rest = [*lines, self._rest], b""
         for line in lines:
-            self._show(plain(line.decode("utf-8", "replace"))[:SHOWN_CHARACTERS])
+            self._show(plain(line.decode("utf-8", "replace")))
 
     def _show(self, line: str) -> None:
+        self._last.said = line.strip() or self._last.said
         if not line.strip() or self._shown > SHOWN_LINES:
             return
         self._shown += 1
-        shown = f"[{self._about}] {line}" if self._shown <= SHOWN_LINES else f"[{self._about}] prints more; not shown"
+        line = line[:SHOWN_CHARACTERS] if self._shown <= SHOWN_LINES else "prints more; not shown"
         with contextlib.suppress(OSError, ValueError, AttributeError):
-            sys.stderr.write(shown + "\n")
+            sys.stderr.write(f"[{self._about}] {line}\n")
             sys.stderr.flush()
 
 

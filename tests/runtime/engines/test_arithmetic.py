@@ -1,6 +1,7 @@
 """The arithmetic probe: what it is, what it finds, and what an engine does about it."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -24,9 +25,11 @@ from vlatool.runtime.arithmetic import (
     operand,
     ort_product,
 )
+from vlatool.runtime.engines import _reference, ort_cpu
 from vlatool.runtime.engines._reference import ReferenceSession
 from vlatool.runtime.engines.openvino import OpenvinoSession
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.runtime.stored_types import lacks_zero_point
 
 SATURATED = 32767.0 * SHAPE[1] / 2
 """Pairs of products become 32,767 each."""
@@ -66,6 +69,28 @@ def test_the_written_probe_is_the_same_product_as_an_integer_operator():
     assert (ReferenceEvaluator(found).run(None, {"x": operand()})[0] == WANTED).all()
     assert ort_product(onnxruntime, precise=True, written=True) == WANTED
     assert ort_product(onnxruntime, written=True) == ort_product(onnxruntime)
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_the_probe_has_the_zero_points_without_which_older_releases_abort(written):
+    assert not lacks_zero_point(model(written))
+
+
+@pytest.mark.parametrize(
+    ("release", "breaks"), [("1.23.2", True), ("1.29.0", True), ("1.30.0", False), ("2.0", False), ("", False)]
+)
+@pytest.mark.parametrize("engine", [OrtCpuSession, ReferenceSession])
+def test_older_releases_do_not_get_the_option_that_ends_them(tmp_path, monkeypatch, engine, release, breaks):
+    """ONNX Runtime 1.23 to 1.29 abort where a product without a zero point of its weights gets the option."""
+    path = integer_product(tmp_path / "uint8.onnx", TensorProto.UINT8)
+    monkeypatch.setattr(arithmetic, "ort_product", lambda *_, **given: WANTED if given.get("precise") else SATURATED)
+    entries = []
+    options = SimpleNamespace(add_session_config_entry=lambda *entry: entries.append(entry))
+    for module in (ort_cpu, _reference):
+        monkeypatch.setattr(module, "session_options", lambda *_: options)
+    library = SimpleNamespace(__version__=release, GraphOptimizationLevel=onnxruntime.GraphOptimizationLevel)
+    engine._option_sets(library, path, 1)
+    assert (PRECISE in entries) is not breaks
 
 
 def test_with_the_option_products_are_exact_on_every_processor():

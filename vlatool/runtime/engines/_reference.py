@@ -15,7 +15,7 @@ from typing import Any
 
 from vlatool.errors import require
 from vlatool.runtime import arithmetic
-from vlatool.runtime.engines.ort_cpu import OrtCpuSession, session_options
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession, is_true_of, session_options
 
 
 class ReferenceSession(OrtCpuSession):
@@ -24,9 +24,10 @@ class ReferenceSession(OrtCpuSession):
     optimized = False
 
     @staticmethod
-    def _option_sets(ort: Any, threads: int | None, model: Path | bytes) -> list[Any]:
+    def _option_sets(ort: Any, model: Path | bytes, threads: int | None) -> list[Any]:
         """Return the options to try: signed activations, which are exact anyway, are refused by the exact products."""
         exact_by_option = arithmetic.ort_exactness(ort, written=True) == arithmetic.EXACT_BY_OPTION
+        exact_by_option = exact_by_option and not is_true_of(arithmetic.breaks_precise, ort, model)
         option_sets = []
         for precise in [True, False] if exact_by_option else [False]:
             option_sets.append(session_options(ort, threads))

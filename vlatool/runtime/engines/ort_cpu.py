@@ -139,7 +139,7 @@ class OrtCpuSession(Engine):
     @classmethod
     def _open(cls, ort: Any, model: Path | bytes, threads: int | None) -> Any:
         """Open a session, with other options where the first break the graph; the first error is reported."""
-        first, *others = cls._option_sets(ort, threads, model)
+        first, *others = cls._option_sets(ort, model, threads)
         try:
             return _session(ort, model, first)
         except Exception:
@@ -149,16 +149,20 @@ class OrtCpuSession(Engine):
             raise
 
     @staticmethod
-    def _option_sets(ort: Any, threads: int | None, model: Path | bytes) -> list[Any]:
+    def _option_sets(ort: Any, model: Path | bytes, threads: int | None) -> list[Any]:
         """Return the options to try, one after the other.
 
         Exact products of uint8 activations refuse a graph with int8 ones, which are exact as long as they stay int8.
         Weights that cannot saturate need no such option, which would make them slower. And ONNX Runtime (1.31) takes
-        float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type.
+        float8 pairs around a MatMul for int8 ones and writes an integer product that has no such type. Where exact
+        products would end the process, pairs are computed in float, which is exact, too.
         """
-        saturates = arithmetic.ort_product(ort) < arithmetic.WANTED and not weights_fit(model)
+        entries: list[tuple[str, str] | None] = [None]
+        if arithmetic.ort_product(ort) < arithmetic.WANTED and not is_true_of(weights_fit, model):
+            breaks = is_true_of(arithmetic.breaks_precise, ort, model)
+            entries = [] if breaks else [arithmetic.PRECISE, arithmetic.SIGNED]
         option_sets = []
-        for entry in (*([arithmetic.PRECISE, arithmetic.SIGNED] if saturates else [None]), arithmetic.UNFUSED):
+        for entry in (*entries, arithmetic.UNFUSED):
             option_sets.append(session_options(ort, threads))
             if entry is not None:
                 option_sets[-1].add_session_config_entry(*entry)
@@ -301,9 +305,14 @@ def left_out(model: Path | bytes) -> list[str]:
     to uint8 cuts off what is negative, and (seen in 1.31) take every float8 for such a type: negative values come
     through.
     """
-    with contextlib.suppress(GraphError, OSError):  # a file that is no graph is refused when it is opened
-        return CUT_OFF_REWRITES if has_float8(model) else []
-    return []
+    return CUT_OFF_REWRITES if told(has_float8, model) else []
+
+
+def is_true_of(question: Callable[..., bool], *about: Any) -> bool:
+    """Return what a graph is asked; a file that is none is refused when it is opened."""
+    with contextlib.suppress(GraphError, OSError):
+        return question(*about)
+    return False
 
 
 def _session(ort: Any, model: Path | bytes, options: Any) -> Any:

@@ -1,0 +1,113 @@
+"""An engine that ends its process, or hangs, on a graph that nobody has run yet is an error of each command."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from vlatool.bundle.bundle import Bundle
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+INT8 = "MatMulIntegerToFloat"
+HANGS = "engine_seconds=2"
+Run = Callable[..., subprocess.CompletedProcess[str]]
+ENDS = {
+    "abort": "ended its process with SIGABRT",
+    "crash": "ended its process with SIGSEGV",
+    "leave": "called sys.exit(0)",
+    "end": "ended its process with exit code 0",
+    "hang": "was ended after 2 s, which the limit 'engine_seconds' allows,",
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A function that runs vlatool in an environment whose ONNX Runtime dies of some graphs."""
+    place = tmp_path_factory.mktemp("dying")
+    python = place / "venv/bin/python"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place / "venv")], check=True)
+    library = next((place / "venv/lib").glob("python*")) / "site-packages"
+    paths = [str(ROOT), *(each for each in sys.path if each.endswith("site-packages"))]
+    (library / "here.pth").write_text("\n".join([*paths, "import dying_engine"]))
+    shutil.copy(HERE / "dying_engine.py", library)
+    environment = {**os.environ, "VLATOOL_CACHE": str(place / "cache"), "COLUMNS": "200"}
+
+    def call(dies: str, of: str, *words: str) -> subprocess.CompletedProcess[str]:
+        own = {"DIES": dies, "DIES_OF": of, "VLATOOL_LIMITS": HANGS if dies.startswith("hang") else ""}
+        command = [str(python), "-W", "ignore", "-m", "vlatool", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment | own, timeout=300)
+
+    return call
+
+
+def refused(done: subprocess.CompletedProcess[str], how: str, where: Path) -> str:
+    """The error of a command that must have left with 3, and must not name what is gone."""
+    told = done.stderr
+    assert done.returncode == 3, done.stdout + told
+    assert "Traceback" not in told
+    error = told[told.index("error:") :]
+    assert ENDS[how] in error
+    assert "ONNX Runtime 1." in error
+    assert ".tmp-" not in error
+    assert "fix: " in error
+    assert not where.exists()
+    return error
+
+
+@pytest.mark.parametrize("how", ENDS)
+@pytest.mark.parametrize("when", ["open", "run"])
+def test_quantize_says_what_the_engine_did(run: Run, float_bundle: Bundle, tmp_path: Path, how: str, when: str):
+    line = ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out"))
+    error = refused(run(f"{how}:{when}", INT8, *line), how, tmp_path / "out")
+    assert f"when it {'opened' if when == 'open' else 'ran'} the graph 'main'" in error
+    if how == "abort":
+        assert "It said last: engine.cc:1130: Assertion '__n < this->size()' failed." in error
+
+
+def test_quantize_survives_a_calibration(run: Run, float_bundle: Bundle, tmp_path: Path):
+    line = ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out"))
+    error = refused(run("abort:run", "", *line), "abort", tmp_path / "out")
+    assert "when it ran the graph 'main' with further outputs" in error
+
+
+@pytest.mark.parametrize("when", ["open", "run"])
+def test_export_does_not_blame_the_policy(run: Run, policy_dir: Path, tmp_path: Path, when: str):
+    error = refused(
+        run(f"abort:{when}", "", "export", str(policy_dir), "-o", str(tmp_path / "out")), "abort", tmp_path / "out"
+    )
+    assert "policy.py" not in error
+
+
+def test_an_onnx_file_is_refused(run: Run, onnx_file: Path, tmp_path: Path):
+    refused(run("crash:open", "", "export", str(onnx_file), "-o", str(tmp_path / "out")), "crash", tmp_path / "out")
+
+
+def test_what_opens_a_bundle_from_elsewhere_survives(run: Run, int8_bundle: Bundle, tmp_path: Path):
+    made = str(int8_bundle.path)
+    for line in (
+        ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "10"), ("explain", made),
+        ("benchmark", "overhead", made),
+    ):  # fmt: skip
+        done = run("abort:run", INT8, *line, "-o", str(tmp_path / "report"))
+        assert done.returncode == 3, (line, done.stdout + done.stderr)
+        assert "SIGABRT" in done.stderr
+        assert "Assertion" in done.stderr
+
+
+def test_a_search_goes_on_without_the_candidate(run: Run, policy_dir: Path, tmp_path: Path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text("candidates:\n  int8: [quantize.static_int8]\n  half: [quantize.float16]\n")
+    line = ("optimize", str(policy_dir), "--recipe", str(recipe), "--max-drop", "relative_error=0.9", "--no-search")
+    done = run("abort:run", INT8, *line, "-o", str(tmp_path / "out"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((tmp_path / "out/reports/report.json").read_text())
+    (failed,) = [row for row in report["rows"] if row["name"] == "int8"]
+    assert "SIGABRT" in failed["reason"]

@@ -1,0 +1,81 @@
+"""What a library of machine code is about to do: it may end the process, and whoever watches that is told before.
+
+A graph that nobody has run yet can make an engine abort, crash or hang. The build side opens and runs such graphs in
+child processes (``vlatool.user_code.children``); a child tells its parent here what it does, so that the parent can say
+it where no answer comes. A process that nobody watches, such as a robot's, tells nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from vlatool.errors import GraphError
+
+Deed = tuple[str, str, str]
+"""Which library (``ONNX Runtime 1.23.2``), what it does in the past tense, and the package that installs it."""
+REMEDY = (
+    "where the graph was quantized, leave layers out with --exclude or use another --layout; otherwise use another "
+    "release of {package}"
+)
+
+_listener: Callable[[Deed | None], None] | None = None
+_now: Deed | None = None
+
+
+def listen(listener: Callable[[Deed | None], None] | None) -> None:
+    """Let a function be told what begins, and None when nothing is under way any more."""
+    global _listener, _now
+    _listener, _now = listener, None
+
+
+@contextlib.contextmanager
+def risky(engine: Any, deed: str) -> Iterator[None]:
+    """Tell whoever watches this process what an engine does meanwhile.
+
+    Args:
+        engine: A class of ``vlatool.runtime.engine``.
+        deed: What it does, in the past tense: ``opened the graph 'main'``.
+
+    Raises:
+        GraphError: when it wants to leave the process.
+    """
+    if _listener is None:
+        yield
+        return
+    before, doing = _now, (_title(engine), deed, str(getattr(engine, "package", "")))
+    _tell(doing)
+    try:
+        yield
+    except SystemExit as left:
+        raise crashed(doing, f"called sys.exit({left.code})") from None
+    finally:
+        _tell(before)
+
+
+def crashed(doing: Deed, how: str, last: str = "") -> GraphError:
+    """Return the error of an engine that ended its process, or wanted to.
+
+    Args:
+        doing: What it did.
+        how: How it ended, in the past tense.
+        last: What it wrote last.
+    """
+    title, deed, package = doing
+    said = f" It said last: {last}" if last else ""
+    return GraphError(f"{title} {how} when it {deed}.{said}", REMEDY.format(package=package or "the engine"))
+
+
+def _tell(doing: Deed | None) -> None:
+    global _now
+    _now = doing
+    if _listener is not None:
+        _listener(doing)
+
+
+def _title(engine: Any) -> str:
+    title = str(getattr(engine, "title", "") or getattr(engine, "__name__", "the engine"))
+    with contextlib.suppress(Exception):  # a package of its own may have no version
+        title = f"{title} {engine.version()}".rstrip()
+    return title
