@@ -137,11 +137,11 @@ class OrtCpuSession(Engine):
         """Open a session, with other options where the first break the graph; the first error is reported."""
         first, *others = cls._option_sets(ort, threads)
         try:
-            return _session(ort, model, first)
+            return open_session(ort, model, first)
         except Exception:
             for options in others:
                 with contextlib.suppress(Exception):
-                    return _session(ort, model, options)
+                    return open_session(ort, model, options)
             raise
 
     @staticmethod
@@ -294,7 +294,8 @@ def left_out(model: Path | bytes) -> list[str]:
     return []
 
 
-def _session(ort: Any, model: Path | bytes, options: Any) -> Any:
+def open_session(ort: Any, model: Path | bytes, options: Any) -> Any:
+    """Open a graph on the CPU alone, without what would make it another one."""
     content = model if isinstance(model, bytes) else str(model)
     optimizers = {"disabled_optimizers": left_out(model)}
     session = ort.InferenceSession(content, options, providers=[PROVIDER], enable_fallback=0, **optimizers)
