@@ -27,6 +27,11 @@ def exact(engine: str = "ort_cpu") -> bool:
     return products(engine).startswith("exact")
 
 
+def full_range_or_less() -> dict[str, bool]:
+    """Return the options of static int8 with which OpenVINO's products are exact on this processor."""
+    return {} if exact("openvino") else {"reduce_range": True}
+
+
 @functools.cache
 def computes_bfloat16() -> bool:
     """Whether OpenVINO computes in bfloat16 here."""

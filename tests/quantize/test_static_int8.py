@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from _arithmetic import computes_bfloat16, exact
+from _arithmetic import computes_bfloat16, exact, full_range_or_less
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import DataError, GraphError, MissingExtra, RecipeError
@@ -13,11 +13,6 @@ from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.stage.build import build_stage
-
-
-def for_openvino() -> dict[str, bool]:
-    """Options with which OpenVINO's products are exact on this processor."""
-    return {} if exact("openvino") else {"reduce_range": True}
 
 
 @pytest.fixture
@@ -87,7 +82,7 @@ def test_every_option_gives_a_policy_near_float(quantized, drift, options):
         with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this processor; wanted bf16"):
             quantized(StaticInt8(samples=8, **options))
         return
-    options = options | (for_openvino() if options.get("layout") == "openvino" else {})
+    options = options | (full_range_or_less() if options.get("layout") == "openvino" else {})
     bundle = quantized(StaticInt8(samples=8, **options))
     assert 0 < drift(bundle) < 0.15
     wanted = {name: list(value) if isinstance(value, tuple) else value for name, value in options.items()}
@@ -190,7 +185,7 @@ def test_without_openvino_the_other_layouts_work(quantized, monkeypatch):
 
 
 def test_openvino_computes_what_the_int8_graph_says(quantized):
-    made = quantized(StaticInt8(layout="openvino", **for_openvino()))
+    made = quantized(StaticInt8(layout="openvino", **full_range_or_less()))
     assert made.manifest.findings == ()
     assert load(made.path, threads=1).golden_error < 0.045
 
@@ -208,7 +203,7 @@ def test_where_openvino_saturates_the_stage_says_so_and_the_bundle_is_refused(qu
 
 def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operators, monkeypatch):
     monkeypatch.setattr(_conv1x1, "FEWEST", 4)
-    options = {"layout": "openvino", "samples": 8, **for_openvino()}
+    options = {"layout": "openvino", "samples": 8, **full_range_or_less()}
     plain = quantized(StaticInt8(**options, activations="uint8"))
     written = quantized(StaticInt8(**options, convolutions=True))
     assert operators(written)["Conv"] > operators(plain)["Conv"]
@@ -217,7 +212,7 @@ def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operato
     assert drift(written) < 1.5 * drift(plain)
 
 
-def test_convolutions_are_for_openvino():
+def test_convolutions_are_full_range_or_less():
     with pytest.raises(RecipeError, match="The layout ort has no use for convolutions") as caught:
         StaticInt8(convolutions=True).check(None, None)
     assert caught.value.fix == "use layout openvino"
