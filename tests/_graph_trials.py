@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+from _arithmetic import full_range_or_less
 from _random_graphs import RandomGraph
 
 from vlatool.bundle.bundle import Bundle
@@ -77,7 +78,7 @@ def float_graph(graph: RandomGraph, folder: Path) -> Bundle:
 def trial(graph: RandomGraph, source: Bundle, word: str) -> Outcome:
     """Quantize the float32 bundle of a graph, load what comes out and compare it on observations of its own."""
     name, options, limit = METHODS[word]
-    given = dict(options)
+    given = dict(options) | (full_range_or_less() if options.get("layout") == "openvino" else {})
     if word.split("-")[0] in CALIBRATED:
         given["calibration"] = str(source.path.parent / "recording.npz")
     try:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from _arithmetic import lacks
 from _tiny import observations, write_policy
 
 from vlatool.bundle.bundle import Bundle, seal
@@ -65,6 +66,13 @@ def write_points(path: Path, rows: list[dict[str, str]]) -> Path:
         writer.writeheader()
         writer.writerows(rows)
     return path
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip a test that needs what this processor lacks; engines are asked here, never while tests are collected."""
+    for marker in item.iter_markers("needs"):
+        if why := lacks(*marker.args, **marker.kwargs):
+            pytest.skip(why)
 
 
 @pytest.fixture(scope="session", autouse=True)

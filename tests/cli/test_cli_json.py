@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 import typer
 from _acts import POLICY_YAML, policy
+from _arithmetic import computes_bfloat16
 from _flow import write_flow
 from safetensors.torch import load_file, save_file
 
@@ -196,6 +197,11 @@ def test_a_command_prints_its_document_alone(vlatool, places, points_file, tmp_p
     given = {**vars(places), "points": points_file, "out": tmp_path / "out", "report": report}
     line = [word.format(**given) for word in of(LINES, command).split()]
     status, told, err = vlatool(*command.split(), *line, "--json")
+    if command == "quantize bfloat16" and not computes_bfloat16():
+        validate(told, "failed")
+        assert (status, told["error"]["type"]) == (3, "GraphError")
+        assert "wanted bf16" in told["error"]["message"]
+        return
     assert status == 0, err
     assert "error" not in told
     validate(told, of(SCHEMA["commands"], command)[0])

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from _arithmetic import full_range_or_less
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
@@ -228,7 +229,8 @@ def test_a_metric_without_observations_is_refused_before_the_search(model, tmp_p
 
 
 def test_the_summary_says_which_engine_the_robot_needs(run, recipe):
-    mine = recipe("candidates: {mine: [quantize.static_int8: {samples: 8, layout: openvino}]}")
+    options = "".join(f", {name}: true" for name in full_range_or_less())
+    mine = recipe(f"candidates: {{mine: [quantize.static_int8: {{samples: 8, layout: openvino{options}}}]}}")
     needs = "It runs on the engine openvino: pip install 'vlatool-runtime[openvino]' on the robot."
     assert needs in run(*NEAREST, *mine).report.summary
 

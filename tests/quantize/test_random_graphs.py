@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import onnx
 import pytest
+from _arithmetic import full_range_or_less
 from _graph_trials import METHODS, float_graph, stage_of, trial
 from _random_graphs import RandomGraph
 from onnx import helper
@@ -246,7 +247,7 @@ def errors_of(graph, options, tmp_path):
     """Hold what OpenVINO computes against float32, and what the quantized graph says."""
     source = float_graph(graph, tmp_path / "graph")
     recording = source.path.parent / "recording.npz"
-    stage = StaticInt8(layout="openvino", calibration=recording, **options)
+    stage = StaticInt8(layout="openvino", calibration=recording, **full_range_or_less(), **options)
     made = run_transform(stage, source, tmp_path / "out", Context())
     assert made.manifest.findings == ()
     observation = {"input0": np.load(recording)["input0"][0]}

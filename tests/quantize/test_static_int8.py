@@ -4,9 +4,10 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from _arithmetic import computes_bfloat16, exact, full_range_or_less
 
 from vlatool.bundle.bundle import Bundle, seal
-from vlatool.errors import DataError, MissingExtra, RecipeError
+from vlatool.errors import DataError, GraphError, MissingExtra, RecipeError
 from vlatool.quantize import _conv1x1
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.static_int8 import StaticInt8
@@ -77,6 +78,11 @@ def test_both_layouts_compute_the_same_numbers(quantized, drift, int8_bundle, op
     ids=str,
 )
 def test_every_option_gives_a_policy_near_float(quantized, drift, options):
+    if options.get("compute") == "bfloat16" and not computes_bfloat16():
+        with pytest.raises(GraphError, match=r"OpenVINO computes .* in f32 on this processor; wanted bf16"):
+            quantized(StaticInt8(samples=8, **options))
+        return
+    options = options | (full_range_or_less() if options.get("layout") == "openvino" else {})
     bundle = quantized(StaticInt8(samples=8, **options))
     assert 0 < drift(bundle) < 0.15
     wanted = {name: list(value) if isinstance(value, tuple) else value for name, value in options.items()}
@@ -157,7 +163,8 @@ def test_openvino_is_in_the_key_and_the_record_only_where_it_runs(quantized, flo
     own, other = StaticInt8(samples=8, layout="openvino"), StaticInt8(samples=8, layout="qdq")
     assert "openvino" in quantized(own).manifest.made_by["versions"]
     assert "openvino" not in quantized(other).manifest.made_by["versions"]
-    assert "openvino" in quantized(Bfloat16()).manifest.made_by["versions"]
+    if computes_bfloat16():
+        assert "openvino" in quantized(Bfloat16()).manifest.made_by["versions"]
     before = [each.key("x") for each in (own, other, Bfloat16())]
     real = base.installed_version
     monkeypatch.setattr(base, "installed_version", lambda name: "9" if name == "openvino" else real(name))
@@ -178,14 +185,25 @@ def test_without_openvino_the_other_layouts_work(quantized, monkeypatch):
 
 
 def test_openvino_computes_what_the_int8_graph_says(quantized):
-    made = quantized(StaticInt8(layout="openvino"))
+    made = quantized(StaticInt8(layout="openvino", **full_range_or_less()))
     assert made.manifest.findings == ()
     assert load(made.path, threads=1).golden_error < 0.045
 
 
+def test_where_openvino_saturates_the_stage_says_so_and_the_bundle_is_refused(quantized):
+    """Exact or not, as the probe says."""
+    made = quantized(StaticInt8(layout="openvino"))
+    assert [each["name"] for each in made.manifest.findings] == ([] if exact("openvino") else ["engine-difference"])
+    if not exact("openvino"):
+        assert "Its int8 products are saturating" in made.manifest.findings[0]["message"]
+        assert "--reduce-range" in made.manifest.findings[0]["message"]
+        with pytest.raises(GraphError, match="was found to be wrong when it was made"):
+            load(made.path, threads=1)
+
+
 def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operators, monkeypatch):
     monkeypatch.setattr(_conv1x1, "FEWEST", 4)
-    options = {"layout": "openvino", "samples": 8}
+    options = {"layout": "openvino", "samples": 8, **full_range_or_less()}
     plain = quantized(StaticInt8(**options, activations="uint8"))
     written = quantized(StaticInt8(**options, convolutions=True))
     assert operators(written)["Conv"] > operators(plain)["Conv"]
@@ -194,7 +212,7 @@ def test_convolutions_change_no_more_than_the_rounding(quantized, drift, operato
     assert drift(written) < 1.5 * drift(plain)
 
 
-def test_convolutions_are_for_openvino():
+def test_convolutions_are_full_range_or_less():
     with pytest.raises(RecipeError, match="The layout ort has no use for convolutions") as caught:
         StaticInt8(convolutions=True).check(None, None)
     assert caught.value.fix == "use layout openvino"

@@ -226,7 +226,7 @@ def test_arithmetic_that_is_not_exact_is_told_of_an_int8_policy_alone(int8_bundl
 def test_where_openvino_saturates_the_remedy_is_what_was_seen_to_be_right(int8_bundle, monkeypatch):
     pytest.importorskip("openvino")
     monkeypatch.setattr(OpenvinoSession, "arithmetic", staticmethod(lambda: SATURATING))
-    policy = load(int8_bundle.path, engine="openvino")
+    policy = load(int8_bundle.path, engine="openvino", golden_tolerance=1.0)  # it may saturate here, too
     with pytest.raises(GraphError, match="saturating") as caught:
         policy.warm_up(1, tolerance=-1.0)
     assert {*re.findall(r"--[a-z-]+", caught.value.fix)} == {"--reduce-range", "--layout"}

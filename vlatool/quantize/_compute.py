@@ -28,7 +28,7 @@ from vlatool.quantize._blocks import (
     unpack_zeros,
 )
 from vlatool.quantize._records import Record, Tools, padded
-from vlatool.quantize._rewrite import PART_BYTES, Piece, Task
+from vlatool.quantize._rewrite import PART_BYTES, Piece, Task, stores_zeros
 from vlatool.weights.shards import FLOATS, StoredTensor
 
 Array = NDArray[Any]
@@ -156,7 +156,7 @@ def store(task: Task, form: Format, stored: Array, scale: Array, zero: Array, da
     rows[:, 0::2], rows[:, 1::2] = shaped[:half].transpose(2, 0, 1), shaped[half:].transpose(2, 0, 1)
     piece(task, 0, data)[:] = _linear(rows.reshape(-1, zero.shape[0])[: task.rows], form)
     piece(task, 1, data)[:] = np.ascontiguousarray(scale.T).reshape(-1).view(np.uint8)
-    if not form.symmetric:
+    if stores_zeros(task.kind, form):
         piece(task, 2, data)[:] = _linear(zero.T, form)
 
 

@@ -155,10 +155,19 @@ def weight_task(product: Product, source: StoredTensor, form: Format, layout: st
     pieces = _laid(
         (f"{name}.q{form.bits}", dtype, codes),
         (f"{name}.scales", "FLOAT", (columns, count) if kind == "blocks" else (count, columns)),
-        *([] if form.symmetric else [(f"{name}.zeros", dtype, zeros)]),
+        *([(f"{name}.zeros", dtype, zeros)] if stores_zeros(kind, form) else []),
         *([(f"{name}.inputs", "FLOAT", (rows,))] if scaled else []),
     )
     return Task(source, kind, pieces, product.node.name, rows, columns, product.output_first, scaled=scaled)
+
+
+def stores_zeros(kind: str, form: Format) -> bool:
+    """Return whether zero points are written: where they are chosen, and 0 for a DequantizeLinear of int8.
+
+    Where int8 products saturate, ONNX Runtime (1.32, with the option that makes them exact) gives such a node without a
+    zero point one that has no blocks, and then refuses to run it.
+    """
+    return not form.symmetric or (kind == "qdq" and form.bits == 8)
 
 
 def copy_task(name: str, source: StoredTensor, half: bool) -> Task:

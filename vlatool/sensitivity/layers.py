@@ -20,7 +20,8 @@ from vlatool.graph.files import foreign_errors, save
 from vlatool.graph.layers import Layer
 from vlatool.graph.qdq import Range
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
+from vlatool.runtime.engine import DEFAULT_ENGINE
+from vlatool.runtime.engines import of_branches
 from vlatool.runtime.policy import Action, Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.sensitivity._switches import add_switches
@@ -175,7 +176,7 @@ class Switchboard:
                     self.shares.update({(name, layer): share for layer, share in _shares(path, layers[name]).items()})
                     path = Path(self._scratch.name) / f"{name}.onnx"
                     save(model, path)
-            self._sessions[name] = _Switchable(engine_class()(path, threads), flags, self._tape)
+            self._sessions[name] = _Switchable(of_branches()(path, threads), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:

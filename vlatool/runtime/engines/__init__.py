@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool.errors import require
 
 if TYPE_CHECKING:
+    from vlatool.runtime.engines._branches import BranchesSession
     from vlatool.runtime.engines._reference import ReferenceSession
 
 
@@ -19,6 +20,17 @@ def reference() -> type[ReferenceSession]:
     from vlatool.runtime.engines._reference import ReferenceSession
 
     return ReferenceSession
+
+
+def of_branches() -> type[BranchesSession]:
+    """Return the session for graphs that quantize in the branches of ``If``, in the library that runs float32 answers.
+
+    Raises:
+        MissingExtra: when the library is not installed.
+    """
+    from vlatool.runtime.engines._branches import BranchesSession
+
+    return BranchesSession
 
 
 def build_tool(name: str) -> Any:

@@ -141,11 +141,11 @@ class OrtCpuSession(Engine):
         """Open a session, with other options where the first break the graph; the first error is reported."""
         first, *others = cls._option_sets(ort, model, threads)
         try:
-            return _session(ort, model, first)
+            return open_session(ort, model, first)
         except Exception:
             for options in others:
                 with contextlib.suppress(Exception):
-                    return _session(ort, model, options)
+                    return open_session(ort, model, options)
             raise
 
     @staticmethod
@@ -305,7 +305,7 @@ def left_out(model: Path | bytes) -> list[str]:
     to uint8 cuts off what is negative, and (seen in 1.31) take every float8 for such a type: negative values come
     through.
     """
-    return CUT_OFF_REWRITES if told(has_float8, model) else []
+    return CUT_OFF_REWRITES if is_true_of(has_float8, model) else []
 
 
 def is_true_of(question: Callable[..., bool], *about: Any) -> bool:
@@ -315,7 +315,8 @@ def is_true_of(question: Callable[..., bool], *about: Any) -> bool:
     return False
 
 
-def _session(ort: Any, model: Path | bytes, options: Any) -> Any:
+def open_session(ort: Any, model: Path | bytes, options: Any) -> Any:
+    """Open a graph on the CPU alone, without what would make it another one."""
     content = model if isinstance(model, bytes) else str(model)
     optimizers = {"disabled_optimizers": left_out(model)}
     session = ort.InferenceSession(content, options, providers=[PROVIDER], enable_fallback=0, **optimizers)

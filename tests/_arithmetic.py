@@ -1,0 +1,77 @@
+"""What this machine computes: asked of the product's own probe and of the processor's flags, once in a process.
+
+A test expects what is found here, and so holds on every processor. Where a claim itself needs an instruction, the test
+is marked: ``@pytest.mark.needs("exact openvino", reason="...")``; ``pytest -rs`` lists what was left out, and why.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from collections.abc import Callable
+
+from vlatool.machine.host import MAX_CPU_ISA, VNNI, isa
+from vlatool.machine.instruction_sets import RUNGS, SATURATING, computed_in, rung
+from vlatool.runtime.engine import engine_class
+
+
+@functools.cache
+def products(engine: str) -> str:
+    """Return what an engine says of its int8 products on this machine; ask before a test replaces its probe."""
+    return str(engine_class(engine).arithmetic())
+
+
+def exact(engine: str = "ort_cpu") -> bool:
+    """Whether an engine's int8 products are exact here, by an option of its own or without one."""
+    return products(engine).startswith("exact")
+
+
+def full_range_or_less() -> dict[str, bool]:
+    """Return the options of static int8 with which OpenVINO's products are exact on this processor."""
+    return {} if exact("openvino") else {"reduce_range": True}
+
+
+@functools.cache
+def computes_bfloat16() -> bool:
+    """Whether OpenVINO computes in bfloat16 here."""
+    import openvino
+
+    return "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
+def host_set() -> str:
+    """Return the highest instruction set of this processor; empty when it is no x86 with AVX2."""
+    return rung(isa() or ())
+
+
+def sets_to_confine_to() -> list[str]:
+    """Return the instruction sets that OpenVINO can be confined to on this host, the highest first."""
+    if os.environ.get(MAX_CPU_ISA):
+        return []
+    return [name for name, feature in RUNGS.items() if feature in (isa() or ())]
+
+
+def _openvino() -> bool:
+    return importlib.util.find_spec("openvino") is not None
+
+
+NEEDS: dict[str, Callable[[], bool]] = {
+    "vnni": lambda: any(feature in (isa() or ()) for feature in VNNI),
+    "more than avx2": lambda: host_set() not in ("", *SATURATING) and MAX_CPU_ISA not in os.environ,
+    "exact openvino": lambda: _openvino() and exact("openvino"),
+    "exact onnxruntime": lambda: exact("ort_cpu"),
+    "bfloat16": lambda: _openvino() and computes_bfloat16(),
+}
+"""Word of the marker -> whether this machine has it."""
+
+
+def lacks(need: str, reason: str) -> str:
+    """Return why a test that needs this is skipped here; empty where it runs.
+
+    Raises:
+        KeyError: when the word is none of ``NEEDS``.
+    """
+    if NEEDS[need]():
+        return ""
+    return f"needs {need}, and OpenVINO computes in {computed_in() or 'no x86 set'} here: {reason}"
