@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 
 CPUINFO = Path("/proc/cpuinfo")
+HOST = Path("/proc/self/root/proc/cpuinfo")
+"""The same file by a path that a confined environment does not mask."""
 
 
 def flags(text: str) -> frozenset[str]:

@@ -73,14 +73,14 @@ class InstructionSet:
 
     @property
     def vnni(self) -> bool:
-        """Whether int8 products are exact in it."""
+        """Whether it has products of int8 that are exact; below AVX2 they are slower, and exact as well."""
         return bool({"avx_vnni", "avx512_vnni"} & {*self.needs})
 
     @property
     def expected(self) -> dict[str, bool]:
         """What a library of a confined environment may say: feature -> whether it sees it; others may be either."""
-        told = {**dict.fromkeys(self.hidden, False), **dict.fromkeys(self.needs, True), BFLOAT16: False}
-        return {**told, EXACT_INT8: self.vnni} if "avx2" in self.needs else told
+        told = {**dict.fromkeys(self.hidden, False), **dict.fromkeys(self.needs, True)}
+        return {**told, BFLOAT16: False, EXACT_INT8: self.vnni or "avx2" not in self.needs}
 
     def lacking(self, flags: Collection[str]) -> tuple[str, ...]:
         """Return what a processor with these flags lacks for it."""

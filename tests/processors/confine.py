@@ -17,7 +17,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from _cpuinfo import CPUINFO, flags
+from _cpuinfo import HOST, flags
 from _sets import InstructionSet, RefusedError, listing, named
 
 SAYS = "confine.py"
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Confine, and say what was done."""
     given = parsed(arguments)
     try:
-        has = flags(CPUINFO.read_text())
+        has = flags(HOST.read_text())
         if given.list:
             print("\n".join(listing(has)))
         elif given.able:
