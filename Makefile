@@ -1,28 +1,50 @@
 # Every target makes its own .venv when there is none and installs what it needs.
 PYTHON ?= python3
-VENV := .venv
-BIN := $(VENV)/bin
 PYTHON310 ?= python3.10
 OUT ?= out
 SAMPLES := vln-babyai vla-metaworld vla-flow
+SET :=
 TORCH := torch==2.13.0
 SYSTEM_PACKAGES := libosmesa6 libegl1 libgl1
 
 BASE ?=
 ARM64 ?=
 LADDER ?=
+SETS ?=
 FOREIGN ?= --guides
+
+# SET=avx2 and others: `make test`, `make peers` and `make demo` in an environment of their own, confined to that set.
+ifeq ($(SET),)
+VENV := .venv
+MADE := $(OUT)
+confine =
+else
+MADE := $(OUT)/confined/$(SET)
+VENV := $(MADE)/venv
+CONFINING := capstone pyelftools
+ABLE := able
+confine = $(1)/bin/python tests/processors/confine.py $(1) $(SET)
+export VLATOOL_CACHE := $(abspath $(MADE))/cache
+export VLATOOL_CALIBRATIONS := $(abspath $(MADE))/calibrations
+ifneq ($(filter-out test peers demo confined,$(or $(MAKECMDGOALS),help)),)
+$(error SET is for 'make test', 'make peers' and 'make demo')
+endif
+endif
+BIN := $(VENV)/bin
 
 RUNTIME_WHEEL := $(OUT)/wheels/vlatool_runtime-*.whl
 
-.PHONY: wheels foreign gate peers python310 arm64 ladder help install demo test coverage check robot docs format clean metaworld
+.PHONY: able confined sets wheels foreign gate peers python310 arm64 ladder help install demo test coverage check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-$(BIN)/vlatool: pyproject.toml
+able:
+	@$(PYTHON) tests/processors/confine.py --able $(SET)
+
+$(BIN)/vlatool: pyproject.toml | $(ABLE)
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,sim,text]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,sim,text]' $(CONFINING)
 	@touch $@
 
 install: $(BIN)/vlatool  ## install vlatool with what the demo needs
@@ -31,15 +53,17 @@ $(VENV)/.dev: $(BIN)/vlatool
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,sim,text,dev]'
 	@touch $@
 
-demo: $(BIN)/vlatool  ## optimise the sample policy vln-babyai for a Raspberry Pi 5, with a report
-	$(BIN)/vlatool optimize sample_models/vln-babyai --profile raspberry-pi-5 --max-drop 1% --episodes 1500 -o $(OUT)/vln-babyai --force
+demo: $(BIN)/vlatool  ## optimise the sample policy vln-babyai for a Raspberry Pi 5, with a report (SET=avx2: on an older processor)
+	$(call confine,$(VENV))
+	$(BIN)/vlatool optimize sample_models/vln-babyai --profile raspberry-pi-5 --max-drop 1% --episodes 1500 -o $(MADE)/vln-babyai --force
 
 metaworld: $(BIN)/vlatool  ## install what the sample policies vla-metaworld and vla-flow need
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH) -e '.[ort,build,metaworld]'
 	@ldconfig -p | grep -q libEGL.so.1 || apt-get install -y -qq $(SYSTEM_PACKAGES) || \
 	  echo "headless rendering needs the system packages $(SYSTEM_PACKAGES)"
 
-test: $(VENV)/.dev  ## run the tests
+test: $(VENV)/.dev  ## run the tests (SET=avx2: as on a processor with AVX2 alone; docs/processors.md)
+	$(call confine,$(VENV))
 	$(BIN)/python -m pytest -n auto
 
 coverage: $(VENV)/.dev  ## run the tests with coverage, in about twice the time; below 90 % fails
@@ -76,13 +100,21 @@ arm64: $(BIN)/vlatool  ## run both samples' bundles on emulated 64-bit ARM and c
 ladder: $(VENV)/.dev  ## hold every layout on every engine and instruction set of this host against what its graphs say
 	$(BIN)/python tests/processors/ladder.py -o $(OUT)/processors $(LADDER)
 
+confined: $(VENV)/.dev
+	$(call confine,$(VENV))
+
+sets: $(VENV)/.dev  ## make bundles under every instruction set that this host can be confined to and load them under every other
+	for set in $$($(BIN)/python tests/processors/sets_table.py --names); do $(MAKE) confined SET=$$set || exit 2; done
+	$(BIN)/python tests/processors/sets_table.py -o $(OUT)/confined $(SETS)
+
 gate: $(BIN)/vlatool  ## hold the sample policies against those that the commit before makes (BASE=COMMIT names another)
 	$(BIN)/python tests/own_gate/gate_samples.py --base "$(BASE)" -o $(OUT)/gate
 
-peers:  ## measure other tools and our bundles on six workloads, interleaved (about an hour)
-	@test -x $(OUT)/peers/venv/bin/python || $(PYTHON) -m venv $(OUT)/peers/venv
-	$(OUT)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/peers/requirements.txt -e '.[ort,build]'
-	PYTHONPATH=. $(OUT)/peers/venv/bin/python tests/peers/table.py
+peers: $(ABLE)  ## measure other tools and our bundles on six workloads, interleaved (about an hour; SET=avx2: on an older processor)
+	@test -x $(MADE)/peers/venv/bin/python || $(PYTHON) -m venv $(MADE)/peers/venv
+	$(MADE)/peers/venv/bin/python -m pip install --quiet --disable-pip-version-check $(TORCH) -r tests/peers/requirements.txt -e '.[ort,build]' $(CONFINING)
+	$(call confine,$(MADE)/peers/venv)
+	PYTHONPATH=. $(MADE)/peers/venv/bin/python tests/peers/table.py
 
 $(OUT)/foreign/common/.made: tests/foreign/common.txt pyproject.toml
 	@test -x $(OUT)/foreign/common/bin/python || $(PYTHON) -m venv $(OUT)/foreign/common

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
-from pathlib import Path
+
+from _cpuinfo import CPUINFO as CPUINFO
+from _cpuinfo import flags
 
 from vlatool.machine.host import MAX_CPU_ISA
 
-CPUINFO = Path("/proc/cpuinfo")
 AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl")
 
 
@@ -51,12 +52,6 @@ RUNGS = (
     Rung("AVX2", "openvino", ("avx2",), "AVX2"),
 )
 """ONNX Runtime's kernels have no such variable, so that one of its rungs is emulated."""
-
-
-def flags(text: str) -> frozenset[str]:
-    """Return the flags that every core in a ``/proc/cpuinfo`` has; none where there is no such line."""
-    lines = re.findall(r"^flags\s*:\s*(.*)$", text, re.MULTILINE)
-    return frozenset.intersection(*(frozenset(line.split()) for line in lines)) if lines else frozenset()
 
 
 def model(text: str) -> str:

@@ -116,7 +116,7 @@ def make(source: str, variants: Sequence[Variant], out: Path, count: int) -> Mad
     for variant in variants:
         if not variant.command:
             continue
-        place = out / variant.name.replace(" ", "-")
+        place = out / folder(variant)
         error = vlatool(*variant.command, str(bundles[FLOAT.name]), "-o", str(place))
         bundles[variant.name] = place
         if error:
@@ -128,12 +128,18 @@ def make(source: str, variants: Sequence[Variant], out: Path, count: int) -> Mad
     return Made(Path(source).name, bundles, refused, out / "observations.npz", recorded, number)
 
 
+def folder(variant: Variant) -> str:
+    """Return the name of its directory."""
+    return variant.name.replace(" ", "-")
+
+
 def vlatool(*words: str) -> str:
     """Run a command of vlatool, and return what it says when it fails."""
     done = subprocess.run(
         [sys.executable, "-m", "vlatool", *words, "--force"], cwd=ROOT, capture_output=True, text=True, check=False
     )
     lines = [line for line in done.stderr.splitlines() if line.strip()]
+    lines = [line for line in lines if line.startswith("error: ")] or lines
     return "" if not done.returncode else (lines[-1] if lines else f"it left with {done.returncode}")
 
 
