@@ -91,7 +91,9 @@ def environment(path: Path) -> Environment:
         RefusedError: when it cannot, or there is none.
     """
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        raise RefusedError(f"environments are confined on Linux on x86-64; this is {sys.platform} on {platform.machine()}.")
+        raise RefusedError(
+            f"environments are confined on Linux on x86-64; this is {sys.platform} on {platform.machine()}."
+        )
     root = path.absolute()
     if not (root / "pyvenv.cfg").is_file() or not (root / "bin/python").exists():
         raise RefusedError(f"{path} is not a virtual environment: make one with python3 -m venv {path}.")

@@ -153,7 +153,9 @@ def rows_of(source: str, places: Sequence[Place], given: argparse.Namespace) -> 
             yield unmade((maker.name, "-", "-", name), variants[why], bundles.refused[why])
         for loader, engine in product(places, BOTH):
             print(f"{name}: made under {maker.name}, loaded under {loader.name} in {engine}", flush=True)
-            answers = asked(bundles, loader, engine, variants, out.parent / "answers" / f"{name}-{loader.name}-{engine}")
+            answers = asked(
+                bundles, loader, engine, variants, out.parent / "answers" / f"{name}-{loader.name}-{engine}"
+            )
             where = (maker.name, loader.name, engine, name)
             yield from (row(where, variants[each], answer, bundles.said[each]) for each, answer in answers.items())
 
@@ -186,9 +188,13 @@ def _environment(out: Path) -> dict[str, str]:
     return {**os.environ, "VLATOOL_CACHE": str(out.parent / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def asked(bundles: Bundles, loader: Place, engine: str, variants: Mapping[str, Variant], out: Path) -> dict[str, Answer]:
+def asked(
+    bundles: Bundles, loader: Place, engine: str, variants: Mapping[str, Variant], out: Path
+) -> dict[str, Answer]:
     """Load the bundles in a place and an engine, and let them act."""
-    paths = {name: path for name, path in bundles.paths.items() if name in variants and engine in variants[name].engines}
+    paths = {
+        name: path for name, path in bundles.paths.items() if name in variants and engine in variants[name].engines
+    }
     return ask([str(loader.python)], paths, bundles.observations, out, engine, tell=lambda line: None)
 
 

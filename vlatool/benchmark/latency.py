@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field, PrivateAttr
@@ -15,13 +16,14 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
-from vlatool.graph.workload import WORK, whole_work, workload
+from vlatool.graph.workload import WORK, Workload, whole_work, workload
 from vlatool.graph.zeros import zero_share
 from vlatool.machine.host import fingerprint
 from vlatool.measurement import agent
 from vlatool.measurement.interleaved import MOST
 from vlatool.measurement.jobs import LatencyJob, Limits
-from vlatool.measurement.measured import Measured
+from vlatool.measurement.measured import Measured, PolicyRun
+from vlatool.measurement.reach import REPEATS, SIZE, share_of_reach
 from vlatool.measurement.rows import measurements, raw, sustained, tables
 from vlatool.measurement.validity import findings, validity
 from vlatool.report import Finding, Measurement, Report, Row
@@ -68,6 +70,9 @@ class Latency(Measure):
     cold: bool = Field(True, description="also load each bundle in fresh processes: cold start, and memory by part")
     phase: bool = Field(True, description="also time the parts of an inference: encoding, each graph, decoding")
     answers: bool = Field(True, description="also look for answers that change in the run, or come from memory")
+    reach: bool = Field(
+        True, description="also time a large matrix product in the same engine, and which share of its speed is reached"
+    )
     cores: int = Field(0, ge=0, le=4096, description="processors that the policy may use; all when 0")
     memory_mb: float = Field(
         0.0, ge=0, le=1e9, description="memory that its process may use in MB (10^6 bytes); all when 0"
@@ -164,6 +169,7 @@ class Latency(Measure):
             cold=COLD_STARTS if self.cold else 0,
             check=self.answers,
             limits=Limits(processors(self.pin), self.cores, self.memory_mb),
+            reach=self.reach,
         )
 
     def _report(self, bundles: Sequence[Bundle], job: LatencyJob, run: Measured, where: str) -> Report:
@@ -176,7 +182,10 @@ class Latency(Measure):
             numbers += sustained(policy.samples) if self.sustained else []
             if bundle.manifest.graphs:
                 numbers.append(Measurement("size", bundle.graph_bytes / 1e6, "MB", note="graphs on disk"))
-            details = tables(run, policy, not others) | _work(bundle, policy.engine)
+            work = _work(bundle)
+            numbers += _arithmetic(work, policy)
+            details = tables(run, policy, not others)
+            details |= {WORK: [{**whole_work(work), "engine": policy.engine}]} if work else {}
             if policy is reference and (lines := run.log.strip().splitlines()):
                 details["log"] = [{"line": line} for line in lines[-LOG_LINES:]]
             role = "baseline" if policy is reference and others else "subject"
@@ -279,11 +288,24 @@ def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Measured) -> It
         )
 
 
-def _work(bundle: Bundle, engine: str) -> dict[str, list[dict[str, Any]]]:
-    """Return what one inference computes, from which predictions for the board can learn; nothing without onnx."""
+def _work(bundle: Bundle) -> Workload | None:
+    """Return what one inference computes, from which predictions for the board can learn; None without onnx."""
     if not bundle.manifest.graphs:
-        return {}
+        return None
     try:
-        return {WORK: [{**whole_work(workload(bundle)), "engine": engine}]}
+        return workload(bundle)
     except (MissingExtra, GraphError):
-        return {}
+        return None
+
+
+def _arithmetic(work: Workload | None, policy: PolicyRun) -> list[Measurement]:
+    """Return how much a policy computes in a second, and which share that is of a large product in the same engine."""
+    latency = median(policy.samples) / 1e3 if policy.samples else 0.0
+    if work is None or not policy.reach or work.unknown or latency <= 0:
+        return []
+    total, product = sum(work.macs.values()), ", ".join(f"{dtype} {gmacs:.3g}" for dtype, gmacs in policy.reach.items())
+    numbers = [Measurement("gmacs", total / latency / 1e9, "GMAC/s", samples=len(policy.samples),
+                           note=f"{total / 1e9:.3g} GMAC in one inference")]  # fmt: skip
+    share = share_of_reach(work.macs, policy.reach, latency)
+    note = f"time that the same work takes at the speed of a product of {SIZE}^3 in this run (GMAC/s: {product})"
+    return numbers if share is None else [*numbers, Measurement("reach_share", share, "1", samples=REPEATS, note=note)]

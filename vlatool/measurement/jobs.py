@@ -42,6 +42,7 @@ class LatencyJob:
         cold: Fresh processes for the cold start of each.
         check: Also look for answers that differ between runs, and for answers from memory.
         limits: Of every process.
+        reach: Also time a large matrix product in what each policy computes in.
     """
 
     bundles: tuple[str, ...]
@@ -55,6 +56,7 @@ class LatencyJob:
     cold: int = 0
     check: bool = True
     limits: Limits = Limits()
+    reach: bool = False
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,8 @@ class PolicyRun:
         engines: For each graph what runs it; none in eager torch.
         golden_error: Relative difference of the golden action; None without one.
         golden_explained: The largest that rounding explains.
+        reach: Dtype -> 10^9 multiply-accumulates in a second of a large matrix product in the same engine
+            (``reach.reached``); none where it was not timed.
         answers: Of the timed calls; None when they were not looked at.
         memory: None when it was not looked for, or cannot be.
         phases: The parts of an inference; none when they were not timed.
@@ -92,6 +94,7 @@ class PolicyRun:
     engines: tuple[GraphEngine, ...] = ()
     golden_error: float | None = None
     golden_explained: float = 0.0
+    reach: Mapping[str, float] = field(default_factory=dict)
     answers: AnswerCheck | None = None
     memory: Memory | None = None
     phases: tuple[Phase, ...] = ()

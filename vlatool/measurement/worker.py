@@ -7,6 +7,7 @@ end ``Measured``, or what it raised. It imports what a robot imports, so that it
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import resource
@@ -18,7 +19,7 @@ from typing import IO
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import BundleError
+from vlatool.errors import BundleError, GraphError
 from vlatool.machine.processes import die_with_parent
 from vlatool.measurement import child
 from vlatool.measurement.answers import Memory, expected_answers, remembered
@@ -28,6 +29,7 @@ from vlatool.measurement.jobs import LatencyJob, WorkerJob
 from vlatool.measurement.measured import GraphEngine, Measured, Pace, Phase, PolicyRun
 from vlatool.measurement.paced import run_paced
 from vlatool.measurement.phases import time_phases
+from vlatool.measurement.reach import DTYPES, reached
 from vlatool.runtime.policy import Policy
 from vlatool.user_code import trust
 
@@ -158,6 +160,8 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
     if job.phases and contestant.bundle.manifest.graphs:
         tell("timing the phases", None)
         phases = time_phases(policy, contestant.observations, EXTRA_S)
+    if job.reach and contestant.bundle.manifest.graphs:
+        tell("timing a large product", None)
     return PolicyRun(
         name=contestant.name,
         blocks_ms=tuple(tuple(round(value, 6) for value in block) for block in contestant.blocks),
@@ -166,11 +170,22 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
         engines=tuple(_engines(policy)),
         golden_error=policy.golden_error,
         golden_explained=policy.golden_explained,
+        reach=_reach(policy, job.threads) if job.reach else {},
         answers=None if contestant.answers is None else contestant.answers.check(),
         memory=memory,
         phases=tuple(phases),
         pace=pace,
     )
+
+
+def _reach(policy: Policy, threads: int) -> dict[str, float]:
+    """Return what the policy's engine reaches in each dtype that its graphs compute in, as far as it can be asked."""
+    graphs = policy.bundle.manifest.graphs.values()
+    found: dict[str, float] = {}
+    for dtype in {dtype for graph in graphs for dtype in graph.precision}.intersection(DTYPES):
+        with contextlib.suppress(GraphError):
+            found[dtype] = round(reached(policy.engine, dtype, threads), 3)
+    return found
 
 
 def _engines(policy: Policy) -> Iterator[GraphEngine]:

@@ -63,7 +63,7 @@ SECONDS = 120.0
 SAMPLES = 8
 """Observations on which it is measured, at most."""
 TIMED = 20
-QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False}
+QUICK: dict[str, Any] = {"duration": 0, "cold": False, "phase": False, "answers": False, "reach": False}
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ ROLES = {"subject": "measured", "within": "within limits", "outside": "outside l
 ERROR_OF_DIMENSION = re.compile(r"^(error\w*)\.(.+)$")
 PERCENTILES = ("latency_p50", "latency_p90", "latency_p95", "latency_p99", "latency_p99.9", "latency_max")
 ORDER = (
-    "speedup", "throughput", "jitter", "deadline_misses", "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99",
+    "speedup", "throughput", "gmacs", "reach_share", "jitter", "deadline_misses",
+    "age_p50", "age_p99", "age_max", "wakeup_p50", "wakeup_p99",
     "latency_start_p50", "latency_sustained_p50", "sustained_slowdown", "cold_start", "cpu",
     "size", "peak_rss", "steady_rss", "energy_per_action", "power_mean", "temperature_max",
 )  # fmt: skip
