@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _limits import LIMITS, dtype_of
 from _ours import COMMANDS, MARK, bundle_of, make
 from _peers import PEERS, REFERENCE
 from _workload import Array, PeersError, Workload, environment, last_words, run_child
@@ -30,6 +31,7 @@ class Contestant:
         opens: What the worker is told to open.
         failed: Why it has no figures; empty when it has.
         engine: What runs it: ``ort_cpu``, ``openvino``, empty for others.
+        dtypes: Dtype -> share of its multiply-accumulates.
         group: Contestants of one group took turns; the reference is in each.
         rounds: Clock -> median milliseconds of each round.
         reference: Clock -> the reference's, in the same rounds.
@@ -42,6 +44,7 @@ class Contestant:
     peak_mb: float = float("nan")
     load_s: float = float("nan")
     engine: str = ""
+    dtypes: dict[str, float] = field(default_factory=dict)
     group: int = -1
     rounds: dict[str, list[float]] = field(default_factory=lambda: {clock: [] for clock in CLOCKS})
     reference: dict[str, list[float]] = field(default_factory=lambda: {clock: [] for clock in CLOCKS})
@@ -104,6 +107,8 @@ class Worker:
 def build(workload: Workload, contestant: Contestant) -> None:
     """Make the contestant's model where it is not there yet; a failure is noted in its row."""
     try:
+        if contestant.name in LIMITS:
+            return
         if not contestant.ours:
             if not PEERS[contestant.name].built(workload):
                 command = [sys.executable, str(WORKER), "--build", "--folder", str(workload.folder)]
@@ -178,7 +183,12 @@ class Contest:
             return None
         if self._expected is None:
             self._expected = outputs
+        if contestant.name in LIMITS:
+            contestant.engine, dtype = LIMITS[contestant.name]
+            contestant.dtypes = {dtype: 1.0}
+            return worker
         contestant.error = mean_error(outputs, self._expected)
+        contestant.dtypes = dtypes_of(contestant)
         contestant.engine = engine_of(contestant)
         contestant.peak_mb = peak
         self.tell(f"  {contestant.name}: error {contestant.error:.4f}, {contestant.peak_mb:.0f} MB")
@@ -216,6 +226,15 @@ def engine_of(contestant: Contestant) -> str:
         return {"ort": "ort_cpu", "openvino": "openvino", "nncf": "openvino"}.get(contestant.name.partition(":")[0], "")
     manifest = json.loads(Path(contestant.opens.removeprefix(MARK), "manifest.json").read_text(encoding="utf-8"))
     return str(manifest.get("engine") or "ort_cpu")
+
+
+def dtypes_of(contestant: Contestant) -> dict[str, float]:
+    """Return what a contestant computes in: dtype -> share of its multiply-accumulates."""
+    if not contestant.ours:
+        return {dtype_of(contestant.name): 1.0}
+    manifest = json.loads(Path(contestant.opens.removeprefix(MARK), "manifest.json").read_text(encoding="utf-8"))
+    shares: dict[str, float] = manifest["graphs"]["main"]["precision"]
+    return {dtype: share for dtype, share in shares.items() if share}
 
 
 def resident_mb(worker: Worker) -> float:

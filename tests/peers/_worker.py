@@ -21,6 +21,7 @@ from typing import Any, TextIO
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
+from _limits import LIMITS, open_limit  # noqa: E402
 from _ours import MARK, open_bundle  # noqa: E402
 from _peers import PEERS  # noqa: E402
 from _workload import Feeds, Infer, Workload  # noqa: E402
@@ -86,6 +87,8 @@ def serve(workload: Workload, contestant: str, core: int | None, answers: TextIO
 
 def opened(workload: Workload, contestant: str) -> tuple[Infer, list[Feeds]]:
     """Return one inference and its inputs."""
+    if contestant in LIMITS:
+        return open_limit(contestant), [{}] * 12
     if contestant.startswith(MARK):
         return open_bundle(workload, Path(contestant.removeprefix(MARK)))
     peer = PEERS[contestant]

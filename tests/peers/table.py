@@ -26,10 +26,14 @@ for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 from _interleave import CLOCKS, Contest, Contestant, build  # noqa: E402
-from _ours import COMMANDS, MARK, bundle_of  # noqa: E402
+from _limits import LIMITS, macs_of  # noqa: E402
+from _ours import COMMANDS, HALF, MARK, bundle_of  # noqa: E402
 from _peers import PEERS, REFERENCE  # noqa: E402
 from _report import Table, markdown, read, save  # noqa: E402
 from _workload import WORKLOADS, PeersError, Workload, remove  # noqa: E402
+
+from vlatool.machine.host import isa  # noqa: E402
+from vlatool.machine.instruction_sets import rung  # noqa: E402
 
 PACKAGES = ("torch", "torchao", "onnx", "onnxruntime", "openvino", "nncf", "numpy")
 
@@ -74,7 +78,7 @@ def main() -> int:
             print(f"{name}: {error}", file=sys.stderr)
             passed = False
             continue
-        table = Table(name, rows, given.clock)
+        table = Table(name, rows, given.clock, about.get("macs", 0.0), about.get("set", ""))
         section = f"{markdown(table)}\n{told(about)} {share(rows)}\n"
         passed = passed and all(check.passed for check in table.checks())
         print(section, flush=True)
@@ -113,6 +117,8 @@ def measure(workload: Workload, contestants: list[Contestant], given: argparse.N
     Contest(workload, given.core, given.rounds, given.block, given.memory_gb * 1e3, tell).run(contestants)
     about = {
         "workload": workload.name,
+        "macs": macs_of(workload.bundle),
+        "set": rung(isa() or ()),
         "processor": processor(),
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
@@ -129,7 +135,7 @@ def measure(workload: Workload, contestants: list[Contestant], given: argparse.N
 def chosen(workload: Workload, given: argparse.Namespace) -> list[Contestant]:
     """Return the contestants, the reference first; those in one group with the fastest are at the front."""
     names = [REFERENCE, *(f"{MARK}{name}" for name in COMMANDS), *(name for name in PEERS if name != REFERENCE)]
-    found = [Contestant(name, name) for name in names]
+    found = [Contestant(name, name) for name in (*LIMITS, *names)]
     for text in given.ours:
         name, _, path = text.partition("=")
         if name not in WORKLOADS or not Path(path, "manifest.json").is_file():
@@ -143,7 +149,17 @@ def chosen(workload: Workload, given: argparse.Namespace) -> list[Contestant]:
             fnmatch.fnmatch(name, glob) for glob in given.skip
         )
 
-    return [each for each in found if each.name == REFERENCE or wanted(each.name)]
+    fits = [each for each in found if HALF == "bf16" or not needs_bfloat16(each.name)]
+    lacks = [each.name for each in found if each not in fits]
+    if lacks:
+        tell(f"  left out, since this processor does not compute in bfloat16: {', '.join(lacks)}")
+    always = (REFERENCE, *LIMITS)
+    return [each for each in fits if each.name in always or wanted(each.name)]
+
+
+def needs_bfloat16(name: str) -> bool:
+    """Say whether a contestant computes in bfloat16."""
+    return any(word in name for word in ("bf16", "bfloat16"))
 
 
 def forget(workload: Workload, contestant: Contestant) -> None:
@@ -151,7 +167,7 @@ def forget(workload: Workload, contestant: Contestant) -> None:
     own = contestant.name.removeprefix(MARK)
     if contestant.ours and COMMANDS.get(own):
         remove(bundle_of(workload, own))
-    elif not contestant.ours and PEERS[contestant.name].make is not None:
+    elif not contestant.ours and contestant.name not in LIMITS and PEERS[contestant.name].make is not None:
         remove(PEERS[contestant.name].model(workload).parent)
 
 
