@@ -2,8 +2,8 @@
 
 Each CPUID instruction of the environment's libraries is replaced by one that traps, and the environment's Python is
 replaced by a program that starts the real one with a library that answers these traps without the hidden features
-(``confined/hide.c``, ``confined/launch.c``). All that starts the environment's Python is confined with it: children, isolated
-ones (``-I``) and those with an empty environment. Another Python is not.
+(``confined/hide.c``, ``confined/launch.c``). Whatever starts the environment's Python is confined with it: children,
+isolated ones (``-I``) and those with an empty environment. Another Python is not.
 """
 
 from __future__ import annotations
@@ -91,7 +91,9 @@ def environment(path: Path) -> Environment:
         RefusedError: when it cannot, or there is none.
     """
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        raise RefusedError(f"environments are confined on Linux on x86-64; this is {sys.platform} on {platform.machine()}.")
+        raise RefusedError(
+            f"environments are confined on Linux on x86-64; this is {sys.platform} on {platform.machine()}."
+        )
     root = path.absolute()
     if not (root / "pyvenv.cfg").is_file() or not (root / "bin/python").exists():
         raise RefusedError(f"{path} is not a virtual environment: make one with python3 -m venv {path}.")

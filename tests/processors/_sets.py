@@ -1,7 +1,8 @@
 """Instruction sets that an environment can be confined to: what each keeps, and what a host needs to have for it.
 
 Standard library alone, so that a set is refused before anything is installed. Features go by their names in
-``/proc/cpuinfo``; where CPUID tells each of them is in Intel's manual (volume 2A, CPUID) and in ``cpufeatures.h`` of Linux.
+``/proc/cpuinfo``; where CPUID tells each of them is in Intel's manual (volume 2A, CPUID) and in ``cpufeatures.h`` of
+Linux.
 """
 
 from __future__ import annotations
@@ -15,16 +16,33 @@ ANY = 0xFFFFFFFF
 BITS = {
     (0x1, ANY, "ecx"): {"fma": 12, "avx": 28, "f16c": 29},
     (0x7, 0, "ebx"): {
-        **{"avx2": 5, "avx512f": 16, "avx512dq": 17, "avx512ifma": 21, "avx512pf": 26, "avx512er": 27},
-        **{"avx512cd": 28, "avx512bw": 30, "avx512vl": 31},
+        "avx2": 5,
+        "avx512f": 16,
+        "avx512dq": 17,
+        "avx512ifma": 21,
+        "avx512pf": 26,
+        "avx512er": 27,
+        "avx512cd": 28,
+        "avx512bw": 30,
+        "avx512vl": 31,
     },
     (0x7, 0, "ecx"): {
-        **{"avx512vbmi": 1, "avx512_vbmi2": 6, "vaes": 9, "vpclmulqdq": 10, "avx512_vnni": 11},
-        **{"avx512_bitalg": 12, "avx512_vpopcntdq": 14},
+        "avx512vbmi": 1,
+        "avx512_vbmi2": 6,
+        "vaes": 9,
+        "vpclmulqdq": 10,
+        "avx512_vnni": 11,
+        "avx512_bitalg": 12,
+        "avx512_vpopcntdq": 14,
     },
     (0x7, 0, "edx"): {
-        **{"avx512_4vnniw": 2, "avx512_4fmaps": 3, "avx512_vp2intersect": 8, "avx512_fp16": 23},
-        **{"amx_bf16": 22, "amx_tile": 24, "amx_int8": 25},
+        "avx512_4vnniw": 2,
+        "avx512_4fmaps": 3,
+        "avx512_vp2intersect": 8,
+        "avx512_fp16": 23,
+        "amx_bf16": 22,
+        "amx_tile": 24,
+        "amx_int8": 25,
     },
     (0x7, 1, "eax"): {"avx_vnni": 4, "avx512_bf16": 5, "amx_fp16": 21, "avx_ifma": 23},
     (0x7, 1, "edx"): {"avx_vnni_int8": 4, "avx_ne_convert": 5, "amx_complex": 8, "avx_vnni_int16": 10, "avx10": 19},

@@ -1,4 +1,4 @@
-"""Bundles made under each instruction set and loaded under each other: do they act as promised, or does load refuse them?
+"""Bundles made under each instruction set and loaded under each other: do they act as promised, or are they refused?
 
 Usage: python tests/processors/sets_table.py [--sources SOURCE ...] [--sets SET ...] [--variants NAME ...]
            [--observations COUNT] [--names] [-o out/confined]
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -153,7 +154,9 @@ def rows_of(source: str, places: Sequence[Place], given: argparse.Namespace) -> 
             yield unmade((maker.name, "-", "-", name), variants[why], bundles.refused[why])
         for loader, engine in product(places, BOTH):
             print(f"{name}: made under {maker.name}, loaded under {loader.name} in {engine}", flush=True)
-            answers = asked(bundles, loader, engine, variants, out.parent / "answers" / f"{name}-{loader.name}-{engine}")
+            answers = asked(
+                bundles, loader, engine, variants, out.parent / "answers" / f"{name}-{loader.name}-{engine}"
+            )
             where = (maker.name, loader.name, engine, name)
             yield from (row(where, variants[each], answer, bundles.said[each]) for each, answer in answers.items())
 
@@ -167,7 +170,7 @@ def made(source: str, place: Place, variants: Sequence[str], count: int, out: Pa
     print(f"{Path(source).name}: making bundles under {place.name}", flush=True)
     words = [str(place.python), str(MAKES), source, "-o", str(out), "--observations", str(count)]
     done = subprocess.run(
-        [*words, "--variants", *variants], cwd=ROOT, env=_environment(out), capture_output=True, text=True, check=False
+        [*words, "--variants", *variants], cwd=ROOT, env=variables(out), capture_output=True, text=True, check=False
     )
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
@@ -179,16 +182,18 @@ def made(source: str, place: Place, variants: Sequence[str], count: int, out: Pa
     return Bundles(place, paths, told["refused"], observations, said)
 
 
-def _environment(out: Path) -> dict[str, str]:
+def variables(out: Path) -> dict[str, str]:
     """Return an environment with a cache of this place's own: what another made is not of this set."""
-    import os
-
     return {**os.environ, "VLATOOL_CACHE": str(out.parent / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def asked(bundles: Bundles, loader: Place, engine: str, variants: Mapping[str, Variant], out: Path) -> dict[str, Answer]:
+def asked(
+    bundles: Bundles, loader: Place, engine: str, variants: Mapping[str, Variant], out: Path
+) -> dict[str, Answer]:
     """Load the bundles in a place and an engine, and let them act."""
-    paths = {name: path for name, path in bundles.paths.items() if name in variants and engine in variants[name].engines}
+    paths = {
+        name: path for name, path in bundles.paths.items() if name in variants and engine in variants[name].engines
+    }
     return ask([str(loader.python)], paths, bundles.observations, out, engine, tell=lambda line: None)
 
 
