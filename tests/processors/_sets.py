@@ -57,7 +57,7 @@ BFLOAT16 = "bfloat16 in the processor"
 """What libraries tell of themselves without the name of a feature."""
 
 OLD = ("ssse3", "sse4_1", "sse4_2", "popcnt")
-"""What numpy's and OpenVINO's wheels cannot do without: no set is below it."""
+"""What numpy's wheels cannot do without: no set is below it."""
 AVX2 = ("avx", "f16c", "fma", "avx2")
 AVX512 = (*AVX2, "avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl")
 VAES = ("vaes", "vpclmulqdq")
@@ -106,7 +106,7 @@ class InstructionSet:
 
 
 SETS = (
-    InstructionSet("sse42", OLD, like="Atom before 2021, as in many industrial PCs"),
+    InstructionSet("sse42", OLD, like="Celeron J4125, N5105"),
     InstructionSet("avx", (*OLD, "avx"), like="Sandy Bridge"),
     InstructionSet("avx2", (*OLD, *AVX2), VAES, "Haswell to Comet Lake; Zen to Zen 3"),
     InstructionSet("avx2_vnni", (*OLD, *AVX2, "avx_vnni"), VAES, "Alder Lake, N100"),

@@ -14,7 +14,6 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from shutil import rmtree
 
 from _variants import FOR_X86, VariantError, folder, make
 
@@ -30,7 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, required=True)
     given = parser.parse_args(arguments)
     variants = [each for each in FOR_X86 if each.name in given.variants]
-    rmtree(given.output, ignore_errors=True)  # what an earlier run left would pass for what this one made
+    if given.output.exists() and any(given.output.iterdir()):
+        print(f"{given.output} is not empty: what it holds would pass for what this run made", file=sys.stderr)
+        return 1
     try:
         made = make(given.source, variants, given.output, given.observations)
     except VariantError as error:

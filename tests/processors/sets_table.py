@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -168,6 +169,7 @@ def made(source: str, place: Place, variants: Sequence[str], count: int, out: Pa
         TableError: when the policy cannot be exported there.
     """
     print(f"{Path(source).name}: making bundles under {place.name}", flush=True)
+    shutil.rmtree(out, ignore_errors=True)
     words = [str(place.python), str(MAKES), source, "-o", str(out), "--observations", str(count)]
     done = subprocess.run(
         [*words, "--variants", *variants], cwd=ROOT, env=variables(out), capture_output=True, text=True, check=False

@@ -1,6 +1,7 @@
 """Bundles made under each set and loaded under each other: which sets are tried, and what is wrong."""
 
 import json
+import shutil
 
 import makes
 import numpy as np
@@ -80,21 +81,23 @@ def test_the_usual_variants_are_some_of_all():
     assert {*sets_table.VARIANTS} < {each.name for each in FOR_X86}
 
 
-def test_a_bundle_with_a_finding_is_tried_and_what_an_earlier_run_left_is_not(tmp_path, capsys, monkeypatch):
+def test_a_bundle_with_a_finding_is_tried_and_what_an_earlier_run_left_is_refused(tmp_path, capsys, monkeypatch):
     def make(source, variants, out, count):
         for name in ("float32", "dynamic-int8"):
             (out / name).mkdir(parents=True)
             (out / name / "manifest.json").touch()
         return Made("p", {}, {"dynamic-int8": "wrong", "ort uint8": "no"}, out / "observations.npz", 1, 1)
 
-    (tmp_path / "made/ort-uint8").mkdir(parents=True)
-    (tmp_path / "made/ort-uint8/manifest.json").touch()
     monkeypatch.setattr(makes, "make", make)
     words = ["p", "-o", str(tmp_path / "made"), "--variants", "float32", "dynamic-int8", "ort uint8"]
     assert makes.main(words) == 0
     told = json.loads(capsys.readouterr().out)
     assert sorted(told["bundles"]) == ["dynamic-int8", "float32"]
     assert told["refused"] == {"ort uint8": "no"}
+
+    assert makes.main(words) == 1
+    assert "is not empty" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "made")
 
     def fail(*words):
         raise VariantError("p cannot be exported: no")
