@@ -2,8 +2,8 @@
 
 Each CPUID instruction of the environment's libraries is replaced by one that traps, and the environment's Python is
 replaced by a program that starts the real one with a library that answers these traps without the hidden features
-(``confined/hide.c``, ``confined/launch.c``). All that starts the environment's Python is confined with it: children, isolated
-ones (``-I``) and those with an empty environment. Another Python is not.
+(``confined/hide.c``, ``confined/launch.c``). Whatever starts the environment's Python is confined with it: children,
+isolated ones (``-I``) and those with an empty environment. Another Python is not.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import Any
 CPUID, MARK = b"\x0f\xa2", b"\x0f\x04"
 ELF = b"\x7fELF"
 TABLE = b"\x01\x1b\x03\x3b"
-"""Head of ``.eh_frame_hdr`` as linkers write it: version 1; the table is sorted, of pairs of 32 bits from its own start."""
+"""Head of ``.eh_frame_hdr`` as linkers write it: version 1; a sorted table of pairs of 32 bits from its own start."""
 LONGEST = 1 << 20
 """Bytes of a function at most: what begins further away is another."""
 BEFORE = 256

@@ -1,7 +1,8 @@
 """Instruction sets that an environment can be confined to: what each keeps, and what a host needs to have for it.
 
 Standard library alone, so that a set is refused before anything is installed. Features go by their names in
-``/proc/cpuinfo``; where CPUID tells each of them is in Intel's manual (volume 2A, CPUID) and in ``cpufeatures.h`` of Linux.
+``/proc/cpuinfo``; where CPUID tells each of them is in Intel's manual (volume 2A, CPUID) and in ``cpufeatures.h`` of
+Linux.
 """
 
 from __future__ import annotations
@@ -15,16 +16,33 @@ ANY = 0xFFFFFFFF
 BITS = {
     (0x1, ANY, "ecx"): {"fma": 12, "avx": 28, "f16c": 29},
     (0x7, 0, "ebx"): {
-        **{"avx2": 5, "avx512f": 16, "avx512dq": 17, "avx512ifma": 21, "avx512pf": 26, "avx512er": 27},
-        **{"avx512cd": 28, "avx512bw": 30, "avx512vl": 31},
+        "avx2": 5,
+        "avx512f": 16,
+        "avx512dq": 17,
+        "avx512ifma": 21,
+        "avx512pf": 26,
+        "avx512er": 27,
+        "avx512cd": 28,
+        "avx512bw": 30,
+        "avx512vl": 31,
     },
     (0x7, 0, "ecx"): {
-        **{"avx512vbmi": 1, "avx512_vbmi2": 6, "vaes": 9, "vpclmulqdq": 10, "avx512_vnni": 11},
-        **{"avx512_bitalg": 12, "avx512_vpopcntdq": 14},
+        "avx512vbmi": 1,
+        "avx512_vbmi2": 6,
+        "vaes": 9,
+        "vpclmulqdq": 10,
+        "avx512_vnni": 11,
+        "avx512_bitalg": 12,
+        "avx512_vpopcntdq": 14,
     },
     (0x7, 0, "edx"): {
-        **{"avx512_4vnniw": 2, "avx512_4fmaps": 3, "avx512_vp2intersect": 8, "avx512_fp16": 23},
-        **{"amx_bf16": 22, "amx_tile": 24, "amx_int8": 25},
+        "avx512_4vnniw": 2,
+        "avx512_4fmaps": 3,
+        "avx512_vp2intersect": 8,
+        "avx512_fp16": 23,
+        "amx_bf16": 22,
+        "amx_tile": 24,
+        "amx_int8": 25,
     },
     (0x7, 1, "eax"): {"avx_vnni": 4, "avx512_bf16": 5, "amx_fp16": 21, "avx_ifma": 23},
     (0x7, 1, "edx"): {"avx_vnni_int8": 4, "avx_ne_convert": 5, "amx_complex": 8, "avx_vnni_int16": 10, "avx10": 19},
@@ -39,7 +57,7 @@ BFLOAT16 = "bfloat16 in the processor"
 """What libraries tell of themselves without the name of a feature."""
 
 OLD = ("ssse3", "sse4_1", "sse4_2", "popcnt")
-"""What numpy's and OpenVINO's wheels cannot do without: no set is below it."""
+"""What numpy's wheels cannot do without: no set is below it."""
 AVX2 = ("avx", "f16c", "fma", "avx2")
 AVX512 = (*AVX2, "avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl")
 VAES = ("vaes", "vpclmulqdq")
@@ -88,7 +106,7 @@ class InstructionSet:
 
 
 SETS = (
-    InstructionSet("sse42", OLD, like="Atom before 2021, as in many industrial PCs"),
+    InstructionSet("sse42", OLD, like="Celeron J4125, N5105"),
     InstructionSet("avx", (*OLD, "avx"), like="Sandy Bridge"),
     InstructionSet("avx2", (*OLD, *AVX2), VAES, "Haswell to Comet Lake; Zen to Zen 3"),
     InstructionSet("avx2_vnni", (*OLD, *AVX2, "avx_vnni"), VAES, "Alder Lake, N100"),

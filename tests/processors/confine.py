@@ -4,10 +4,9 @@ Usage: python tests/processors/confine.py VENV SET
        python tests/processors/confine.py --list
        python tests/processors/confine.py --able SET
 
-At native speed, but for good: the libraries of the environment are changed, so take one that nothing else needs. It
-hides what the processor has and adds nothing. Once more after packages were installed; what is confined already is left
-as it is. Afterwards the libraries are asked what they see. Exits 2 when it cannot be done, 1 when a library still sees a
-hidden feature.
+What runs in it runs at native speed. The libraries of the environment are changed for good, so take one that nothing
+else needs. Features are hidden, none is added. Run it again after packages were installed: it changes what is new. Then
+the libraries are asked what they see. Exits 2 when it cannot be done, 1 when a library still sees a hidden feature.
 """
 
 from __future__ import annotations

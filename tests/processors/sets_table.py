@@ -1,4 +1,4 @@
-"""Bundles made under each instruction set and loaded under each other: do they act as promised, or does load refuse them?
+"""Bundles made under each instruction set and loaded under each other: do they act as promised, or are they refused?
 
 Usage: python tests/processors/sets_table.py [--sources SOURCE ...] [--sets SET ...] [--variants NAME ...]
            [--observations COUNT] [--names] [-o out/confined]
@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -167,9 +169,10 @@ def made(source: str, place: Place, variants: Sequence[str], count: int, out: Pa
         TableError: when the policy cannot be exported there.
     """
     print(f"{Path(source).name}: making bundles under {place.name}", flush=True)
+    shutil.rmtree(out, ignore_errors=True)
     words = [str(place.python), str(MAKES), source, "-o", str(out), "--observations", str(count)]
     done = subprocess.run(
-        [*words, "--variants", *variants], cwd=ROOT, env=_environment(out), capture_output=True, text=True, check=False
+        [*words, "--variants", *variants], cwd=ROOT, env=variables(out), capture_output=True, text=True, check=False
     )
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
@@ -181,10 +184,8 @@ def made(source: str, place: Place, variants: Sequence[str], count: int, out: Pa
     return Bundles(place, paths, told["refused"], observations, said)
 
 
-def _environment(out: Path) -> dict[str, str]:
+def variables(out: Path) -> dict[str, str]:
     """Return an environment with a cache of this place's own: what another made is not of this set."""
-    import os
-
     return {**os.environ, "VLATOOL_CACHE": str(out.parent / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
 
 

@@ -70,7 +70,8 @@ static void on_illegal(int number, siginfo_t *info, void *context) {
 
 __attribute__((constructor)) static void start(void) {
   WRAPPED(FIND)
-  struct sigaction ours = {.sa_sigaction = on_illegal, .sa_flags = SA_SIGINFO | SA_NODEFER | SA_ONSTACK | SA_RESTART};
+  // without SA_ONSTACK: such a stack is that of others, who free it
+  struct sigaction ours = {.sa_sigaction = on_illegal, .sa_flags = SA_SIGINFO | SA_NODEFER | SA_RESTART};
   NEXT(sigaction)(SIGILL, &ours, &others);
   const char *words = getenv("LD_PRELOAD");  // launch.c put this library first: children that are other programs go without
   if (!words || strncmp(words, PRELOADED, strlen(PRELOADED))) return;
