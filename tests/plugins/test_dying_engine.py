@@ -93,7 +93,7 @@ def test_an_onnx_file_is_refused(run: Run, onnx_file: Path, tmp_path: Path):
 def test_what_opens_a_bundle_from_elsewhere_survives(run: Run, int8_bundle: Bundle, tmp_path: Path):
     made = str(int8_bundle.path)
     for line in (
-        ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "10"), ("explain", made),
+        ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "20"), ("explain", made),
         ("benchmark", "overhead", made),
     ):  # fmt: skip
         done = run("abort:run", INT8, *line, "-o", str(tmp_path / "report"))

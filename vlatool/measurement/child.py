@@ -22,6 +22,8 @@ from vlatool.measurement.jobs import Limits
 from vlatool.measurement.limited import command, ran_out
 
 T = TypeVar("T")
+LAST_WORDS = 240
+"""Characters of the last line of a process that a signal ended: the end of an assertion says most."""
 NO_MEMORY = (
     "MemoryError",
     "bad_alloc",
@@ -165,7 +167,9 @@ def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fre
             f"{about}: the process was killed (SIGKILL) {when}, as it is when memory runs out.", "use a smaller policy"
         )
     if code < 0:
-        return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.")
+        last = log.strip().rpartition("\n")[2][-LAST_WORDS:]
+        said = f" It said last: {last}" if last else ""
+        return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.{said}")
     if code == 0:
         return GraphError(f"{about}: the process ended with exit code 0 {when}, before it was done.")
     last = (log.strip() or f"exit code {code}").splitlines()[-1]

@@ -60,6 +60,8 @@ ROUNDS = 5
 """Plans that are tried for one variant, at most."""
 SECONDS = 120.0
 """What the sensitivity of all layers may take; fewer samples are used for slow policies."""
+RECORDED = 256
+"""Observations that errors of plans are taken on, at most."""
 SAMPLES = 8
 """Observations on which it is measured, at most."""
 TIMED = 20
@@ -117,7 +119,7 @@ class Search:
         self._apart = board_set(self.profile).confined
         self._planned = 1
         self._layers: list[LayerError] | None = None
-        self._observations = recorded_observations(self.baseline, 256)
+        self._observations = recorded_observations(self.baseline, RECORDED)
         self.budget = budget_of(self.limits, self.baseline.manifest.spec)
 
     def run(self, candidates: Mapping[str, StageList]) -> dict[str, StageList]:
@@ -265,12 +267,15 @@ class Search:
         return len(ranked)
 
     def _sensitivities(self, stage: StaticInt8) -> list[LayerError]:
-        from vlatool.sensitivity.layers import sensitivities
+        from vlatool.sensitivity.apart import sensitivities_apart
 
         if self._layers is None:
             stage = stage.model_copy(update={"attention": False, "elementwise": False})
-            chosen = self._observations[:: max(1, len(self._observations) // SAMPLES)][:SAMPLES]
-            self._layers = sensitivities(self.baseline, stage, None, chosen, self.context, seconds=SECONDS)
+            try:
+                self._layers = sensitivities_apart(self.baseline, stage, RECORDED, SAMPLES, self.context, SECONDS)
+            except GraphError as error:  # the plans that were tried stand
+                self.context.tell(f"search: the layers could not be measured: {error.message}", None)
+                self._layers = []
         return self._layers
 
     def _finalists(self) -> list[Trial]:

@@ -19,6 +19,7 @@ from vlatool.errors import DataError, require
 from vlatool.graph.files import foreign_errors, save
 from vlatool.graph.layers import Layer
 from vlatool.graph.qdq import Range
+from vlatool.machine.risky import risky
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.runtime.engines import of_branches
@@ -138,7 +139,8 @@ class _Switchable:
         if not tape.changed:
             tape.place += 1
             return tape.recorded[tape.place - 1]
-        outputs: Mapping[str, Any] = self._session.run({**feeds, **self._set})
+        with risky(type(self._session), "ran a graph with switches"):
+            outputs: Mapping[str, Any] = self._session.run({**feeds, **self._set})
         if tape.recording:
             tape.recorded.append(outputs)
         return outputs
@@ -176,7 +178,8 @@ class Switchboard:
                     self.shares.update({(name, layer): share for layer, share in _shares(path, layers[name]).items()})
                     path = Path(self._scratch.name) / f"{name}.onnx"
                     save(model, path)
-            self._sessions[name] = _Switchable(of_branches()(path, threads), flags, self._tape)
+            with risky(of_branches(), f"opened the graph '{name}' with switches"):
+                self._sessions[name] = _Switchable(of_branches()(path, threads), flags, self._tape)
         self.policy = Policy(bundle, Program(bundle.manifest.program, self._sessions, seed=0), DEFAULT_ENGINE)
 
     def __enter__(self) -> Switchboard:

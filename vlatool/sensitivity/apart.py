@@ -1,0 +1,52 @@
+"""Measure what each layer costs in a child process: the graphs have switches in them, and nobody has run them yet."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vlatool.bundle.bundle import Bundle
+from vlatool.data import recorded_observations
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.sensitivity.layers import LayerError, sensitivities
+from vlatool.stage.base import Context
+from vlatool.user_code import children
+
+PRELOAD = ("numpy", "onnx", "onnxruntime", __name__)
+
+
+def sensitivities_apart(
+    bundle: Bundle, stage: StaticInt8, recorded: int, samples: int, context: Context, seconds: float
+) -> list[LayerError]:
+    """Return what ``sensitivities`` gives.
+
+    Args:
+        bundle: A float32 bundle that carries a recording.
+        stage: Which layers, and how they are written.
+        recorded: Observations of that recording, of which ``samples`` are taken, spread over them.
+        samples: How many.
+        context: For progress.
+        seconds: See ``sensitivities``.
+
+    Raises:
+        VlatoolError: what ``sensitivities`` raises; GraphError when the engine ends the child.
+    """
+    job = {
+        "bundle": str(bundle.path.absolute()), "options": stage.given(), "recorded": recorded, "samples": samples,
+        "seconds": seconds,
+    }  # fmt: skip
+    found = children.call(f"{__name__}:run", job, context.tell, "measuring the layers", PRELOAD, own=True)
+    return [LayerError(**layer) for layer in json.loads(found)]
+
+
+def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> str:
+    """Measure the layers of a job in this process; return them as JSON, in which numbers may be infinite or none."""
+    bundle = Bundle.open(Path(job["bundle"]), verify=False)
+    observations, most = recorded_observations(bundle, job["recorded"]), job["samples"]
+    chosen = observations[:: max(1, len(observations) // most)][:most]
+    stage = StaticInt8(**job["options"])
+    layers = sensitivities(bundle, stage, None, chosen, Context(tell), seconds=job["seconds"])
+    return json.dumps([asdict(layer) for layer in layers])
