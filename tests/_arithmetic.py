@@ -45,15 +45,13 @@ def host_set() -> str:
     return rung(isa() or ())
 
 
-def sets_to_confine_to() -> list[str]:
-    """Return the instruction sets that OpenVINO can be confined to on this host, the highest first."""
-    if os.environ.get(MAX_CPU_ISA):
-        return []
-    return [name for name, feature in RUNGS.items() if feature in (isa() or ())]
-
-
 def _openvino() -> bool:
     return importlib.util.find_spec("openvino") is not None
+
+
+def _confinable(feature: str) -> bool:
+    """Whether OpenVINO can be confined to the set with this feature in a child of this process."""
+    return _openvino() and feature in (isa() or ()) and MAX_CPU_ISA not in os.environ
 
 
 NEEDS: dict[str, Callable[[], bool]] = {
@@ -62,6 +60,7 @@ NEEDS: dict[str, Callable[[], bool]] = {
     "exact openvino": lambda: _openvino() and exact("openvino"),
     "exact onnxruntime": lambda: exact("ort_cpu"),
     "bfloat16": lambda: _openvino() and computes_bfloat16(),
+    **{name: functools.partial(_confinable, feature) for name, feature in RUNGS.items()},
 }
 """Word of the marker -> whether this machine has it."""
 

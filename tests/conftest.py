@@ -68,6 +68,7 @@ def write_points(path: Path, rows: list[dict[str, str]]) -> Path:
     return path
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip a test that needs what this processor lacks; engines are asked here, never while tests are collected."""
     for marker in item.iter_markers("needs"):
