@@ -29,6 +29,7 @@ from vlatool.explain._origin import (
 from vlatool.explain._remedy import measure, plans
 from vlatool.graph.workload import workload
 from vlatool.machine.host import fingerprint
+from vlatool.measurement.reach import reached_in
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.report import Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -75,6 +76,7 @@ class _Findings:
     islands: list[Island] = field(default_factory=list)
     pairs: tuple[int, int] = (0, 0)
     fallen: list[Fallback] = field(default_factory=list)
+    reach: dict[str, float] = field(default_factory=dict)
     phases: list[Phases] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -194,6 +196,8 @@ def _times(findings: _Findings, options: Options, context: Context) -> None:
     values = findings.seen.values
     context.tell("profiling the operators", None)
     findings.operators = profile(findings.bundle, values, options.runs, options.threads)
+    engine = findings.bundle.manifest.engine or DEFAULT_ENGINE
+    findings.reach = reached_in(engine, _macs(findings.bundle), options.threads)
     if findings.baseline is not None:
         context.tell("profiling the operators of float32", None)
         compared = reference_engine(findings.bundle)
@@ -227,7 +231,9 @@ def _sentences(findings: _Findings, speed: float = math.nan) -> list[str]:
         sentences.append(tables.fallbacks_sentence(findings.fallen, findings.operators))
     if findings.pairs[0]:
         sentences.append(tables.islands_sentence(findings.islands, findings.pairs, findings.operators))
-    sentences += tables.limit_sentences(findings.operators, findings.before, _macs(findings.bundle), speed)
+    macs = _macs(findings.bundle)
+    sentences += tables.limit_sentences(findings.operators, findings.before, macs, speed)
+    sentences += tables.reach_sentence(findings.operators, macs, findings.reach)
     return sentences + about_phases[ruined:]
 
 

@@ -11,15 +11,22 @@ from vlatool.explain._islands import Fallback, Island
 from vlatool.explain._operators import GROUPS, Operator, shares
 from vlatool.explain._origin import command
 from vlatool.explain._remedy import Candidate, Contest
+from vlatool.machine.host import isa
+from vlatool.machine.instruction_sets import saturates
 from vlatool.measurement.interleaved import latency_measurements, speedup
+from vlatool.measurement.reach import share_of_reach
 from vlatool.report import Measurement, Row
 from vlatool.sensitivity.layers import LayerError
 
 MOST = 10
 MOST_ELEMENTS = 12
 """Of a longer action those are shown that the worst layer moves most."""
+OTHERS = 6
+"""Kinds of operators that are named beside products."""
 FASTER = 4.0
 """What int8 does with one instruction of the same width that float32 does with four."""
+FASTER_IN_PAIRS = 2.0
+"""The same without VNNI: three instructions do what float32 does with six."""
 
 
 def layers_table(layers: Sequence[LayerError], several: bool) -> list[dict[str, Any]]:
@@ -157,8 +164,9 @@ def limit_sentences(
         base = sum(operator.ms for operator in before) or 1.0
         actual = base / total if math.isnan(speed) else speed
         rest = base - heavy
-        ideal, most = base / (rest + heavy / FASTER), base / rest if rest else math.inf
-        text = f"In float32 they took {heavy / base:.0%} of {base:.3g} ms. By Amdahl's law products four times as"
+        faster, word = (FASTER_IN_PAIRS, "two") if saturates(isa() or ()) else (FASTER, "four")
+        ideal, most = base / (rest + heavy / faster), base / rest if rest else math.inf
+        text = f"In float32 they took {heavy / base:.0%} of {base:.3g} ms. By Amdahl's law products {word} times as"
         text += (
             f" fast make the whole {ideal:.2g}x as fast, and products for nothing {most:.2g}x; measured: {actual:.2g}x."
         )
@@ -167,6 +175,34 @@ def limit_sentences(
             text += f" What is not a product takes {grown:.2g} ms more than in float32: quantizing and moving data."
         sentences.append(text)
     return sentences
+
+
+def reach_sentence(operators: Sequence[Operator], macs: Mapping[str, int], reach: Mapping[str, float]) -> list[str]:
+    """Return which part of the time the work would take at the speed of large products, and what the rest goes to.
+
+    Args:
+        operators: Of the bundle.
+        macs: Precision -> multiply-accumulates of one inference.
+        reach: Precision -> 10^9 multiply-accumulates in a second of a large product in the same engine.
+    """
+    total = sum(operator.ms for operator in operators)
+    share = share_of_reach(macs, reach, total / 1e3)
+    if share is None:
+        return []
+    products = sum(operator.ms for operator in operators if operator.product)
+    speeds = ", ".join(f"{name} {speed:.3g} GMAC/s" for name, speed in reach.items() if macs.get(name))
+    text = (
+        f"At the speed of a large product here ({speeds}) its MACs would take {share * total:.3g} of the {total:.3g} ms"
+    )
+    text += f" ({share:.0%})."
+    others: Counter[str] = Counter()
+    for operator in operators:
+        others[operator.kind] += 0 if operator.product else operator.ms  # type: ignore[assignment]
+    listed = ", ".join(f"{kind} {ms:.2g} ms" for kind, ms in others.most_common(OTHERS) if ms > 0.005 * total)
+    slower = f"its products take {products - share * total:.2g} ms more than that" if products > share * total else ""
+    rest = f"everything else {total - products:.2g} ms{f': {listed}' if listed else ''}"
+    text += f" The rest: {', '.join(filter(None, (slower, rest)))}."
+    return [text]
 
 
 def precision_table(operators: Sequence[Operator]) -> list[dict[str, Any]]:

@@ -7,14 +7,16 @@ board. In int8 it is standard QDQ with its quantizers, weights of which no pair 
 from __future__ import annotations
 
 import base64
+import contextlib
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vlatool.errors import GraphError
 from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, engine_class
 
 SIZE = 1024
@@ -78,6 +80,15 @@ def reached(engine: str, dtype: str, threads: int | None) -> float:
         opened.run()
         seconds.append((time.perf_counter_ns() - start) / 1e9)
     return MACS / min(seconds) / 1e9
+
+
+def reached_in(engine: str, dtypes: Iterable[str], threads: int | None) -> dict[str, float]:
+    """Return what an engine reaches in each of some dtypes, as far as it computes the product in them."""
+    found: dict[str, float] = {}
+    for dtype in set(dtypes).intersection(DTYPES):
+        with contextlib.suppress(GraphError):
+            found[dtype] = round(reached(engine, dtype, threads), 3)
+    return found
 
 
 def share_of_reach(macs: Mapping[str, float], reach: Mapping[str, float], seconds: float) -> float | None:

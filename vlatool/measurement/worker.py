@@ -7,7 +7,6 @@ end ``Measured``, or what it raised. It imports what a robot imports, so that it
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import resource
@@ -19,7 +18,7 @@ from typing import IO
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
-from vlatool.errors import BundleError, GraphError
+from vlatool.errors import BundleError
 from vlatool.machine.processes import die_with_parent
 from vlatool.measurement import child
 from vlatool.measurement.answers import Memory, expected_answers, remembered
@@ -29,7 +28,7 @@ from vlatool.measurement.jobs import LatencyJob, WorkerJob
 from vlatool.measurement.measured import GraphEngine, Measured, Pace, Phase, PolicyRun
 from vlatool.measurement.paced import run_paced
 from vlatool.measurement.phases import time_phases
-from vlatool.measurement.reach import DTYPES, reached
+from vlatool.measurement.reach import reached_in
 from vlatool.runtime.policy import Policy
 from vlatool.user_code import trust
 
@@ -181,11 +180,7 @@ def _policy(contestant: Contestant, job: LatencyJob, begun: float, pace: Pace | 
 def _reach(policy: Policy, threads: int) -> dict[str, float]:
     """Return what the policy's engine reaches in each dtype that its graphs compute in, as far as it can be asked."""
     graphs = policy.bundle.manifest.graphs.values()
-    found: dict[str, float] = {}
-    for dtype in {dtype for graph in graphs for dtype in graph.precision}.intersection(DTYPES):
-        with contextlib.suppress(GraphError):
-            found[dtype] = round(reached(policy.engine, dtype, threads), 3)
-    return found
+    return reached_in(policy.engine, {dtype for graph in graphs for dtype in graph.precision}, threads)
 
 
 def _engines(policy: Policy) -> Iterator[GraphEngine]:
