@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -202,7 +203,8 @@ def asked(
 def row(where: tuple[str, ...], variant: Variant, answer: Answer, said: Any) -> Row:
     """Return one row: right, refused for what it computes, or wrong."""
     found = None if answer.actions is None else difference(answer.actions, said)
-    return Row(where, variant.name, found, variant.limit, answer.refused, must="tell", note=answer.why)
+    note = re.sub(r"^/\S+ ", "", answer.why)  # the path would take the whole cell
+    return Row(where, variant.name, found, variant.limit, answer.refused, must="tell", note=note)
 
 
 if __name__ == "__main__":
