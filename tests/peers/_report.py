@@ -179,13 +179,14 @@ class Table:
 
     def _check_reached(self, ours: Sequence[Contestant]) -> list[Check]:
         """Say which share of the reachable float32 and the fastest int8 bundles reach."""
-        told = []
-        for name, rows in (("float32", [row for row in ours if row.name == f"{MARK}float32"]),
-                           ("int8", [row for row in ours if row.error <= BUDGET and "int8" in row.dtypes]),
-                           ("int8 in ONNX Runtime", [row for row in ours if row.error <= BUDGET
-                                                           and "int8" in row.dtypes and row.engine == ENGINE])):  # fmt: skip
-            reached = [part for row in rows[:1] if (part := self.reached(row)) is not None]
-            told += [(name, part) for part in reached]
+        within = [row for row in ours if row.error <= BUDGET and "int8" in row.dtypes]
+        first = {
+            "float32": [row for row in ours if row.name == f"{MARK}float32"],
+            "int8": within,
+            "int8 in ONNX Runtime": [row for row in within if row.engine == ENGINE],
+        }
+        reached = {name: self.reached(rows[0]) for name, rows in first.items() if rows}
+        told = [(name, part) for name, part in reached.items() if part is not None]
         if not told:
             return []
         text = ", ".join(f"{name} {part:.0%}" for name, part in told)

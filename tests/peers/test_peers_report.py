@@ -33,3 +33,43 @@ def test_the_fastest_within_the_budget_is_held_against_the_target_of_onnx_runtim
     assert [check.passed for check in Table("vit-s", rows, "cpu").checks()] == [True] * 4
     slow = [contestant("ours:int8", [16.0] * 10, 0.03), contestant("peer", [20.0] * 10, 0.03)]
     assert not Table("vit-s", slow, "cpu").checks()[3].passed, "2.5x where 2.6x is wanted"
+
+
+def measured(name: str, milliseconds: float, error: float = 0.03, engine: str = "ort_cpu", **dtypes: float):
+    row = contestant(name, [milliseconds] * 10, error)
+    row.engine, row.dtypes = engine, dtypes or {"int8": 1.0}
+    return row
+
+
+LIMITS = [measured("limit: ort_cpu float32", 20.0, float32=1.0), measured("limit: ort_cpu int8", 10.0, int8=1.0)]
+
+
+def checks(rows, instruction_set: str = "AVX2", macs: float = 2**31) -> dict[str, bool]:
+    found = Table("vit-s", [*rows, *LIMITS], "cpu", macs, instruction_set).checks()
+    return {check.text[:3]: check.passed for check in found}
+
+
+def test_a_set_without_vnni_has_targets_of_its_own():
+    rows = [measured("ours:static-int8", 24.0), measured("ort:static", 30.0)]
+    assert checks(rows)["(b)"], "1.67x is what AVX2 can do"
+    assert not checks(rows, "AVX512_CORE_VNNI")["(b)"]
+    assert not checks([measured("ours:static-int8", 25.0), rows[1]])["(b)"]
+
+
+def test_the_share_of_the_reachable_adds_up_what_each_dtype_would_take():
+    half = measured("ours:static-int8", 40.0, int8=0.5, float32=0.5)
+    table = Table("vit-s", [half, measured("ort:static", 60.0), *LIMITS], "cpu", 2**31)
+    assert table.reached(half) == pytest.approx((10.0 + 20.0) / 40.0)
+    assert table.reached(measured("torch", 40.0, engine="", float32=1.0)) is None
+    assert {row.name for row in table.limits} == {limit.name for limit in LIMITS}
+    assert checks([half, measured("ort:static", 60.0)])["(f)"]
+    assert not checks([measured("ours:static-int8", 30.0), measured("ort:static", 60.0)])["(f)"], "20 of 30 ms"
+
+
+def test_the_search_must_deliver_what_one_command_does():
+    peer, single = measured("ort:static", 60.0), measured("ours:static-int8, mse, attention", 20.0)
+    ahead = measured("ours:optimize, relative_error 0.04", 20.2)
+    assert checks([peer, single, ahead])["(e)"]
+    assert not checks([peer, single, measured("ours:optimize, relative_error 0.04", 21.0)])["(e)"]
+    assert not checks([peer, single, measured("ours:optimize, relative_error 0.04", 19.0, error=0.05)])["(e)"]
+    assert "(e)" not in checks([peer, single])

@@ -43,12 +43,14 @@ REDRAWN = 1.5
 """How many times that difference is allowed on other machines, where it is drawn again: of 18 observations, the largest
 was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
 LEAST_TOLERANCE = 0.01
-COARSE_TOLERANCE = {"float16": 0.03, "int4": 0.03, "int4 weights": 0.03, "float8": 0.06}
+COARSE_TOLERANCE = {"int8": 0.02, "float16": 0.03, "int4": 0.03, "int4 weights": 0.03, "float8": 0.06}
 """The same for graphs whose kernels round differently by design from processor to processor: float16 is computed as
 such where there is arithmetic for it and in float32 elsewhere, the activations beside int4 weights are rounded to int8
 where there is a dot product. Golden actions of the samples differed by 0.013 (Cortex-A76) and 0.009 (Cortex-A72). A sum
 that is added up in another order falls on the other side of a step of float8, which is an eighth of a value: between
-one and two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029."""
+one and two threads of ONNX Runtime 1.32 the action of a ResNet-18 with a GRU differed by 0.029. An engine that rounds
+int8 as the graphs say where a bundle is made need not do so elsewhere: ten steps of a flow differed by 0.0123 between
+the kernels of AVX and of AVX2."""
 SEED = 0
 """Seed of the noise that golden inputs and calibration runs draw."""
 CARRIED = ("assets", "data")
