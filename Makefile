@@ -14,7 +14,7 @@ FOREIGN ?= --guides
 
 RUNTIME_WHEEL := $(OUT)/wheels/vlatool_runtime-*.whl
 
-.PHONY: wheels foreign gate peers python310 arm64 ladder help install demo test coverage check robot docs format clean metaworld
+.PHONY: wheels foreign gate peers python310 arm64 ladder help install demo test soak coverage check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -39,10 +39,13 @@ metaworld: $(BIN)/vlatool  ## install what the sample policies vla-metaworld and
 	  echo "headless rendering needs the system packages $(SYSTEM_PACKAGES)"
 
 test: $(VENV)/.dev  ## run the tests
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
+
+soak: $(VENV)/.dev  ## run the tests in their full form: every draw, kill and case of those that have many
+	$(BIN)/python -m pytest -n auto --dist worksteal --full
 
 coverage: $(VENV)/.dev  ## run the tests with coverage, in about twice the time; below 90 % fails
-	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto --dist worksteal
 
 check: $(VENV)/.dev  ## lint, format, types, layers, docs that match the code
 	$(BIN)/ruff check .

@@ -16,6 +16,9 @@ from vlatool.user_code import children
 
 PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)
 """What such stages need; imported once, by the server that forks the children."""
+EXPORT = ("torch._dynamo", "torch.export._trace", "torch.onnx._internal.exporter._compat",
+          "onnxscript.function_libs.torch_lib.ops")  # fmt: skip
+"""What the first export of a process imports beside that, half of its time; a name may be gone in a release."""
 
 
 def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
@@ -26,7 +29,8 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
         BundleError: when what it wrote is not a whole bundle.
     """
     job = {**_job(stage, source, context), "out": str(draft)}
-    answer = children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), PRELOAD)
+    preload = (*PRELOAD, *EXPORT) if stage.name().startswith("export.") else PRELOAD
+    answer = children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), preload)
     said = answer.get("said") if isinstance(answer, Mapping) else None
     context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
     return Bundle.open(draft)
