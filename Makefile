@@ -34,7 +34,7 @@ BIN := $(VENV)/bin
 
 RUNTIME_WHEEL := $(OUT)/wheels/vlatool_runtime-*.whl
 
-.PHONY: able confined sets wheels foreign gate peers python310 arm64 ladder help install demo test coverage check robot docs format clean metaworld
+.PHONY: able confined sets wheels foreign gate peers python310 arm64 ladder help install demo test soak coverage check robot docs format clean metaworld
 
 help:  ## list the targets
 	@grep -hE '^[a-z0-9]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -64,10 +64,13 @@ metaworld: $(BIN)/vlatool  ## install what the sample policies vla-metaworld and
 
 test: $(VENV)/.dev  ## run the tests (SET=avx2: as on a processor with AVX2 alone; docs/processors.md)
 	$(call confine,$(VENV))
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
+
+soak: $(VENV)/.dev  ## run the tests in their full form: every draw, kill and case of those that have many
+	$(BIN)/python -m pytest -n auto --dist worksteal --full
 
 coverage: $(VENV)/.dev  ## run the tests with coverage, in about twice the time; below 90 % fails
-	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n auto --dist worksteal
 
 check: $(VENV)/.dev  ## lint, format, types, layers, docs that match the code
 	$(BIN)/ruff check .

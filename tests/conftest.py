@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from _arithmetic import lacks
+from _full import VARIABLE
 from _tiny import observations, write_policy
 
 from vlatool.bundle.bundle import Bundle, seal
@@ -66,6 +67,17 @@ def write_points(path: Path, rows: list[dict[str, str]]) -> Path:
         writer.writeheader()
         writer.writerows(rows)
     return path
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add what ``make soak`` passes."""
+    parser.addoption("--full", action="store_true", help="every draw, kill and case of the tests that have many")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Tell the modules of the tests, which choose their cases when they are collected."""
+    if config.getoption("--full"):
+        os.environ[VARIABLE] = "1"
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -8,6 +8,7 @@ import numpy as np
 import onnx
 import pytest
 from _arithmetic import exact
+from _full import small_or_full
 from _qdq_reference import (
     IMAGE,
     OPS,
@@ -203,7 +204,7 @@ RANDOM: list[Callable[[np.random.Generator], str]] = [
 ]
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(small_or_full(8, 25)))
 def test_random_graphs_stay_near_float_in_every_style(seed: int) -> None:
     random = np.random.default_rng(seed)
     values, lines = ["x"], []

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from _full import small_or_full
 
 from vlatool.quantize._ranges import BINS, LEVELS, PER_SAMPLE, Method, Statistics, choose_range
 
@@ -237,7 +238,7 @@ def test_entropy_finds_the_threshold_of_the_plain_algorithm(kind: str) -> None:
     assert low == -high
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(small_or_full(6, 20)))
 def test_random_data_in_random_pieces(seed: int) -> None:
     """Whatever the scale, the order and the mixture: ranges stay ordered, and mse is no worse than minmax."""
     random = np.random.default_rng(seed)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _arithmetic import full_range_or_less
 from _random_policies import RandomPolicy
 
 from vlatool.bundle.bundle import Bundle
@@ -111,7 +112,8 @@ def trials(
 
         def quantize(method: str = method, word: str = "", **more: Any) -> Bundle:
             stage, options, _ = METHODS[method]
-            built = build_stage(stage, {**options, **more})
+            exact = full_range_or_less() if options.get("layout") == "openvino" else {}
+            built = build_stage(stage, {**options, **exact, **more})
             assert isinstance(built, Transform)
             return run_transform(built, exported, scratch / f"{method}{word}", Context())
 

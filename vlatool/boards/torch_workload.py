@@ -22,6 +22,8 @@ from vlatool.graph.workload import GraphWorkload, Tally, Workload, part_named
 from vlatool.module.faked import faked_modules, run_faked
 from vlatool.user_code import children
 
+PRELOAD = ("torch", "torch._dynamo", __name__)
+"""What counting needs; imported once, by the server that forks the children."""
 PRODUCTS = {"mm": 0, "bmm": 0, "addmm": 1, "baddbmm": 1}
 """Operator of torch -> the position of its first factor."""
 ATTENTION = "_scaled_dot_product"
@@ -35,7 +37,7 @@ def counted_apart(bundle: Bundle, tell: Callable[[str, float | None], None]) -> 
     """
     about = str(bundle.manifest.source.get("factory", "")).rpartition(":")[0]
     job = {"bundle": str(bundle.path.absolute())}
-    values = children.call("vlatool.boards.torch_workload:count", job, tell, about, ("torch", __name__))
+    values = children.call("vlatool.boards.torch_workload:count", job, tell, about, PRELOAD)
     counted = from_values(values)
     if counted is None:
         raise SourceError(f"{about} gave a count that is not one.")

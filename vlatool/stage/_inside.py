@@ -26,7 +26,7 @@ PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", 
 
 def needed(stage: Stage) -> tuple[str, ...]:
     """Return the modules that a child needs for a stage of vlatool's own code; the server imports them once."""
-    return (*stage.used_packages(), type(stage).__module__, __name__)
+    return (*stage.used_packages(), *stage.imports, type(stage).__module__, __name__)
 
 
 def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
@@ -38,7 +38,7 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
         BundleError: when what it wrote is not a whole bundle.
     """
     job, whose = {**_job(stage, source, context), "out": str(draft)}, stage.runs(source)
-    about, preload = whose or stage.name(), PRELOAD if whose else needed(stage)
+    about, preload = whose or stage.name(), (*PRELOAD, *stage.imports) if whose else needed(stage)
     try:
         answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
     except VlatoolError as error:  # the draft is gone when a person reads it

@@ -7,15 +7,17 @@ import mutants
 import swaps
 import victim
 import walls
+from _full import small_or_full
 from mutations import mutated, read
 
 
 def test_mutants_are_refused_or_answer_as_before():
-    found = mutants.soak(300, seed=7, workers=1)
+    count = small_or_full(120, 300)
+    found = mutants.soak(count, seed=7, workers=1)
     assert {name: found.counts[name] for name in mutants.ZERO} == dict.fromkeys(mutants.ZERO, 0), found.examples
     told = sum(count for name, count in found.counts.items() if name.startswith(mutants.REFUSED))
-    assert found.counts.total() == 300
-    assert told > 200
+    assert found.counts.total() == count
+    assert told > 2 / 3 * count
 
 
 def test_the_attack_sees_an_answer_that_changed(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from _full import small_or_full
 from broken_cases import CASES, Case
 from broken_policies import judge_case, rightly
 
@@ -16,7 +17,13 @@ NAMES = (
     "honest", "honest, recordings alone", "honest, world alone, is_success",
     "honest, success told before the end alone",    "honest, final_info", "honest, discrete",
 )  # fmt: skip
-FAST = [case for case in CASES if case.name in NAMES]
+FEW = (
+    "wrapper forgot two layers", "collapsed policy, recordings alone", "always one label", "expert in degrees",
+    "images recorded BGR", "success is never true", "success by the dice", "int8 scales corrupted", "honest",
+    "honest, recordings alone", "honest, discrete",
+)  # fmt: skip
+"""One of each kind of break, and of each kind of honest policy."""
+FAST = [case for case in CASES if case.name in small_or_full(FEW, NAMES)]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +35,8 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_there_are_thirty_broken_ones_and_five_honest_ones_at_least() -> None:
     assert sum(not case.honest for case in CASES) >= 30
     assert sum(case.honest for case in CASES) >= 5
-    assert len(FAST) == len(NAMES)
+    assert len(FAST) == len(small_or_full(FEW, NAMES))
+    assert {*FEW} <= {*NAMES} <= {case.name for case in CASES}
     assert len({case.name for case in CASES}) == len(CASES)
 
 

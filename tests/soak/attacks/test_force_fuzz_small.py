@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from _full import small_or_full
 from force_fuzz import Work, files_of, fuzz, run
 
 
 def test_no_file_of_a_person_is_removed_or_changed(tmp_path: Path) -> None:
     told: list[str] = []
-    assert fuzz(25, 5000, tmp_path, told.append) == []
+    assert fuzz(small_or_full(12, 25), 5000, tmp_path, told.append) == []
     assert any("exit 0" in line for line in told)
     assert any("exit 3" in line for line in told)
 
