@@ -38,6 +38,10 @@ class ExportOnnx(Transform):
 
     takes_modules: ClassVar[bool] = True
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
+    imports: ClassVar[tuple[str, ...]] = (
+        "torch._dynamo", "torch.export._trace", "torch.onnx._internal.exporter._compat",
+        "onnxscript.function_libs.torch_lib.ops",
+    )  # fmt: skip
 
     opset: int = Field(20, ge=18, le=23, description="opset of the default ONNX domain")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")

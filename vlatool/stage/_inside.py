@@ -16,9 +16,6 @@ from vlatool.user_code import children
 
 PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", __name__)
 """What such stages need; imported once, by the server that forks the children."""
-EXPORT = ("torch._dynamo", "torch.export._trace", "torch.onnx._internal.exporter._compat",
-          "onnxscript.function_libs.torch_lib.ops")  # fmt: skip
-"""What the first export of a process imports beside that, half of its time; a name may be gone in a release."""
 
 
 def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:
@@ -29,7 +26,7 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
         BundleError: when what it wrote is not a whole bundle.
     """
     job = {**_job(stage, source, context), "out": str(draft)}
-    preload = (*PRELOAD, *EXPORT) if stage.name().startswith("export.") else PRELOAD
+    preload = (*PRELOAD, *stage.imports)
     answer = children.call("vlatool.stage._inside:run", job, context.tell, stage.runs(source), preload)
     said = answer.get("said") if isinstance(answer, Mapping) else None
     context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered

@@ -124,6 +124,8 @@ class Stage(Numeric):
     """Options with which a search of ``optimize`` tries the stage: ending of the plan's name -> options."""
     packages: ClassVar[tuple[str, ...]] = ()
     """Distributions whose versions change the result whatever the options; part of the cache key and the record."""
+    imports: ClassVar[tuple[str, ...]] = ()
+    """Modules that it imports when it runs; the server that forks children for it imports them once."""
 
     @classmethod
     def kind(cls) -> str:
