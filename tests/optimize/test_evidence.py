@@ -43,7 +43,10 @@ def played(monkeypatch) -> list[str]:
     return names
 
 
-def accuracy(enough, loop=SimpleNamespace()):
+LOOP = SimpleNamespace()
+
+
+def accuracy(enough, loop=LOOP):
     rows = {each.name: each for each in [row("float32", 4.0, 0.0), *ROWS]}
     return with_accuracy(rows, {name: name for name in rows}, loop, None, Context(), enough)
 
