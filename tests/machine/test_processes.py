@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from _full import small_or_full
 
 import vlatool
 from vlatool.machine.processes import SINGLE, import_path, python_code, python_command, single_threads
@@ -79,8 +80,13 @@ def test_this_vlatool_comes_before_what_is_installed_and_after_python(monkeypatc
     assert import_path() == [library, PACKAGE]
 
 
-@pytest.mark.parametrize("started", ["script", "module"])
-@pytest.mark.parametrize("command", ["export", "benchmark", "closed-loop", "refit"])
+WAYS = [(command, started) for command in ("export", "benchmark", "closed-loop", "refit")
+        for started in ("script", "module")]  # fmt: skip
+EACH_ONCE = [way for way in WAYS if way[1] == "script" or way[0] == "export"]
+"""Every kind of child of a script, and of a module one: both ask ``import_path``."""
+
+
+@pytest.mark.parametrize(("command", "started"), small_or_full(EACH_ONCE, WAYS))
 def test_modules_in_the_current_directory_do_not_run_in_children(
     shadowed, started, command, policy_template, float_bundle, points_file, tmp_path
 ) -> None:

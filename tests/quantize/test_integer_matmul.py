@@ -8,6 +8,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.quantize._integer_matmul import use_integer_matmul
+from vlatool.runtime.arithmetic import PRECISE
 
 RANDOM = np.random.default_rng(0)
 WEIGHT = RANDOM.integers(-127, 128, (4, 3)).astype(np.int8)
@@ -113,6 +114,21 @@ def test_two_products_share_the_quantized_input():
         v=WEIGHT[::-1],
     )
     assert rewritten(made, 2) == ["QuantizeLinear", "MatMulIntegerToFloat", "MatMulIntegerToFloat"]
+
+
+def test_two_products_of_one_weight_have_one_each_and_are_exact_where_products_saturate():
+    again = helper.make_node("MatMul", ["xd", "wd"], ["second"], "again")
+    made = model(*QUANTIZE, PRODUCT, again, outputs=("product", "second"))
+    wanted = run(made)
+    assert use_integer_matmul(made) == 2
+    first, second = (node for node in made.graph.node if node.op_type == "MatMulIntegerToFloat")
+    assert first.input[1] != second.input[1]
+    assert first.input[5] != second.input[5]
+    for got, value in zip(run(made), wanted, strict=True):
+        np.testing.assert_allclose(got, value, atol=1e-6)
+    options = onnxruntime.SessionOptions()
+    options.add_session_config_entry(*PRECISE)
+    onnxruntime.InferenceSession(made.SerializeToString(), options, providers=["CPUExecutionProvider"])
 
 
 def test_a_dequantized_input_that_somebody_else_reads_is_kept():

@@ -17,7 +17,14 @@ from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
-from vlatool.module.to_onnx import EXTERNAL_DATA_BYTES, exported_by_torch, name_by_module, strip_notes, weight_bytes
+from vlatool.module.to_onnx import (
+    EXTERNAL_DATA_BYTES,
+    IMPORTS,
+    exported_by_torch,
+    name_by_module,
+    strip_notes,
+    weight_bytes,
+)
 from vlatool.module.torch_policy import TorchSession, load_modules
 from vlatool.runtime.contract import Outputs, check_chunk
 from vlatool.runtime.engine import engine_class
@@ -40,10 +47,7 @@ class ExportOnnx(Transform):
 
     takes_modules: ClassVar[bool] = True
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
-    imports: ClassVar[tuple[str, ...]] = (
-        "torch._dynamo", "torch.export._trace", "torch.onnx._internal.exporter._compat",
-        "onnxscript.function_libs.torch_lib.ops",
-    )  # fmt: skip
+    imports: ClassVar[tuple[str, ...]] = IMPORTS
 
     opset: int = Field(20, ge=18, le=23, description="opset of the default ONNX domain")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")

@@ -25,12 +25,13 @@ def use_integer_matmul(model: Any) -> int:
     """
     graph = OnnxGraph(model)
     fused: list[Any] = []
-    rewritten = 0
+    rewritten, weights = 0, set[str]()
     for node in model.graph.node:
         operands = _operands(node, graph)
         if not operands:
             continue
         add, bias = _bias(node, graph, operands[1])
+        _of_its_own(operands, graph, weights)
         target = (add or node).output[0]
         integer = graph.node("MatMulIntegerToFloat", operands + bias, [target], node.name, domain=DOMAIN)
         if add:
@@ -57,6 +58,21 @@ def _operands(node: Any, graph: OnnxGraph) -> list[str]:
     else:  # two activations, as in attention
         fits = graph.is_scalar(left[1]) and graph.is_scalar(right[1])
     return [left[0], right[0], left[1], right[1], left[2], right[2]] if fits else []
+
+
+def _of_its_own(operands: list[str], graph: OnnxGraph, seen: set[str]) -> None:
+    """Give a product a copy of a weight that another one has, with its zero point.
+
+    Where products saturate, the option of ONNX Runtime that makes them exact refuses a graph (1.32) in which two such
+    products share a weight, and nothing else would be exact.
+    """
+    weight = operands[1]
+    if weight in seen:
+        for place in (1, 5):
+            name = f"{operands[place]}.{len(graph.constants)}"
+            operands[place] = graph.add_tensor(graph.constants[operands[place]], name)
+    elif weight in graph.constants:
+        seen.add(weight)
 
 
 def _bias(node: Any, graph: OnnxGraph, weight: str) -> tuple[Any, list[str]]:

@@ -19,6 +19,7 @@ from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import takes_shards
+from vlatool.module.to_onnx import IMPORTS
 from vlatool.quantize._compute import records_of
 from vlatool.quantize._records import Record
 from vlatool.quantize._skeletons import BLOCKED_OPSET, skeletons_of, weights_fingerprint
@@ -52,6 +53,7 @@ class WeightOnly(WeightOptions):
     """
 
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnx-ir", "onnxscript", "numpy")
+    imports: ClassVar[tuple[str, ...]] = IMPORTS
     streams: ClassVar[bool] = True
     """Takes a source bundle whose policy describes its shards, without an export before."""
 
