@@ -6,6 +6,7 @@ The bundles are made once in a session and must not be changed; copy one (``copi
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from _tiny import observations, write_policy
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.user_code import children
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 """Of torch, here and in all children: two threads that meet at barriers on busy cores are ten times slower than one."""
@@ -182,15 +184,25 @@ def points_file(points_template: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def wrong_engine(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """A function that lets ONNX Runtime give so many times what the graph says, as a wrong kernel would."""
-    real = OrtCpuSession.run
+    """A function that lets ONNX Runtime give so many times what the graph says, as a wrong kernel would.
+
+    What would run in a child process, which has an ONNX Runtime of its own, runs in this one.
+    """
+    real, apart = OrtCpuSession.run, children.call
 
     def make(factor: float) -> None:
         def run(self: OrtCpuSession, feeds: Any) -> dict[str, Any]:
             by = np.float32(factor if self.optimized else 1)
             return {name: value * by for name, value in real(self, feeds).items()}
 
+        def call(function: str, job: Any, tell: Any, *rest: Any, own: bool = False, **more: Any) -> Any:
+            if not own:
+                return apart(function, job, tell, *rest, **more)
+            module, _, name = function.partition(":")
+            return getattr(importlib.import_module(module), name)(job, tell)
+
         monkeypatch.setattr(OrtCpuSession, "run", run)
+        monkeypatch.setattr(children, "call", call)
 
     return make
 

@@ -104,7 +104,7 @@ def test_what_opens_a_bundle_from_elsewhere_survives(run: Run, int8_bundle: Bund
 
 def test_a_search_goes_on_without_the_candidate(run: Run, policy_dir: Path, tmp_path: Path):
     recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("candidates:\n  int8: [quantize.static_int8]\n  half: [quantize.float16]\n")
+    recipe.write_text("candidates:\n  int8: [{quantize.static_int8: {samples: 4}}]\n  half: [{quantize.float16: {}}]\n")
     line = ("optimize", str(policy_dir), "--recipe", str(recipe), "--max-drop", "relative_error=0.9", "--no-search")
     done = run("abort:run", INT8, *line, "-o", str(tmp_path / "out"))
     assert done.returncode == 0, done.stdout + done.stderr

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from vlatool.user_code import children
 
-GRAPHS = ("numpy", "onnx", "onnxruntime", "vlatool.stage._inside", "vlatool.quantize.static_int8")
+GRAPHS = ("numpy.random", "onnx", "onnxruntime", "vlatool.stage._inside", "vlatool.quantize.static_int8")
 MODULES = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", "vlatool.stage._inside")
 TRAINED = "qat"
 

@@ -26,7 +26,8 @@ PRELOAD = ("torch", "onnx", "onnxscript", "onnxruntime", "vlatool.export.onnx", 
 
 def needed(stage: Stage) -> tuple[str, ...]:
     """Return the modules that a child needs for a stage of vlatool's own code; the server imports them once."""
-    return (*stage.used_packages(), *stage.imports, type(stage).__module__, __name__)
+    packages = (package.replace("-", "_") for package in stage.used_packages())
+    return (*packages, *stage.imports, "numpy.random", type(stage).__module__, __name__)
 
 
 def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Context) -> Bundle:

@@ -15,7 +15,6 @@ import select
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import warnings
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -32,14 +31,12 @@ from vlatool.user_code._answers import Killed as Killed
 from vlatool.user_code._answers import Last, ended, plain, read
 from vlatool.user_code._answers import left as left
 from vlatool.user_code._answers import result as result
+from vlatool.user_code._said import BLOCK, Said
 
 Tell = Callable[[str, float | None], None]
 LONGEST_ANSWER = 1 << 28
 """Bytes of one line of an answer."""
-SHOWN_LINES, SHOWN_CHARACTERS = 200, 400
-"""Of what a child prints."""
 PATIENCE_S = 5.0
-BLOCK = 1 << 16
 
 
 class _Server:
@@ -131,7 +128,7 @@ class Apart:
         self._output, output = os.pipe()
         self._open: list[Any] = [self._talk, self._output, self._status]
         self._last = Last()
-        self._said = _Said(about, self._last)
+        self._said = Said(about, self._last)
         self._received = b""
         variables = {**os.environ, **(environment or {})}
         try:
@@ -299,30 +296,6 @@ def spread(
             for child in children:
                 child.end()
             raise
-
-
-class _Said:
-    """What a child prints, shown on standard error as the policy's, a limited number of lines."""
-
-    def __init__(self, about: str, last: Last) -> None:
-        self._about, self._last, self._rest, self._shown = about, last, b"", 0
-
-    def take(self, printed: bytes) -> None:
-        *lines, self._rest = (self._rest + printed).split(b"\n")
-        if len(self._rest) > BLOCK:
-            lines, self._rest = [*lines, self._rest], b""
-        for line in lines:
-            self._show(plain(line.decode("utf-8", "replace")))
-
-    def _show(self, line: str) -> None:
-        self._last.said = line.strip() or self._last.said
-        if not line.strip() or self._shown > SHOWN_LINES:
-            return
-        self._shown += 1
-        line = line[:SHOWN_CHARACTERS] if self._shown <= SHOWN_LINES else "prints more; not shown"
-        with contextlib.suppress(OSError, ValueError, AttributeError):
-            sys.stderr.write(f"[{self._about}] {line}\n")
-            sys.stderr.flush()
 
 
 def _received(stream: socket.socket) -> bytes:

@@ -1,0 +1,37 @@
+"""What a child prints, for whoever watches the command, and its last line for an error."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+
+from vlatool.user_code._answers import Last, plain
+
+SHOWN_LINES, SHOWN_CHARACTERS = 200, 400
+"""Of what a child prints."""
+BLOCK = 1 << 16
+
+
+class Said:
+    """What a child prints, shown on standard error as the policy's, a limited number of lines."""
+
+    def __init__(self, about: str, last: Last) -> None:
+        self._about, self._last, self._rest, self._shown = about, last, b"", 0
+
+    def take(self, printed: bytes) -> None:
+        """Show the lines that are whole now."""
+        *lines, self._rest = (self._rest + printed).split(b"\n")
+        if len(self._rest) > BLOCK:
+            lines, self._rest = [*lines, self._rest], b""
+        for line in lines:
+            self._show(plain(line.decode("utf-8", "replace")))
+
+    def _show(self, line: str) -> None:
+        self._last.said = line.strip() or self._last.said
+        if not line.strip() or self._shown > SHOWN_LINES:
+            return
+        self._shown += 1
+        line = line[:SHOWN_CHARACTERS] if self._shown <= SHOWN_LINES else "prints more; not shown"
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            sys.stderr.write(f"[{self._about}] {line}\n")
+            sys.stderr.flush()
