@@ -13,7 +13,8 @@ from collections.abc import Callable
 
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, isa
 from vlatool.machine.instruction_sets import RUNGS, SATURATING, computed_in, rung
-from vlatool.runtime.engine import engine_class
+from vlatool.runtime.arithmetic import EXACT
+from vlatool.runtime.engine import UNKNOWN, engine_class
 
 
 @functools.cache
@@ -30,6 +31,11 @@ def exact(engine: str = "ort_cpu") -> bool:
 def full_range_or_less() -> dict[str, bool]:
     """Return the options of static int8 with which OpenVINO's products are exact on this processor."""
     return {} if exact("openvino") else {"reduce_range": True}
+
+
+def weights_of_this_host(engine: str = "ort_cpu") -> dict[str, bool]:
+    """Return the options that the command line gives to int8 for an engine of this host, where none are typed."""
+    return {} if products(engine) in (EXACT, UNKNOWN) else {"reduce_range": True}
 
 
 @functools.cache

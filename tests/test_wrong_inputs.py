@@ -201,14 +201,23 @@ def finished(at: Workshop, command: list[str]) -> tuple[int, str]:
 
 
 def without_package(name: str) -> Callable[[Workshop, Line], tuple[int, str]]:
-    """In a fresh process in which a package cannot be imported, as if it were not installed."""
+    """In a fresh process in which a package cannot be imported, as if it were not installed, nor in its children."""
+    absent = f"raise ModuleNotFoundError(\"No module named '{name}'\", name={name!r})\n"
     code = f"""
+sys.path.insert(0, {{folder!r}})
 class Blocked:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] == {name!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+            raise ModuleNotFoundError(f"No module named {{{{name!r}}}}", name=name)
 sys.meta_path.insert(0, Blocked())"""
-    return lambda at, line: finished(at, at.child(code, line))
+
+    def run(at: Workshop, line: Line) -> tuple[int, str]:
+        folder = at.root / "absent"
+        folder.mkdir()
+        (folder / f"{name}.py").write_text(absent)
+        return finished(at, at.child(code.format(folder=str(folder)), line))
+
+    return run
 
 
 def namespace() -> list[str]:
