@@ -23,6 +23,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 WORST = (1, 5, 0)
 """Exit codes of a gate from the worst to the best; any other one ends the run."""
+EVERYWHERE = ("--no-reduce-range",)
+"""Options with which the same code makes the same bundle on every processor."""
 
 
 def main() -> int:
@@ -90,7 +92,7 @@ def quantized(tree: Path, sample: Path, out: Path) -> Path:
     Raises:
         SystemExit: when that fails.
     """
-    command = [sys.executable, "-m", "vlatool", "quantize", str(sample), "-o", str(out), "--force"]
+    command = [sys.executable, "-m", "vlatool", "quantize", str(sample), "-o", str(out), "--force", *EVERYWHERE]
     place = {**os.environ, "PYTHONPATH": str(tree), "VLATOOL_CACHE": str(out.parent / f"{out.name}-cache")}
     if subprocess.run(command, cwd=tree, env=place, check=False).returncode:
         raise SystemExit(f"{sample} cannot be quantized with the code of {tree}")
