@@ -127,3 +127,11 @@ def test_a_quantized_bundle_fits_when_it_was_asked_to(
         made = stage.run(float_bundle, tmp_path / str(number), Context())
         assert weights_fit(made.path / "graphs/main.onnx"), stage
     assert not weights_fit(int8_bundle.path / "graphs/main.onnx")
+
+
+def test_a_vector_is_a_zero_point_unless_it_is_multiplied() -> None:
+    zeros = helper.make_node("MatMulInteger", ["x", "w", "", "zeros"], ["y"])
+    assert weights_fit(model_of(zeros, w=FITS, zeros=np.zeros(2, np.int8)))
+    assert not weights_fit(
+        model_of(product("MatMul"), product("MatMulInteger", "v"), w=FITS, v=np.full(4, 100, np.int8))
+    )

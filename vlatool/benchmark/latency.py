@@ -169,7 +169,7 @@ class Latency(Measure):
             cold=COLD_STARTS if self.cold else 0,
             check=self.answers,
             limits=Limits(processors(self.pin), self.cores, self.memory_mb),
-            reach=self.reach,
+            reach=self.reach and not self.memory_mb,  # what a policy may take is not for a product
         )
 
     def _report(self, bundles: Sequence[Bundle], job: LatencyJob, run: Measured, where: str) -> Report:

@@ -58,8 +58,8 @@ def with_accuracy(
     found = ""
     for row in others if enough is None else in_order(others):
         if found:
-            reason = f"its episodes were not played: {found} keeps to the limits, and is faster or as fast and closer"
-            evaluated[row.name] = replace(row, reason=f"{reason} to float32 (--every-candidate plays all)")
+            reason = f"its episodes were not played: {found} keeps to the limits and comes before it"
+            evaluated[row.name] = replace(row, reason=f"{reason} (--every-candidate plays all)")
             continue
         played = cached_measure(loop, bundles[row.name], cache, context.about(row.name)).rows[-1]
         evaluated[row.name] = _joined(row, compare_success(own, played))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from vlatool.errors import GraphError
 from vlatool.files.limits import check, limit
@@ -56,6 +57,22 @@ class OpenFile:
         if not self._at <= start <= end <= self._at + len(self._part):
             self._at, self._part = start, os.pread(self._handle, max(SMALL, end - start), start)
         return self._part[start - self._at : end - self._at]
+
+
+def asked_of(question: Callable[[bytes | OpenFile], bool], model: Path | bytes) -> bool:
+    """Return the answer to a question about a serialized ``ModelProto``, or about the file of one.
+
+    Raises:
+        GraphError: what the question raises.
+        OSError: when there is no such file.
+    """
+    if isinstance(model, bytes):
+        return question(model)
+    handle = os.open(model, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        return question(OpenFile(handle))
+    finally:
+        os.close(handle)
 
 
 MayHold = Callable[[bytes | OpenFile, int, int], bool]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from pathlib import Path
 
-from vlatool.runtime.external_data import LENGTH, SMALL, VARINT, OpenFile, messages, parts, varint
+from vlatool.runtime.external_data import LENGTH, SMALL, VARINT, OpenFile, asked_of, messages, parts, varint
 
 FLOAT8 = (17, 18, 19, 20)
 """``TensorProto.DataType``: E4M3FN, E4M3FNUZ, E5M2, E5M2FNUZ."""
@@ -38,7 +36,7 @@ def has_float8(model: Path | bytes) -> bool:
         >>> has_float8(b"")
         False
     """
-    return _asked(_holds, model)
+    return asked_of(_holds, model)
 
 
 def lacks_zero_point(model: Path | bytes) -> bool:
@@ -53,17 +51,7 @@ def lacks_zero_point(model: Path | bytes) -> bool:
         >>> lacks_zero_point(b"")
         False
     """
-    return _asked(_lacks, model)
-
-
-def _asked(question: Callable[[bytes | OpenFile], bool], model: Path | bytes) -> bool:
-    if isinstance(model, bytes):
-        return question(model)
-    handle = os.open(model, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        return question(OpenFile(handle))
-    finally:
-        os.close(handle)
+    return asked_of(_lacks, model)
 
 
 def _lacks(model: bytes | OpenFile) -> bool:

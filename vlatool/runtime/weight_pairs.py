@@ -7,7 +7,6 @@ when one weight is not.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import OpenFile, fields, messages, varint
+from vlatool.runtime.external_data import OpenFile, asked_of, fields, messages, varint
 from vlatool.weights import pairs
 
 INT8 = 3
@@ -63,13 +62,7 @@ def weights_fit(model: Path | bytes) -> bool:
             than ``graph_fields``.
         OSError: when there is no such file.
     """
-    if isinstance(model, bytes):
-        return _fit(model)
-    handle = os.open(model, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        return _fit(OpenFile(handle))
-    finally:
-        os.close(handle)
+    return asked_of(_fit, model)
 
 
 def _fit(model: bytes | OpenFile) -> bool:
@@ -82,7 +75,17 @@ def _fit(model: bytes | OpenFile) -> bool:
             name, weight = _tensor(model, start, end)
             if weight is not None and weights.setdefault(name, weight) is not weight:
                 return False
-    return bool(weights) and all(_met(model, name, weight, nodes) for name, weight in weights.items())
+    # what a vector may be multiplied by, as it is or behind the first input of any other operator
+    multiplied = {
+        node.inputs[index] for node in nodes if (index := WEIGHT_INPUT.get(node.operator, 0)) < len(node.inputs)
+    }
+    vectors = {name for name, weight in weights.items() if len(weight.shape) < 2}  # zero points, as a rule
+    matrices = {name: weight for name, weight in weights.items() if name not in vectors}
+    return (
+        bool(matrices)
+        and not vectors & multiplied
+        and all(_met(model, name, weight, nodes) for name, weight in matrices.items())
+    )
 
 
 def _met(model: bytes | OpenFile, name: str, weight: _Weight, nodes: list[_Node]) -> bool:
@@ -144,7 +147,7 @@ def _transposes(model: bytes | OpenFile, start: int, end: int) -> bool:
 
 
 def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, _Weight | None]:
-    """Return the name of a tensor, and where its data are if it is int8 and has two axes or more."""
+    """Return the name of a tensor, and where its data are if it is int8 and no scalar."""
     shape: list[int] = []
     name, dtype, place = "", 0, (0, 0)
     for field, at, to, number in fields(model, start, end):
@@ -156,7 +159,7 @@ def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, _Weight
             name = _text(model, at, to)
         elif field == RAW_DATA:
             place = at, to
-    return name, _Weight(tuple(shape), *place) if dtype == INT8 and len(shape) > 1 else None
+    return name, _Weight(tuple(shape), *place) if dtype == INT8 and shape else None
 
 
 def _packed(model: bytes | OpenFile, start: int, end: int) -> Iterator[int]:
