@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+
+from _shared import once
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.export.onnx import ExportOnnx
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.run import run_transform
+from vlatool.user_code import trust
 
 YAML = """\
 schema: 1
@@ -89,6 +93,13 @@ def folder_of(folder: Path, kind: tuple[float, float] = GOOD) -> Path:
 
 
 def bundle_of(folder: Path, kind: tuple[float, float] = GOOD) -> Bundle:
-    """Export a policy of a kind, written beside its bundle."""
-    source = run_transform(TorchModule(policy=folder_of(folder / "policy", kind)), None, folder / "module", Context())
-    return run_transform(ExportOnnx(), source, folder / "bundle", Context())
+    """Return the bundle of a policy of a kind, in a new folder that holds the policy, too."""
+
+    def make(place: Path) -> None:
+        policy = folder_of(place / "policy", kind)
+        source = run_transform(TorchModule(policy=policy), None, place / "module", Context())
+        run_transform(ExportOnnx(), source, place / "bundle", Context())
+
+    shutil.copytree(once(f"reach-{kind[0]}-{kind[1]}", make), folder, dirs_exist_ok=True)
+    trust.name(folder / "policy")
+    return Bundle.open(folder / "bundle")

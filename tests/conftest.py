@@ -16,12 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 from _arithmetic import lacks
-from _full import VARIABLE
+from _full import VARIABLE, full
+from _shared import VARIABLE as SHARED
+from _shared import found, once
 from _tiny import observations, write_policy
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
-from vlatool.user_code import children
+from vlatool.stage.base import Context, Transform
+from vlatool.stage.run import run_transform
+from vlatool.user_code import children, trust
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 """Of torch, here and in all children: two threads that meet at barriers on busy cores are ten times slower than one."""
@@ -84,7 +88,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip a test that needs what this processor lacks; engines are asked here, never while tests are collected."""
+    """Skip a test of ``make soak``, and one that needs what this processor lacks.
+
+    Engines are asked here, never while tests are collected.
+    """
+    for marker in item.iter_markers("soak"):
+        if not full():
+            pytest.skip(f"make soak runs it; here: {marker.args[0]}")
     for marker in item.iter_markers("needs"):
         if why := lacks(*marker.args, **marker.kwargs):
             pytest.skip(why)
@@ -94,6 +104,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def _cache_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep the tests away from the user's cache and measurements, and child processes too."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(SHARED, str(found(tmp_path_factory)))
         patch.setenv("VLATOOL_CACHE", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("VLATOOL_CALIBRATIONS", str(tmp_path_factory.mktemp("calibrations")))
         patch.setenv("VLATOOL_TRUST", str(tmp_path_factory.mktemp("trust") / "trusted.json"))
@@ -101,9 +112,9 @@ def _cache_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 
 @pytest.fixture(scope="session")
-def policy_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def policy_template() -> Path:
     """The folder of the tiny policy; read only."""
-    return write_policy(tmp_path_factory.mktemp("template") / "tiny")
+    return once("tiny", write_policy)
 
 
 @pytest.fixture
@@ -112,37 +123,50 @@ def policy_dir(policy_template: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(policy_template, tmp_path / "tiny"))
 
 
+def made_once(name: str, stage: Transform, source: Bundle | None) -> Bundle:
+    """Return what a stage makes of a bundle."""
+
+    def make(folder: Path) -> None:
+        (folder / "bundle").mkdir(parents=True)
+        stage.run(source, folder / "bundle", Context())
+
+    return Bundle.open(once(name, make) / "bundle")
+
+
 @pytest.fixture(scope="session")
-def source_bundle(policy_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+def source_bundle(policy_template: Path) -> Bundle:
     """The source bundle of the tiny policy; read only."""
     from vlatool.sources.torch_module import TorchModule
-    from vlatool.stage.base import Context
 
-    out = tmp_path_factory.mktemp("source") / "bundle"
-    out.mkdir()
-    return TorchModule(policy=policy_template).run(None, out, Context())
+    trust.name(policy_template)  # as making the bundle does, in the process that makes it
+    return made_once("source", TorchModule(policy=policy_template), None)
 
 
 @pytest.fixture(scope="session")
-def float_bundle(source_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+def float_bundle(source_bundle: Bundle) -> Bundle:
     """The tiny policy as exported, float32; read only."""
     from vlatool.export.onnx import ExportOnnx
-    from vlatool.stage.base import Context
 
-    out = tmp_path_factory.mktemp("float") / "bundle"
-    out.mkdir()
-    return ExportOnnx().run(source_bundle, out, Context())
+    return made_once("float", ExportOnnx(), source_bundle)
 
 
 @pytest.fixture(scope="session")
-def int8_bundle(float_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+def int8_bundle(float_bundle: Bundle) -> Bundle:
     """The tiny policy in static int8; read only."""
     from vlatool.quantize.static_int8 import StaticInt8
-    from vlatool.stage.base import Context
 
-    out = tmp_path_factory.mktemp("int8") / "bundle"
-    out.mkdir()
-    return StaticInt8().run(float_bundle, out, Context())
+    return made_once("int8", StaticInt8(), float_bundle)
+
+
+@pytest.fixture(scope="session")
+def pruned_once(source_bundle: Bundle) -> Bundle:
+    """The tiny policy without most of its hidden neurons; read only."""
+    from vlatool.prune.neurons import Neurons
+
+    place = once(
+        "pruned", lambda folder: run_transform(Neurons(ratio=0.7), source_bundle, folder / "bundle", Context())
+    )
+    return Bundle.open(place / "bundle")
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from _acts import DISTURBS, ENDS, FORGES, POLICY_YAML, environment, policy
+from _full import small_or_full
 
 from vlatool.cli import main
 
@@ -193,7 +194,7 @@ def gone(pid: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize("group", [True, False])
+@pytest.mark.parametrize("group", small_or_full([True], [True, False]))
 @pytest.mark.parametrize(
     ("number", "status", "says"),
     [
@@ -233,7 +234,9 @@ def test_closed_and_full_streams_do_not_change_the_exit_code(float_bundle, redir
     assert subprocess.run(["sh", "-c", shell], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("redirect", [">/dev/full", ">/dev/full 2>&-", "--json >/dev/full"])
+@pytest.mark.parametrize(
+    "redirect", small_or_full([">/dev/full"], [">/dev/full", ">/dev/full 2>&-", "--json >/dev/full"])
+)
 def test_a_result_that_cannot_be_printed_is_an_error(int8_bundle, redirect: str) -> None:
     shell = f'"{sys.executable}" -m vlatool evaluate recorded "{int8_bundle.path}" --samples 2 {redirect}'
     done = subprocess.run(["sh", "-c", shell], check=False, stderr=subprocess.PIPE, text=True)
@@ -254,6 +257,6 @@ def test_another_error_keeps_its_code_when_it_cannot_be_printed() -> None:
 
 def test_an_error_keeps_its_code_with_stderr_closed(tmp_path: Path, folder) -> None:
     mine = folder(in_make="import sys; sys.exit(0)")
-    for redirect in ("2>&-", "2>/dev/full"):
+    for redirect in small_or_full(["2>&-"], ["2>&-", "2>/dev/full"]):
         shell = f'"{sys.executable}" -m vlatool export "{mine}" -o "{tmp_path / "out"}" {redirect}'
         assert subprocess.run(["sh", "-c", shell], check=False).returncode == 3

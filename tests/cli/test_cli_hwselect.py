@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from vlatool.cli import main
 from vlatool.hardware.profile import load_profile, names
 from vlatool.report import Report, read_report
 
@@ -366,3 +368,23 @@ def test_a_report_is_no_calibration_before_it_is_told(vlatool, float_bundle, tmp
     code, _, err = vlatool(*line, "--calibration", tmp_path / "report/report.json")
     assert code == 3
     assert "vlatool profiles calibrate" in err
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"),
+    [
+        (["--max-price", 1], "costs 80 dollars, more than 1"),
+        (["--max-watts", 1], "takes up to"),
+        (["--memory", 0.001], "0.0 usable"),
+        (["--hz", 1e6], "even at"),
+        (["--precision", "float8"], "it has no engine for float8"),
+    ],
+    ids=lambda value: str(value[0]) if isinstance(value, list) else "",
+)
+def test_what_no_board_can_do_is_answered_with_reasons(flags: list[Any], reason: str, float_bundle, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([str(part) for part in ("hwselect", float_bundle.path, "--boards", "raspberry-pi-5", *flags, "--json")])
+    assert caught.value.code == 1
+    (row,) = Report.from_json(capsys.readouterr().out).rows
+    assert row.role == "outside"
+    assert reason in row.reason

@@ -107,6 +107,7 @@ def test_the_student_plays_with_the_weights_of_all(pruned_deep: Bundle, tmp_path
     assert max(apart(two, one)) < TOLERANCE
 
 
+@pytest.mark.soak("the same parts as processes of one machine; torchrun's options in tests/cli")
 def test_torchrun_trains_as_processes_of_one_machine_do(policy: Path, pruned_deep: Bundle, two: Bundle, tmp_path: Path):
     agents = [agent(rank, pruned_deep, policy, tmp_path) for rank in range(2)]
     said = [each.communicate(timeout=240)[0] for each in agents]

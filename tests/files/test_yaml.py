@@ -97,3 +97,18 @@ def test_a_pipe_is_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.yaml")
     with pytest.raises(RecipeError, match="it is not a regular file"):
         read_mapping(tmp_path / "a.yaml", "It", RecipeError)
+
+
+def test_a_file_that_changes_is_read_again_and_what_is_read_is_the_callers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("{a: [1, 2]}")
+    read_mapping(path, "It", RecipeError)["a"].append(3)
+    assert read_mapping(path, "It", RecipeError) == {"a": [1, 2]}
+    path.write_text("{a: [4, 2]}")
+    os.utime(path, (0, 0))
+    assert read_mapping(path, "It", RecipeError) == {"a": [4, 2]}
+    monkeypatch.setenv("VLATOOL_LIMITS", "yaml_nodes=2")
+    with pytest.raises(RecipeError, match="yaml_nodes"):
+        read_mapping(path, "It", RecipeError)

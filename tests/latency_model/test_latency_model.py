@@ -117,6 +117,13 @@ def test_nothing_measured_changes_nothing(model: LatencyModel) -> None:
     assert same.own == frozenset()
 
 
+def test_what_was_measured_is_taken_in_once(model: LatencyModel) -> None:
+    told = model.conditioned([(ask(CONV, NEW), 123.0)])
+    assert model.conditioned([(ask(CONV, NEW), 123.0)]) is told, "for each bundle that a command predicts"
+    other = model.conditioned([(ask(CONV, NEW), 60.0)])
+    assert other.predict([ask(CONV, NEW)])[0].ms < told.predict([ask(CONV, NEW)])[0].ms
+
+
 def test_what_is_written_is_read(model: LatencyModel, points: list[Point], reread: Callable[..., LatencyModel]) -> None:
     asked = [point.question for point in points if point.question] + [ask(VIT, NEW), ask(CONV, NEW)]
     found = reread(model)

@@ -82,11 +82,11 @@ def test_this_vlatool_comes_before_what_is_installed_and_after_python(monkeypatc
 
 WAYS = [(command, started) for command in ("export", "benchmark", "closed-loop", "refit")
         for started in ("script", "module")]  # fmt: skip
-EACH_ONCE = [way for way in WAYS if way[1] == "script" or way[0] == "export"]
-"""Every kind of child of a script, and of a module one: both ask ``import_path``."""
+FEW = [("export", "module"), ("benchmark", "script"), ("refit", "script")]
+"""Both ways of starting, and each kind of child: of the server, of a measurement, of multiprocessing."""
 
 
-@pytest.mark.parametrize(("command", "started"), small_or_full(EACH_ONCE, WAYS))
+@pytest.mark.parametrize(("command", "started"), small_or_full(FEW, WAYS))
 def test_modules_in_the_current_directory_do_not_run_in_children(
     shadowed, started, command, policy_template, float_bundle, points_file, tmp_path
 ) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from _arithmetic import full_range_or_less
+from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
@@ -161,7 +162,10 @@ def test_every_candidate_has_a_row_with_what_was_measured_and_predicted(from_tor
     report = from_torch.report
     names = [row.name for row in report.rows]
     assert names[:3] == ["float32", "dynamic_int8", "static_int8"]
-    assert set(names[3:]) <= {"static_int8_mse", "static_int8_attention"}
+    chosen = next(row for row in report.rows if row.role == "chosen")
+    plans = {trial["plan"]: trial for trial in chosen.details["Plans tried by the search"]}
+    assert set(names[1:]) <= set(plans), "which options win on a policy of four layers depends on the processor"
+    assert all(plans[name]["speed-up"] for name in names[1:])
     assert [row.role for row in report.rows].count("chosen") == 1
     assert report.verdict == "pass"
     assert "float32 succeeds in 80.0% of 10 episodes; actions that do not look" in report.summary[-1]
@@ -273,9 +277,8 @@ def test_fresh_measures_again_and_keeps_what_was_made(run, recipe):
     ("stage", "file"),
     [
         ("quantize.dynamic_int8", "graphs/main.onnx"),
-        ("sources.onnx", "manifest.json"),
         ("benchmark.latency", "report.json"),
-        ("evaluate.recorded", "report.json"),
+        *small_or_full([], [("sources.onnx", "manifest.json"), ("evaluate.recorded", "report.json")]),
     ],
 )
 def test_a_damaged_entry_of_the_cache_is_made_again(run, recipe, stage, file):

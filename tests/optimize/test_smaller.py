@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.cli import main
@@ -48,7 +49,7 @@ def test_candidates_are_pruned_trained_exported_and_quantized(policy_dir: Path, 
     assert page.count("Loss of smaller: distill.policy") == 2, "for a screen and a phone"
 
 
-@pytest.mark.parametrize("listens", [True, False])
+@pytest.mark.parametrize("listens", small_or_full([True], [True, False]))
 def test_what_was_trained_is_told_the_wrong_instruction(listens: bool, policy_dir: Path, tmp_path: Path):
     """Beside float32, on the first of the same seeds; nothing is said where the environment knows no wrong one."""
     if not listens:

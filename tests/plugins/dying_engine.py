@@ -17,25 +17,27 @@ HOW = {
 }
 
 
-def plant(how: str, when: str, of: bytes) -> None:
-    """Let sessions die."""
+def plant() -> None:
+    """Let sessions die as the variables say then."""
     from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 
     begin, run = OrtCpuSession.__init__, OrtCpuSession.run
 
-    def open_or_die(self, path, threads=None, compute="", opened=None):
-        self.deadly = of in (opened if isinstance(opened, bytes) else path.read_bytes())
-        if when == "open" and self.deadly:
+    def die(when: str, graph: bytes) -> None:
+        how, _, moment = os.environ.get("DIES", "").partition(":")
+        if when == moment and os.environ["DIES_OF"].encode() in graph:
             HOW[how]()
+
+    def open_or_die(self, path, threads=None, compute="", opened=None):
+        self.graph = opened if isinstance(opened, bytes) else path.read_bytes()
+        die("open", self.graph)
         begin(self, path, threads, compute, opened)
 
     def run_or_die(self, feeds):
-        if when == "run" and self.deadly:
-            HOW[how]()
+        die("run", self.graph)
         return run(self, feeds)
 
     OrtCpuSession.__init__, OrtCpuSession.run = open_or_die, run_or_die
 
 
-if "DIES" in os.environ:
-    plant(*os.environ["DIES"].split(":"), os.environ["DIES_OF"].encode())
+plant()

@@ -7,10 +7,11 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from _console import Console
 
 from vlatool.bundle.bundle import Bundle
 
@@ -29,7 +30,7 @@ ENDS = {
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """A function that runs vlatool in an environment whose ONNX Runtime dies of some graphs."""
     place = tmp_path_factory.mktemp("dying")
     python = place / "venv/bin/python"
@@ -40,12 +41,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     shutil.copy(HERE / "dying_engine.py", library)
     environment = {**os.environ, "VLATOOL_CACHE": str(place / "cache"), "COLUMNS": "200"}
 
-    def call(dies: str, of: str, *words: str) -> subprocess.CompletedProcess[str]:
-        own = {"DIES": dies, "DIES_OF": of, "VLATOOL_LIMITS": HANGS if dies.startswith("hang") else ""}
-        command = [str(python), "-W", "ignore", "-m", "vlatool", *words]
-        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment | own, timeout=300)
+    with Console(place, python, environment) as console:
 
-    return call
+        def call(dies: str, of: str, *words: str) -> subprocess.CompletedProcess[str]:
+            limits = HANGS if dies.startswith("hang") else ""
+            return console.run(*words, DIES=dies, DIES_OF=of, VLATOOL_LIMITS=limits)
+
+        yield call
 
 
 def refused(done: subprocess.CompletedProcess[str], how: str, where: Path) -> str:

@@ -7,11 +7,12 @@ import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from _console import Console
 
 from vlatool.bundle.bundle import Bundle
 
@@ -65,7 +66,7 @@ def wheel(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """A function that runs vlatool in a fresh environment in which the package is installed."""
     place = tmp_path_factory.mktemp("plugin")
     python = place / "venv/bin/python"
@@ -78,11 +79,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     subprocess.run([*install, str(wheel(place))], check=True)
     environment = {**os.environ, "VLATOOL_CACHE": str(place / "cache"), "COLUMNS": "200"}
 
-    def call(*words: str) -> subprocess.CompletedProcess[str]:
-        command = [str(python), "-W", "ignore", *([] if words[0] == "-c" else ["-m", "vlatool"]), *words]
-        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=place, env=environment)
-
-    return call
+    with Console(place, python, environment) as console:
+        yield console.run
 
 
 def ok(done: subprocess.CompletedProcess[str]) -> str:
@@ -143,7 +141,7 @@ def test_optimize_chooses_its_method(run: Run, policy_dir: Path, tmp_path: Path)
 
 def test_a_search_begins_with_its_method_and_its_engines_plans(run: Run):
     code = "from vlatool.optimize.search import variants_for; print(sorted(variants_for(None, False)))"
-    found = ok(run("-c", code))
+    found = ok(run(code=code))
     assert "'rounded'" in found
     assert "'acme_float16'" in found
 
@@ -155,7 +153,7 @@ def test_its_section_is_in_every_format_of_a_report(run: Run):
         "print(render(Report('benchmark', 't', rows=(row,)), '{}'))"
     )
     for format in ("terminal", "markdown", "html"):
-        text = ok(run("-c", code.format(format)))
+        text = ok(run(code=code.format(format)))
         assert "Inferences in an hour" in text
         assert "72,000" in text
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from _full import small_or_full
 from _tiny import deepen
 from torch import nn
 
@@ -72,7 +73,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vlatool.stage.run.run_apart", lambda stage, *rest: stage.run(*rest))
 
 
-@pytest.mark.parametrize("share", [0.9, 0.7, 0.5])
+@pytest.mark.parametrize("share", small_or_full([0.7], [0.9, 0.7, 0.5]))
 def test_the_target_is_met_and_made_again_without_measuring(
     counted: None, deep: Bundle, policy_dir: Path, tmp_path: Path, share: float, monkeypatch: pytest.MonkeyPatch
 ):
@@ -168,7 +169,7 @@ def test_kernels_that_like_some_widths_better_do_not_end_the_search(
 
     monkeypatch.setattr(latency, "Clock", Choosy)
     clock = Choosy(deep)
-    for share in (0.6, 0.65, 0.7, 0.75, 0.8):
+    for share in small_or_full((0.65, 0.75), (0.6, 0.65, 0.7, 0.75, 0.8)):
         target = share * clock.ms(())
         stage = build_stage("prune.latency", {"target_ms": target, **FINE})
         pruned = run_transform(stage, deep, tmp_path / f"o{share}", Context())

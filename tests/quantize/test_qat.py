@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from _arithmetic import weights_of_this_host
+from _full import small_or_full
 from safetensors.torch import load_file, save_file
 from torch import nn
 
@@ -95,7 +96,7 @@ def error(policy: object, wanted: object, bundle: Bundle) -> float:
     return float(np.mean([relative_error(policy.infer(each).chunk, wanted.infer(each).chunk) for each in observations]))
 
 
-@pytest.mark.parametrize("weights", ["int8", "int4"])
+@pytest.mark.parametrize("weights", small_or_full(["int8"], ["int8", "int4"]))
 def test_what_rounding_costs_is_learnt_away(policy_dir: Path, tmp_path: Path, weights: str):
     stored = load_file(policy_dir / "weights.safetensors")
     for name, factor in (("mlp.1.weight", 60.0), ("mlp.1.bias", 60.0)):  # one neuron takes the whole range

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from _full import small_or_full
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.data import recorded_observations
@@ -186,7 +187,7 @@ def test_the_folder_stays_small() -> None:
 
 
 @pytest.mark.parametrize("folder", [FLOW, METAWORLD], ids=lambda folder: folder.name)
-@pytest.mark.parametrize("script", ["train.py", "evaluate.py"])
+@pytest.mark.parametrize("script", small_or_full(["train.py"], ["train.py", "evaluate.py"]))
 def test_the_scripts_find_what_the_folders_share(folder: Path, script: str) -> None:
     done = subprocess.run(
         [sys.executable, folder / script, "--help"], capture_output=True, text=True, check=False, timeout=120

@@ -103,7 +103,7 @@ def test_a_damaged_bundle_in_the_cache_is_made_again_and_that_is_said(float_bund
 
 
 def test_a_report_is_kept_read_again_and_measured_afresh_when_asked(float_bundle, tmp_path):
-    stage = Latency(iterations=20, cold=False)
+    stage = Latency(iterations=20, duration=0, cold=False, reach=False)
     first = cached_measure(stage, float_bundle, tmp_path, Context())
     before = stamps(tmp_path)
     assert cached_measure(stage, float_bundle, tmp_path, Context()) == first

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +45,7 @@ def imports(root: Path = ROOT) -> list[Import]:
 
 
 def _imports(importer: str, path: Path, known: dict[str, Path]) -> Iterator[Import]:
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    for node in _nodes(path.read_bytes()):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 if alias.name in known:
@@ -55,6 +56,12 @@ def _imports(importer: str, path: Path, known: dict[str, Path]) -> Iterator[Impo
                 yield Import(importer, f"{node.module}.{name}", line=node.lineno)
             if taken := tuple(alias.name for alias in node.names if alias.name not in inside):
                 yield Import(importer, str(node.module), taken, node.lineno)
+
+
+@functools.cache
+def _nodes(source: bytes) -> list[ast.Import | ast.ImportFrom | ast.Call]:
+    """Return what may import something, read once from each text."""
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, (ast.Import, ast.ImportFrom, ast.Call))]
 
 
 def room(module: str, known: dict[str, Path]) -> str:
@@ -123,9 +130,9 @@ def named_libraries(libraries: Collection[str], root: Path = ROOT, engines: str 
     found = []
     for path in modules(root).values():
         if engines not in path.as_posix():
-            place, nodes = path.relative_to(root).as_posix(), ast.walk(ast.parse(path.read_bytes()))
+            place, nodes = path.relative_to(root).as_posix(), _nodes(path.read_bytes())
             asking = (node for node in nodes if any(name.partition(".")[0] in libraries for name in _asked_for(node)))
-            found += [f"{place}:{node.lineno}" for node in asking]  # type: ignore[attr-defined]
+            found += [f"{place}:{node.lineno}" for node in asking]
     return found
 
 

@@ -132,6 +132,7 @@ def test_an_environment_that_fails_fails_as_it_does_here(nodes: Nodes, bundle: B
     assert (found[0].message, found[0].fix) == (found[1].message, found[1].fix)
 
 
+@pytest.mark.soak("a worker that is killed once, and a policy's process that dies")
 def test_an_environment_that_takes_each_worker_with_it_is_told(nodes: Nodes, bundle: Bundle, tmp_path: Path):
     folder = changed(bundle, tmp_path / "deadly", "import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     with pytest.raises(SourceError, match=r"was killed \(SIGKILL\) before it was done, 3 times in a row"):

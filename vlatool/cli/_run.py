@@ -23,7 +23,6 @@ from vlatool.files.outputs import BUNDLE
 from vlatool.files.printable import one_line, printable
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.instruction_sets import ENGINE, board_set
-from vlatool.optimize.choice import foretold
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
@@ -264,6 +263,7 @@ def _measured(stage: Measure, bundle: Bundle, board: Profile | None, context: Co
 def with_predictions(report: Report, board: Profile, bundle: Bundle) -> Report:
     """Add what is predicted for a board; without onnx, the measurement stands, with a warning."""
     from vlatool.latency_model.predict import predictions
+    from vlatool.optimize.choice import foretold
 
     row = report.rows[-1] if report.kind == "evaluate" else report.rows[0]
     try:

@@ -20,6 +20,7 @@ from vlatool.module.stored import graph_filled, stored_modules, takes_shards, we
 from vlatool.module.to_onnx import (
     EXTERNAL_DATA_BYTES,
     IMPORTS,
+    OPSET,
     exported_by_torch,
     name_by_module,
     strip_notes,
@@ -49,7 +50,7 @@ class ExportOnnx(Transform):
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
 
-    opset: int = Field(20, ge=18, le=23, description="opset of the default ONNX domain")
+    opset: int = Field(OPSET, ge=18, le=23, description="opset of the default ONNX domain")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
     tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
 

@@ -6,6 +6,8 @@ for, so that a few lines cannot become gigabytes. Only plain values are read; a 
 
 from __future__ import annotations
 
+import copy
+import functools
 import os
 import stat
 import sys
@@ -18,6 +20,8 @@ from vlatool.files.limits import check, limit
 PLAIN = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "merge", "value")
 """Kinds of values that are read."""
 TAG = "tag:yaml.org,2002:"
+SHORT = 1 << 16
+"""Characters of a text that is parsed once and remembered."""
 
 
 def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
@@ -34,16 +38,9 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
     """
     yaml = require("yaml", "build")
     try:
-        loader = yaml.SafeLoader(_text(path, what, raised))
-        loader.compose_node = _bounded(loader, what, raised)
-        try:
-            node = loader.get_single_node()
-            if node is None:
-                return None
-            _check_nodes(node, what, raised)
-            return loader.construct_document(node)
-        finally:
-            loader.dispose()
+        text = _text(path, what, raised)
+        parse = _remembered if len(text) <= SHORT else _parsed
+        return copy.deepcopy(parse(text, what, raised, (limit("yaml_depth"), limit("yaml_nodes"))))
     except OSError as error:
         raise raised(f"{what} cannot be read: {error.strerror or error}.") from error
     except UnicodeDecodeError as error:
@@ -54,6 +51,24 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
         raise raised(f"{what} has a whole number of more than {sys.get_int_max_str_digits():,} digits.") from error
     except (yaml.YAMLError, TypeError, LookupError, AttributeError, OverflowError) as error:
         raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.") from error
+
+
+def _parsed(text: str, what: str, raised: type[InputError], _limits: tuple[int, int]) -> Any:
+    yaml = require("yaml", "build")
+    loader = yaml.SafeLoader(text)
+    loader.compose_node = _bounded(loader, what, raised)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _check_nodes(node, what, raised)
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+_remembered: Any = functools.lru_cache(32)(_parsed)
+"""What is not to be changed; a command asks several times for the profiles of all boards."""
 
 
 def read_mapping(path: Path, what: str, raised: type[InputError]) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 Array = NDArray[Any]
 
@@ -163,6 +162,8 @@ class Process:
     def __init__(self, rows: Rows, logs: Array, scales: Scales, noise: Array | None = None) -> None:
         self.rows, self.logs, self.scales = rows, logs, scales
         self.noise = np.full(len(rows), scales.noise) if noise is None else noise
+        from scipy.linalg import cho_solve, cholesky  # every command line imports this module, few solve anything
+
         covariance = kernel(rows, rows, scales)
         covariance[np.diag_indices(len(rows))] += self.noise**2
         self._factor = cholesky(covariance, lower=True, overwrite_a=True)
@@ -175,6 +176,8 @@ class Process:
 
     def joint(self, questions: Rows) -> tuple[Array, Array]:
         """Return mean (n,) and covariance (n, n) of log(ms) without noise."""
+        from scipy.linalg import solve_triangular
+
         across = kernel(self.rows, questions, self.scales)
         mean = questions.prior + across.T @ self._weights
         half = solve_triangular(self._factor, across, lower=True)

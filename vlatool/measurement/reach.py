@@ -22,7 +22,7 @@ from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, engine_class
 SIZE = 1024
 MACS = SIZE**3
 DTYPES = (INT8, FLOAT32, BFLOAT16)
-REPEATS = 9
+REPEATS = 5
 """Timed products of each dtype; the fastest counts, since other work only slows a product down."""
 IN_FLOAT = (
     "eNrj4LJaxsilKcRYrMThnJ9XXJKYV6IlwcValphTmqrFw8EkwG7F0sDRwOHEsICRxYqBy5iLsViIsVyJH6baPy04I7EgFVkTowCjEgvXdWUbmCZh"

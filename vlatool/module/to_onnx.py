@@ -18,15 +18,18 @@ from vlatool.graph.nodes import FOLDED
 from vlatool.module.factory import exits_caught
 from vlatool.module.failures import export_error
 from vlatool.module.norms import divide_by_roots
+from vlatool.module.torchlib import built_once
 
 if TYPE_CHECKING:
     from torch import nn
 
 IMPORTS = (
     "torch._dynamo", "torch.export._trace", "torch.onnx._internal.exporter._compat",
-    "onnxscript.function_libs.torch_lib.ops",
+    "onnxscript.function_libs.torch_lib.ops", "vlatool.module.torchlib_built",
 )  # fmt: skip
 """What the first export of a process imports, half of its time; names that a release has no more cost that alone."""
+OPSET = 20
+"""Of the default domain, unless another one is asked for."""
 EXTERNAL_DATA_BYTES = 1_500_000_000
 """Weights above this go into a file beside the graph: protobuf ends at 2 GiB."""
 
@@ -43,7 +46,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     """
     torch = require("torch", "build")
     try:
-        with quiet_exporter(), torch.no_grad(), exits_caught("the policy's forward()"):
+        with quiet_exporter(), built_once(), torch.no_grad(), exits_caught("the policy's forward()"):
             exported = torch.onnx.export(
                 module, tuple(arguments), dynamo=True, opset_version=opset, input_names=list(step.feeds),
                 output_names=list(step.gives), verbose=False, **options,

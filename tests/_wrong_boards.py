@@ -1,26 +1,22 @@
-"""Everything that a person can get wrong with boards: the sentence on stderr, the exit code, and nothing left behind.
-
-One table, as in ``test_wrong_inputs``: a row is a name, a part of the message, the exit code and the command line.
-"""
+"""What a person can get wrong with boards: rows of the table of wrong inputs."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import onnx
 import pytest
 import yaml
 from _edits import put, take
+from _wrong_inputs import Line, Place, Row
 from onnx import TensorProto, helper
 
-from vlatool.cli import main
 from vlatool.report import Measurement, Report
 from vlatool.report import Row as Variant
 
-Line = list[Any]
 PROFILES = Path(__file__).parents[1] / "profiles"
 ONE = ["--boards", "raspberry-pi-5"]
 WORK = {"macs": 1e9, "weights": 1e7, "activations": 5e6, "layers": 50, "traits": []}
@@ -36,21 +32,14 @@ SHEET = {"name": "mine", "title": "t", "control_hz": 10, "compute_watts": 20, "s
          "source": "s"}  # fmt: skip
 
 
-class Workshop:
-    """Makes wrong things in a temporary folder; ``out`` is where a command is told to write."""
+class Workshop(Place):
+    """Makes wrong boards, figures and measurements."""
 
     def __init__(self, root: Path, policy: Path, bundle: Path, points: Path) -> None:
-        self.root, self.template, self.float, self.points = root, policy, bundle, points
-        self.place = root / "place"
-        self.place.mkdir()
-        self.out = self.place / "out"
-        self.kept = root / "kept"
-
-    def file(self, name: str, content: str | bytes) -> Path:
-        path = self.root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return path
+        super().__init__(root)
+        self.template, self.float, self.points = policy, bundle, points
+        self.measured = root / "kept"
+        self.kept.append(self.measured)
 
     def choose(self, *more: Any) -> Line:
         """Choose a board for the tiny policy."""
@@ -113,21 +102,6 @@ class Workshop:
             "  outputs: [{name: action, shape: [1, 1, 2]}]\n  control_hz: 10\n"
         )
         return folder / "shapeless.onnx"
-
-    def snapshot(self) -> dict[str, bytes | None]:
-        """Everything in the folder of the output, hidden or not, and the measurements that are kept."""
-        return {
-            path.relative_to(self.root).as_posix(): path.read_bytes() if path.is_file() else None
-            for folder in (self.place, self.kept)
-            for path in sorted(folder.rglob("*"))
-        }
-
-
-class Row(NamedTuple):
-    name: str
-    says: str
-    code: int
-    line: Callable[[Workshop], Line]
 
 
 def latency(ms: float = 9.5, origin: str = "measured") -> Measurement:
@@ -354,47 +328,11 @@ CALIBRATE = [
     Row("a calibration that is not there", "cannot be read: No such file", 3,
         lambda at: at.choose("--calibration", at.root / "none.json")),
 ]  # fmt: skip
-TABLE = [*NUMBERS, *NAMES, *CONSTRAINTS, *PROFILE_FILES, *SIMULATE, *POINTS, *PROFILES_COMMANDS, *CALIBRATE]
+ROWS = [*NUMBERS, *NAMES, *CONSTRAINTS, *PROFILE_FILES, *SIMULATE, *POINTS, *PROFILES_COMMANDS, *CALIBRATE]
 
 
-@pytest.fixture
-def workshop(tmp_path, policy_template, float_bundle, points_template, monkeypatch) -> Workshop:
-    made = Workshop(tmp_path, policy_template, float_bundle.path, points_template)
-    monkeypatch.setenv("VLATOOL_CALIBRATIONS", str(made.kept))
+def place(root: Path, monkeypatch: pytest.MonkeyPatch, fixture: Callable[[str], Any]) -> Workshop:
+    """Return where they are made."""
+    made = Workshop(root, fixture("policy_template"), fixture("float_bundle").path, fixture("points_template"))
+    monkeypatch.setenv("VLATOOL_CALIBRATIONS", str(made.measured))
     return made
-
-
-@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.name.replace(" ", "-"))
-def test_what_is_wrong_is_said_and_nothing_is_left(row: Row, workshop: Workshop, capsys):
-    line = row.line(workshop)
-    before = workshop.snapshot()
-    with pytest.raises(SystemExit) as caught:
-        main([str(part) for part in line])
-    told = capsys.readouterr().err
-    assert (caught.value.code, row.says in " ".join(told.split())) == (row.code, True), told
-    assert "Traceback" not in told
-    assert workshop.snapshot() == before
-
-
-@pytest.mark.parametrize(
-    ("flags", "reason"),
-    [
-        (["--max-price", 1], "costs 80 dollars, more than 1"),
-        (["--max-watts", 1], "takes up to"),
-        (["--memory", 0.001], "0.0 usable"),
-        (["--hz", 1e6], "even at"),
-        (["--precision", "float8"], "it has no engine for float8"),
-    ],
-    ids=lambda value: str(value[0]) if isinstance(value, list) else "",
-)
-def test_what_no_board_can_do_is_answered_with_reasons(flags: Line, reason: str, workshop: Workshop, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main([str(part) for part in workshop.choose(*flags, "--json")])
-    assert caught.value.code == 1
-    (row,) = Report.from_json(capsys.readouterr().out).rows
-    assert row.role == "outside"
-    assert reason in row.reason
-
-
-def test_the_table_names_each_case_once():
-    assert len({row.name for row in TABLE}) == len(TABLE) >= 100
