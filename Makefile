@@ -90,6 +90,7 @@ robot: wheels  ## run an int8 bundle as a robot would: Python 3.10, vlatool-runt
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check onnxruntime==1.23.2 $(RUNTIME_WHEEL)
 	$(OUT)/robot/venv/bin/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(RUNTIME_WHEEL)
 	$(OUT)/robot/venv/bin/python tests/robot/controller.py $(OUT)/robot/bundle --max-mb 130
+	$(OUT)/robot/venv/bin/python -W error tests/robot/alone.py $(OUT)/robot/bundle
 
 python310: $(BIN)/vlatool  ## run the build side's commands on an exported bundle under Python 3.10, without torch
 	for sample in $(SAMPLES); do $(BIN)/vlatool export sample_models/$$sample -o $(OUT)/python310/$$sample --force || exit 1; done

@@ -246,7 +246,7 @@ def test_it_succeeds_least_only_where_it_loses():
 
 
 def test_several_strengths_are_played_one_after_the_other(bundles: dict[str, Bundle]):
-    report = evaluated(bundles, "eager", 20, disturb=("delay", "push"), strength="2,0,1,1")
+    report = evaluated(bundles, "eager", 10, disturb=("delay", "push"), strength="2,0,1,1")
     row = report.rows[-1]
     table = row.details["under disturbances"]
     assert [(line["disturbance"], line["strength"]) for line in table] == [
@@ -255,9 +255,9 @@ def test_several_strengths_are_played_one_after_the_other(bundles: dict[str, Bun
     undisturbed, *disturbed = (line["success"] for line in table if line["disturbance"] == "delay")
     assert undisturbed == row.value("success"), "strength 0 is no disturbance"
     assert max(disturbed) < undisturbed
-    assert row.get("success_disturbed").samples == 120
+    assert row.get("success_disturbed").samples == 60
     assert "under delay at strength " in " ".join(report.summary)
-    alone = evaluated(bundles, "eager", 20, disturb=("delay",), strength=2.0).rows[-1]
+    alone = evaluated(bundles, "eager", 10, disturb=("delay",), strength=2.0).rows[-1]
     assert alone.raw["disturbed.delay"] == row.raw["disturbed.delay at 2"]
 
 

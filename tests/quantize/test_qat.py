@@ -105,7 +105,7 @@ def test_what_rounding_costs_is_learnt_away(policy_dir: Path, tmp_path: Path, we
     save_file(stored, policy_dir / "weights.safetensors")
     source_bundle = run_transform(TorchModule(policy=policy_dir), None, tmp_path / "source", Context())
     whole = torch_policy(source_bundle, 0)
-    options = {"weights": weights, "steps": 80, "batch": 32, "average": 0.9, "episodes": 0, "student_episodes": 0,
+    options = {"weights": weights, "steps": 40, "batch": 32, "average": 0.9, "episodes": 0, "student_episodes": 0,
                "learning_rate": 0.01, "loss": "l2", "threads": 1}  # fmt: skip
     tuned = run_transform(build_stage("quantize.qat", options), source_bundle, tmp_path / "tuned", Context())
     errors = []

@@ -23,13 +23,6 @@ ONNXRUNTIME = "onnxruntime==1.23.2"
 """The newest for Python 3.10."""
 SILENT = re.compile(r"NewConnectionError|ConnectTimeout|ReadTimeout|Temporary failure|Connection refused|ProxyError")
 """What pip says when the registry does not answer."""
-IMPORTS = """
-import importlib, pkgutil, sys, vlatool
-names = [module.name for module in pkgutil.walk_packages(vlatool.__path__, "vlatool.")]
-for name in names:
-    name.endswith("__main__") or importlib.import_module(name)
-print(len(names), vlatool.__file__)
-"""
 
 
 def imported_by(path: Path) -> set[str]:
@@ -123,30 +116,14 @@ def test_its_files_are_those_of_the_whole_wheel(wheels: dict[str, Path]):
         assert not any("cli" in name for name in names)
 
 
+@pytest.mark.soak("make robot, which .ci/run calls, does the same")
 def test_a_fresh_python_310_loads_a_bundle_and_acts(robot: Path, int8_bundle):
-    """One test, so that one environment is made, however many processes run the tests."""
-    listed = {row["name"].lower() for row in json.loads(run(robot, "-m", "pip", "list", "--format", "json").stdout)}
-    assert not {"typer", "pydantic", "rich", "psutil", "pyyaml", "scipy", "onnx", "torch"} & listed
     done = run(robot, str(ROOT / "tests/robot/controller.py"), str(int8_bundle.path))
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("python 3.10")
-    every_module_imports(robot)
-    absent_parts_are_named(robot, str(int8_bundle.path))
-
-
-def every_module_imports(robot: Path) -> None:
-    done = run(robot, "-W", "error", "-c", IMPORTS)
+    done = run(robot, "-W", "error", str(ROOT / "tests/robot/alone.py"), str(int8_bundle.path))
     assert done.returncode == 0, done.stderr
     assert str(robot.parents[1]) in done.stdout
-
-
-def absent_parts_are_named(robot: Path, bundle: str) -> None:
-    done = run(robot, "-m", "vlatool", "benchmark", bundle)
-    assert done.returncode == 4
-    assert "the command line is in vlatool.\n  fix: pip install vlatool on another machine" in done.stderr
-    assert "Traceback" not in done.stderr
-    code = f"import vlatool; vlatool.load({bundle!r}, engine='openvino')"
-    assert "fix: pip install 'vlatool-runtime[openvino]'" in run(robot, "-c", code).stderr
 
 
 def test_both_in_one_place_are_refused(wheels: dict[str, Path], int8_bundle, tmp_path: Path):

@@ -106,6 +106,7 @@ def test_two_nodes_give_the_rows_of_one_process_and_say_how_they_differ(nodes: N
     assert disturbances_of(bundle, asked[0], context)[-1] == "push"
 
 
+@pytest.mark.soak("workers of this machine that are killed: tests/episodes")
 def test_a_worker_that_is_killed_loses_nothing(nodes: Nodes, bundle: Bundle):
     asked = jobs(bundle.path.parent / "policy", 16)
     told: list[str] = []
@@ -119,6 +120,7 @@ def test_a_worker_that_is_killed_loses_nothing(nodes: Nodes, bundle: Bundle):
     assert any("a worker of the Ray cluster was lost" in line for line in told)
 
 
+@pytest.mark.soak("the rows of two nodes; environments that fail here: tests/episodes")
 @pytest.mark.parametrize(("code", "error"), [
     ("raise RuntimeError(f'no display in {__file__}')", DataError), ("import os; os._exit(3)", SourceError),
 ])  # fmt: skip
