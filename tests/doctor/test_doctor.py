@@ -16,6 +16,7 @@ from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT, SATURATING
 from vlatool.runtime.engine import Engine
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.stage import products
 
 JETSON = "NVIDIA Jetson Orin Nano Engineering Reference Developer Kit Super"
 
@@ -35,8 +36,7 @@ def named(checks: Iterable[Check], name: str) -> Check:
 
 
 def arithmetic_of(monkeypatch: pytest.MonkeyPatch, found: str) -> list[Check]:
-    engine = SimpleNamespace(arithmetic=lambda: found)
-    monkeypatch.setattr(doctor.registry, "load", lambda kind, name: engine)
+    monkeypatch.setattr(doctor, "products_apart", lambda engine: found)
     return list(doctor.arithmetic())
 
 
@@ -62,10 +62,10 @@ def test_a_variable_that_confines_openvino_is_a_warning() -> None:
 
 
 def test_an_engine_that_is_not_installed_is_not_asked(monkeypatch) -> None:
-    def missing() -> str:
-        raise MissingExtra("openvino is not installed")
+    def missing(engine: str) -> str:
+        raise MissingExtra(f"{engine} is not installed")
 
-    monkeypatch.setattr(doctor.registry, "load", lambda kind, name: SimpleNamespace(arithmetic=missing))
+    monkeypatch.setattr(doctor, "products_apart", missing)
     assert list(doctor.arithmetic()) == []
 
 
@@ -74,6 +74,7 @@ def test_an_engine_that_measures_no_products_of_its_own_is_not_known(monkeypatch
         package = "numpy"
 
     monkeypatch.setattr(doctor.registry, "load", lambda kind, name: Bare)
+    monkeypatch.setattr(doctor, "products_apart", lambda engine: products.run({"engine": engine}, print))
     (check,) = [check for check in doctor.arithmetic() if check.name == "int8 ort_cpu"]
     assert (check.status, "not known" in check.finding) == ("warn", True)
 

@@ -104,6 +104,27 @@ def test_what_opens_a_bundle_from_elsewhere_survives(run: Run, int8_bundle: Bund
         assert "Assertion" in done.stderr
 
 
+def test_doctor_names_an_engine_that_dies_of_its_own_products(run: Run):
+    done = run("abort:probe", "", "doctor", "--json")
+    told = {each["name"]: each for each in json.loads(done.stdout)}
+    assert told["int8 ort_cpu"]["status"] == "warn"
+    assert "ended its process with SIGABRT when it computed small int8 products" in told["int8 ort_cpu"]["finding"]
+    assert told["python"]["finding"], "the rest is told as well"
+
+
+def test_no_command_dies_of_the_products_that_an_engine_is_asked_for(
+    run: Run, float_bundle: Bundle, int8_bundle: Bundle, tmp_path: Path
+):
+    made = str(int8_bundle.path)
+    for line in (
+        ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out")),
+        ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "20"), ("inspect", made, "--probe"),
+    ):  # fmt: skip
+        done = run("abort:probe", "", *line)
+        assert done.returncode in (0, 3), (line, done.stdout + done.stderr)
+        assert done.returncode == 0 or "SIGABRT" in done.stderr, (line, done.stderr)
+
+
 def test_a_search_goes_on_without_the_candidate(run: Run, policy_dir: Path, tmp_path: Path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("candidates:\n  int8: [{quantize.static_int8: {samples: 4}}]\n  half: [{quantize.float16: {}}]\n")

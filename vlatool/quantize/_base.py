@@ -25,9 +25,10 @@ from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import precision_shares
 from vlatool.runtime.arithmetic import EXACT
-from vlatool.runtime.engine import UNKNOWN, engine_class
+from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
 from vlatool.stage.finish import TRIALS, carry_over, finish, history
+from vlatool.stage.products import products_apart
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
@@ -203,7 +204,7 @@ def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:
         stage: Has the option.
         engine: What will run the bundle; the default engine when empty.
     """
-    if "reduce_range" in stage.model_fields_set or engine_class(engine).arithmetic() in (EXACT, UNKNOWN):
+    if "reduce_range" in stage.model_fields_set or products_apart(engine) in (EXACT, UNKNOWN):
         return stage
     return stage.model_copy(update={"reduce_range": True})
 
