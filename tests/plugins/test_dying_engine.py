@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -30,15 +31,20 @@ ENDS = {
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    """A function that runs vlatool in an environment whose ONNX Runtime dies of some graphs."""
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment whose ONNX Runtime dies of some graphs."""
     place = tmp_path_factory.mktemp("dying")
-    python = place / "venv/bin/python"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place / "venv")], check=True)
     library = next((place / "venv/lib").glob("python*")) / "site-packages"
     paths = [str(ROOT), *(each for each in sys.path if each.endswith("site-packages"))]
     (library / "here.pth").write_text("\n".join([*paths, "import dying_engine"]))
     shutil.copy(HERE / "dying_engine.py", library)
+    return place / "venv/bin/python"
+
+
+@contextlib.contextmanager
+def running(python: Path) -> Iterator[Run]:
+    place = python.parents[2]
     environment = {**os.environ, "VLATOOL_CACHE": str(place / "cache"), "COLUMNS": "200"}
 
     with Console(place, python, environment) as console:
@@ -47,6 +53,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
             limits = HANGS if dies.startswith("hang") else ""
             return console.run(*words, DIES=dies, DIES_OF=of, VLATOOL_LIMITS=limits)
 
+        yield call
+
+
+@pytest.fixture(scope="module")
+def run(python: Path) -> Iterator[Run]:
+    """A function that runs vlatool there."""
+    with running(python) as call:
+        yield call
+
+
+@pytest.fixture
+def fresh(python: Path) -> Iterator[Run]:
+    """The same in a process that has run no bundle and asked no engine before."""
+    with running(python) as call:
         yield call
 
 
@@ -92,20 +112,20 @@ def test_an_onnx_file_is_refused(run: Run, onnx_file: Path, tmp_path: Path):
     refused(run("crash:open", "", "export", str(onnx_file), "-o", str(tmp_path / "out")), "crash", tmp_path / "out")
 
 
-def test_what_opens_a_bundle_from_elsewhere_survives(run: Run, int8_bundle: Bundle, tmp_path: Path):
+def test_what_opens_a_bundle_from_elsewhere_survives(fresh: Run, int8_bundle: Bundle, tmp_path: Path):
     made = str(int8_bundle.path)
     for line in (
         ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "20"), ("explain", made),
         ("benchmark", "overhead", made),
     ):  # fmt: skip
-        done = run("abort:run", INT8, *line, "-o", str(tmp_path / "report"))
+        done = fresh("abort:run", INT8, *line, "-o", str(tmp_path / "report"))
         assert done.returncode == 3, (line, done.stdout + done.stderr)
         assert "SIGABRT" in done.stderr
         assert "Assertion" in done.stderr
 
 
-def test_doctor_names_an_engine_that_dies_of_its_own_products(run: Run):
-    done = run("abort:probe", "", "doctor", "--json")
+def test_doctor_names_an_engine_that_dies_of_its_own_products(fresh: Run):
+    done = fresh("abort:probe", "", "doctor", "--json")
     told = {each["name"]: each for each in json.loads(done.stdout)}
     assert told["int8 ort_cpu"]["status"] == "warn"
     assert "ended its process with SIGABRT when it computed small int8 products" in told["int8 ort_cpu"]["finding"]
@@ -113,14 +133,14 @@ def test_doctor_names_an_engine_that_dies_of_its_own_products(run: Run):
 
 
 def test_no_command_dies_of_the_products_that_an_engine_is_asked_for(
-    run: Run, float_bundle: Bundle, int8_bundle: Bundle, tmp_path: Path
+    fresh: Run, float_bundle: Bundle, int8_bundle: Bundle, tmp_path: Path
 ):
     made = str(int8_bundle.path)
     for line in (
         ("quantize", "static-int8", str(float_bundle.path), "--samples", "4", "-o", str(tmp_path / "out")),
         ("evaluate", "recorded", made), ("benchmark", made, "--iterations", "20"), ("inspect", made, "--probe"),
     ):  # fmt: skip
-        done = run("abort:probe", "", *line)
+        done = fresh("abort:probe", "", *line)
         assert done.returncode in (0, 3), (line, done.stdout + done.stderr)
         assert done.returncode == 0 or "SIGABRT" in done.stderr, (line, done.stderr)
 
