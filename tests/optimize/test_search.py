@@ -201,11 +201,11 @@ def test_a_board_without_vnni_also_tries_products_that_do_not_saturate(tmp_path:
 def made_of(search, monkeypatch):
     """A search whose plans are as fast and as wrong as a table says of their options."""
 
-    def start(figures: dict[str, tuple[float, float]], budget: float) -> Search:
+    def start(figures: dict[str, tuple[float, float]], budget: float, fastest: float = 1.0) -> Search:
         def fake(self: Search, name: str, stages: Any) -> Trial:
             ((_, options),) = stages[-1].items()
             speedup, error = figures["+".join(sorted(options))]
-            self.trials.append(Trial(name, stages, speedup, error, error <= 0.9 * budget))
+            self.trials.append(Trial(name, stages, speedup, error, error <= 0.9 * budget, fastest=fastest * speedup))
             return self.trials[-1]
 
         monkeypatch.setattr(Search, "_try", fake)
@@ -228,6 +228,14 @@ def test_options_that_gain_something_alone_are_tried_together(made_of) -> None:
     assert [trial.name for trial in run.trials[4:]] == ["int8_attention_mse"]
     assert [trial.name for trial in run._finalists()][:1] == ["int8_attention_mse"], "above 0.9 of the budget, below it"
     assert run.trials[1] in run._finalists(), "a plan that is safely inside stays"
+
+
+def test_what_may_be_as_fast_on_a_busy_machine_is_combined_too(made_of) -> None:
+    slower = {**ALONE, "attention": (1.9, 0.038)}
+    alone = made_of({**slower, "attention+method": (2.4, 0.036)}, 0.04)
+    assert len(alone.trials) == 4, "an option that is certainly slower is left alone"
+    unsure = made_of({**slower, "attention+method": (2.4, 0.036)}, 0.04, fastest=1.1)
+    assert [trial.name for trial in unsure.trials[4:]][:1] == ["int8_attention_mse"]
 
 
 def test_of_three_the_one_that_costs_most_is_left_out_again(made_of) -> None:

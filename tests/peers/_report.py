@@ -174,7 +174,8 @@ class Table:
                 continue
             ratio = self.relative(single[0], found)
             text = f"(e) the search delivers {self.told(found)}; the fastest of one command is {self.told(single[0])}"
-            checks.append(Check(found.error <= BUDGET and ratio >= FOUND, f"{text}, {ratio:.3f} of its time"))
+            passed = found.error <= BUDGET and ratio >= FOUND
+            checks.append(Check(passed, f"{text}, {self.share(single[0], found)} of its time"))
         return checks
 
     def _check_reached(self, ours: Sequence[Contestant]) -> list[Check]:

@@ -53,7 +53,7 @@ NEAR = 1.05
 """Share of the budget up to which a fast plan is evaluated in full, though it misses the budget on calibration
 observations."""
 SLOWER = 0.97
-"""Share of a plan's speed that an option must keep to be combined with others: the noise of a few inferences."""
+"""Share of a plan's speed that an option must keep, as far as a few inferences can say, to be combined with others."""
 COMBINED = 3
 """Combinations of options that are tried for one plan, at most."""
 ROUNDS = 5
@@ -81,6 +81,7 @@ class Trial:
         within: Whether ``error`` keeps to the budget.
         note: Why it could not be made.
         engine: What its speed is compared within; empty where all plans are compared with each other.
+        fastest: What its speed may be, as far as those few inferences say: the upper end of the interval.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Trial:
     within: bool = False
     note: str = ""
     engine: str = ""
+    fastest: float = 0.0
 
 
 @dataclass
@@ -175,9 +177,10 @@ class Search:
                 raise GraphError(f"It has the graphs of {twin}.")
             engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
             timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, engine=engine, **QUICK)
-            speedup = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].value("speedup")
+            timed = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].get("speedup")
+            speedup, fastest = (timed.value, timed.high or timed.value) if timed else (math.nan, math.nan)
             error = self._error(bundle, quiet)
-            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine)
+            trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine, fastest)
         except VlatoolError as failure:
             if failure.exit_code not in (3, 4):
                 raise
@@ -299,8 +302,11 @@ class Search:
 
 
 def _useful(base: Trial, trial: Trial, extra: Mapping[str, Any]) -> bool:
-    """Return whether an option gains something: a way to choose ranges is more accurate, another one not slower."""
-    if trial.speedup < SLOWER * base.speedup:
+    """Return whether an option gains something: a way to choose ranges is more accurate, another one not slower.
+
+    On a busy machine a few inferences cannot tell which plan is faster: what may be as fast is tried.
+    """
+    if max(trial.speedup, trial.fastest) < SLOWER * base.speedup:
         return False
     return trial.error < base.error if "method" in extra else trial.speedup > 0
 
