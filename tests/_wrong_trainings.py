@@ -224,7 +224,7 @@ ROWS = [
     Row("the student as its teacher", "is the student itself", 3, lambda at: at.line("--teacher", at.pruned.path)),
     Row("a damaged teacher", "has 1 bytes; the manifest says", 3,
         lambda at: at.line("--teacher", at.copied("module/main.safetensors", b"0"))),
-    Row("a teacher with other labels", "of dy, dx", 3,
+    Row("a teacher with other labels", "gives 'action' as tensor ... of dy, dx", 3,
         lambda at: at.teacher(("policy.yaml", "[dx, dy]", "[dy, dx]"))),
     Row("a teacher with another chunk", "gives 'action' as tensor [1, 2, 2]", 3, lambda at: at.teacher(
         ("policy.yaml", "shape: [1, 4, 2]", "shape: [1, 2, 2]"), ("policy.yaml", "chunk: 4", "chunk: 2"),
@@ -271,7 +271,7 @@ ROWS = [
     Row("a learning rate that is too high", "try a lower --learning-rate", 3, lambda at: [*at.code(EXPLODING),
         "--learning-rate", 1, "--steps", 40]),
     # ---- recordings
-    Row("a recording with NaN", "is not finite in 1 of 8 samples", 3,
+    Row("a recording with NaN", "'proprio' in ... is not finite in 1 of 8 samples", 3,
         lambda at: at.recorded(proprio=nan(observations(8, seed=1)["proprio"]))),
     Row("a recording without an input", "has no 'proprio'", 3, lambda at: at.recorded(proprio=None)),
     Row("a recording of another shape", "has the shape", 3,
@@ -288,9 +288,9 @@ ROWS = [
         lambda at: at.student(drop=("calibration.npz", "evaluation.npz"))),
     Row("nothing to judge with", "--patience needs something to judge with", 3, lambda at: at.student(
         drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--patience", 1])),
-    Row("an expert without a recording", "has no recording", 3, lambda at: at.student(
-        drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--alpha", 0.5])),
-    Row("an expert without actions", "has none", 3,
+    Row("an expert without a recording", "needs an expert's actions, and ... has no recording", 3,
+        lambda at: at.student(drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--alpha", 0.5])),
+    Row("an expert without actions", "A loss against an expert's actions needs them, and ... has none", 3,
         lambda at: [*at.recorded(action=None), "--alpha", 0.5]),
     Row("a control of one observation", "said of another one; there is 1", 3, lambda at: [*at.recorded(
         **{name: values[:1] for name, values in observations(8, seed=1).items()}), "--control", "noise"]),

@@ -106,7 +106,6 @@ def test_two_nodes_give_the_rows_of_one_process_and_say_how_they_differ(nodes: N
     assert disturbances_of(bundle, asked[0], context)[-1] == "push"
 
 
-@pytest.mark.soak("workers of this machine that are killed: tests/episodes")
 def test_a_worker_that_is_killed_loses_nothing(nodes: Nodes, bundle: Bundle):
     asked = jobs(bundle.path.parent / "policy", 16)
     told: list[str] = []

@@ -160,10 +160,10 @@ class Process:
     """
 
     def __init__(self, rows: Rows, logs: Array, scales: Scales, noise: Array | None = None) -> None:
-        self.rows, self.logs, self.scales = rows, logs, scales
-        self.noise = np.full(len(rows), scales.noise) if noise is None else noise
         from scipy.linalg import cho_solve, cholesky  # every command line imports this module, few solve anything
 
+        self.rows, self.logs, self.scales = rows, logs, scales
+        self.noise = np.full(len(rows), scales.noise) if noise is None else noise
         covariance = kernel(rows, rows, scales)
         covariance[np.diag_indices(len(rows))] += self.noise**2
         self._factor = cholesky(covariance, lower=True, overwrite_a=True)
