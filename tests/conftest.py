@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 from _arithmetic import lacks
-from _full import VARIABLE, full
+from _full import VARIABLE, full, small_or_full
 from _shared import VARIABLE as SHARED
 from _shared import found, once
 from _tiny import observations, write_policy
 
+from vlatool.benchmark import latency
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.stage.base import Context, Transform
@@ -108,6 +109,14 @@ def _cache_of_the_session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         patch.setenv("VLATOOL_CACHE", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("VLATOOL_CALIBRATIONS", str(tmp_path_factory.mktemp("calibrations")))
         patch.setenv("VLATOOL_TRUST", str(tmp_path_factory.mktemp("trust") / "trusted.json"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _few_cold_starts() -> Iterator[None]:
+    """Start one fresh process for each bundle that is measured in this process; tests of the cold start have more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(latency, "COLD_STARTS", small_or_full(1, latency.COLD_STARTS))
         yield
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from _console import Console
+from _environment import environment_beside
 
 from vlatool.bundle.bundle import Bundle
 
@@ -33,13 +32,7 @@ ENDS = {
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of an environment whose ONNX Runtime dies of some graphs."""
-    place = tmp_path_factory.mktemp("dying")
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place / "venv")], check=True)
-    library = next((place / "venv/lib").glob("python*")) / "site-packages"
-    paths = [str(ROOT), *(each for each in sys.path if each.endswith("site-packages"))]
-    (library / "here.pth").write_text("\n".join([*paths, "import dying_engine"]))
-    shutil.copy(HERE / "dying_engine.py", library)
-    return place / "venv/bin/python"
+    return environment_beside(tmp_path_factory.mktemp("dying") / "venv", str(HERE), "import dying_engine")
 
 
 @contextlib.contextmanager

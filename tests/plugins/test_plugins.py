@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from _console import Console
+from _environment import environment_beside
 
 from vlatool.bundle.bundle import Bundle
 
@@ -69,12 +70,7 @@ def wheel(folder: Path) -> Path:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """A function that runs vlatool in a fresh environment in which the package is installed."""
     place = tmp_path_factory.mktemp("plugin")
-    python = place / "venv/bin/python"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(place / "venv")], check=True)
-    library = next((place / "venv/lib").glob("python*")) / "site-packages"
-    (library / "here.pth").write_text(
-        "\n".join([str(ROOT), *(each for each in sys.path if each.endswith("site-packages"))])
-    )
+    python = environment_beside(place / "venv")
     install = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-index", "--no-deps"]
     subprocess.run([*install, str(wheel(place))], check=True)
     environment = {**os.environ, "VLATOOL_CACHE": str(place / "cache"), "COLUMNS": "200"}
