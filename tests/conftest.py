@@ -9,6 +9,7 @@ import csv
 import importlib
 import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -82,9 +83,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Tell the modules of the tests, which choose their cases when they are collected."""
+    """Tell the modules of the tests, which choose their cases when they are collected; heed Ctrl-C, as children do."""
     if config.getoption("--full"):
         os.environ[VARIABLE] = "1"
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)
