@@ -67,6 +67,8 @@ FOR_ARM = (
 FOR_X86 = (
     FLOAT,
     *(Variant(each.name, each.command, ROUNDING, BOTH) for each in FOR_ARM[1:]),
+    Variant("ort 7-bit", (*STATIC, "--reduce-range"), ROUNDING, BOTH),
+    Variant("ort 8-bit", (*STATIC, "--no-reduce-range"), ROUNDING, BOTH),
     Variant("openvino", OPENVINO, ROUNDING, BOTH),
     Variant("openvino uint8", (*OPENVINO, "--activations", "uint8"), ROUNDING, BOTH),
     Variant("openvino 7-bit", (*OPENVINO, "--reduce-range"), ROUNDING, BOTH),
