@@ -16,10 +16,11 @@ HALF = "bf16" if any(feature in (isa() or ()) for feature in BF16) else "f32"
 OPENVINO = ("quantize", "static-int8", "{bundle}", "--layout", "openvino")
 OPENVINO = (*OPENVINO, "--compute", "bfloat16") if HALF == "bf16" else OPENVINO
 STATIC = ("quantize", "static-int8", "{bundle}")
+OPTIMIZE = "optimize"
 SEARCH, SEARCH_ORT = "optimize, relative_error 0.04", "optimize for ONNX Runtime, relative_error 0.04"
 COMMANDS: dict[str, tuple[str, ...]] = {
-    SEARCH: ("optimize", "{policy}", "--max-drop", "relative_error=0.04"),
-    SEARCH_ORT: ("optimize", "{policy}", "--profile", "{ort_alone}", "--max-drop", "relative_error=0.04"),
+    SEARCH: (OPTIMIZE, "{policy}", "--max-drop", "relative_error=0.04"),
+    SEARCH_ORT: (OPTIMIZE, "{policy}", "--profile", "{ort_alone}", "--max-drop", "relative_error=0.04"),
     f"openvino {HALF}": OPENVINO,
     f"openvino {HALF}, mse": (*OPENVINO, "--method", "mse"),
     f"openvino {HALF}, attention": (*OPENVINO, "--attention"),

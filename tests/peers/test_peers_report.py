@@ -1,8 +1,13 @@
 """Which rows dominate which: two processes of one graph never do, whatever the noise of their median."""
 
+from pathlib import Path
+
 import pytest
 from _interleave import CLOCKS, Contestant
+from _ours import MARK, SEARCH, bundle_of
 from _report import Table
+from _workload import Workload
+from table import without_copies
 
 NOISE = [1.0, 1.05, 0.96, 1.03, 0.97, 1.01, 0.99, 1.04, 0.95, 1.02]
 
@@ -73,3 +78,25 @@ def test_the_search_must_deliver_what_one_command_does():
     assert not checks([peer, single, measured("ours:optimize, relative_error 0.04", 21.0)])["(e)"]
     assert not checks([peer, single, measured("ours:optimize, relative_error 0.04", 19.0, error=0.05)])["(e)"]
     assert "(e)" not in checks([peer, single])
+
+
+def test_what_an_option_did_not_change_is_timed_once(tmp_path: Path):
+    workload = Workload("vit-s", tmp_path)
+    graphs = {
+        "static-int8": b"one",
+        "static-int8, attention": b"one",
+        "static-int8, elementwise": b"two",
+        SEARCH: b"one",
+    }
+    for name, graph in graphs.items():
+        place = bundle_of(workload, name) / "graphs"
+        place.mkdir(parents=True)
+        (place / "main.onnx").write_bytes(graph)
+    rows = [Contestant(f"{MARK}{name}", "") for name in graphs]
+    rows += [
+        Contestant("ort:fp32", ""),
+        Contestant(f"{MARK}mine (given)", ""),
+        Contestant(f"{MARK}bfloat16", "", "gone"),
+    ]
+    kept = [row.name for row in without_copies(workload, rows)]
+    assert kept == [row.name for row in rows if row.name != f"{MARK}static-int8, attention"]
