@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from _arithmetic import exact
 from _full import small_or_full
@@ -29,7 +30,9 @@ from vlatool.errors import GraphError
 from vlatool.graph.layers import Layer, Style, check_weights, find_layers
 from vlatool.graph.nodes import read_names
 from vlatool.graph.qdq import quantize_weight
+from vlatool.quantize._integer_matmul import use_integer_matmul
 from vlatool.runtime.engines.openvino import OpenvinoSession
+from vlatool.runtime.weight_pairs import weights_fit
 
 
 @pytest.mark.parametrize("style", STYLES.values(), ids=STYLES)
@@ -90,6 +93,20 @@ class TestLayers:
         shares /= shares.sum(-1, keepdims=True)
         close(run(model, q=q, k=k, v=v)["y"], rounded(shares, style, 0.0, 1.0) @ rounded(v, style))
         assert find_layers(graph(text), OPS) == []
+
+
+@pytest.mark.parametrize("reduced", [True, False])
+def test_keys_and_values_keep_to_7_bits_outside_the_calibrated_range_where_pairs_saturate(reduced: bool) -> None:
+    style = Style(reduce_range=reduced, signed_second=True)
+    text = "(float[1,4,6] q, float[1,6,4] k) => (float[1,4,4] s, float[1,4,5] y) { s = MatMul(q, k)  y = MatMul(q, w) }"
+    model, _ = quantized(graph(text, w=weight(6, 5)), style, {}, attention=True)
+    assert use_integer_matmul(model) == 2
+    assert ("Clip" in kinds(model)) is reduced
+    if reduced:
+        assert weights_fit(model.SerializeToString()), "so that no engine is asked for its exact mode"
+        feeds = {"q": np.full((1, 4, 6), 30, np.float32), "k": np.full((1, 6, 4), 30, np.float32)}
+        session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+        np.testing.assert_allclose(session.run(["s"], feeds)[0], 6 * 3.0 * 3.0, rtol=0.02)
 
 
 def test_an_input_that_is_shared_is_quantized_once_and_so_is_a_weight() -> None:

@@ -24,7 +24,7 @@ def model_of(*nodes: onnx.NodeProto, **weights: np.ndarray) -> bytes:
 
 def product(kind: str, weight: str = "w", **options: int) -> onnx.NodeProto:
     first = ["x", "sx", "zx"] if kind in ("QLinearMatMul", "QLinearConv", "QGemm") else ["x"]
-    return helper.make_node(kind, [*first, weight], ["y"], **options)
+    return helper.make_node(kind, [*first, weight], [f"{weight}.y"], **options)
 
 
 @pytest.mark.parametrize("kind", ["MatMul", "MatMulInteger", "MatMulIntegerToFloat", "DynamicQuantizeMatMul",
@@ -135,3 +135,76 @@ def test_a_vector_is_a_zero_point_unless_it_is_multiplied() -> None:
     assert not weights_fit(
         model_of(product("MatMul"), product("MatMulInteger", "v"), w=FITS, v=np.full(4, 100, np.int8))
     )
+
+
+def quantizer(name: str, out: str, zero: str = "z") -> onnx.NodeProto:
+    return helper.make_node("QuantizeLinear", [name, "s", zero], [out])
+
+
+def integers(*nodes: onnx.NodeProto, **tensors: np.ndarray) -> bool:
+    """Whether a graph with a weight that fits also fits with these nodes."""
+    zeros = {"z": np.array(0, np.int8), "u": np.array(0, np.uint8), "s": np.array(1, np.float32)}
+    return weights_fit(model_of(product("MatMul"), *nodes, w=FITS, **{**zeros, **tensors}))
+
+
+TURNED = [helper.make_node("Reshape", ["q", "shape"], ["r"]), helper.make_node("Transpose", ["r"], ["t"])]
+LOOKED_UP = helper.make_node("Gather", ["table", "ids"], ["g"])
+AGAIN = helper.make_node("DequantizeLinear", ["q", "s", "z"], ["d"])
+
+
+@pytest.mark.parametrize("kind", ["MatMulInteger", "MatMulIntegerToFloat", "QLinearMatMul", "ConvInteger"])
+def test_an_activation_in_uint8_is_multiplied_exactly_and_one_in_int8_may_not_be(kind: str) -> None:
+    for zero, exact in (("u", True), ("z", False)):
+        assert integers(quantizer("k", "q", zero), product(kind, "q")) is exact
+        assert integers(quantizer("k", "q", zero), *TURNED, product(kind, "t")) is exact
+    assert integers(helper.make_node("DynamicQuantizeLinear", ["k"], ["q", "qs", "qz"]), product(kind, "q"))
+
+
+@pytest.mark.parametrize("nodes", [
+    [LOOKED_UP, product("MatMulInteger", "g")],
+    [quantizer("f", "q"), product("MatMulInteger", "q")],
+    [quantizer("f", "q"), AGAIN, product("MatMul", "d")],
+    [quantizer("f", "q"), AGAIN, helper.make_node("Transpose", ["d"], ["t"]), product("Gemm", "t")],
+    [helper.make_node("Cast", ["i"], ["c"], to=TensorProto.INT8), product("MatMulInteger", "c")],
+    [helper.make_node("Gather", ["table", "ids"], ["g"], domain="own"), product("MatMulInteger", "g")],
+    [helper.make_node("Constant", [], ["c"], value=numpy_helper.from_array(SATURATES, "table")),
+     product("MatMulInteger", "c")],
+    [product("MatMulInteger", "given")],
+], ids=["looked up", "quantized there", "and dequantized", "and turned", "cast", "an operator of another domain",
+        "a constant of another's name", "an input"])  # fmt: skip
+def test_an_int8_operand_that_the_graph_computes_may_saturate(nodes: list[onnx.NodeProto]) -> None:
+    assert not integers(*nodes, table=SATURATES, f=SATURATES.astype(np.float32), i=SATURATES.astype(np.int32))
+
+
+def test_what_is_made_twice_or_reads_itself_may_saturate() -> None:
+    assert not integers(quantizer("a", "q", "u"), quantizer("b", "q"), product("MatMulInteger", "q"))
+    assert not integers(helper.make_node("Identity", ["q"], ["q2"]), helper.make_node("Identity", ["q2"], ["q"]),
+                        quantizer("f", "q3"), product("MatMulInteger", "q3"))  # fmt: skip
+
+
+def test_deep_and_wide_graphs_are_walked_once() -> None:
+    nodes = [helper.make_node("DequantizeLinear", ["w", "s"], ["d0"])]
+    for level in range(60):
+        nodes += [helper.make_node("DequantizeLinear", [f"d{level}", "s"], [f"d{level + 1}"])] * 2
+    assert not weights_fit(model_of(product("MatMul"), *nodes, product("MatMul", "d60"), w=FITS))
+    joins = [quantizer("k", "c0", "u")]
+    joins += [helper.make_node("Concat", [f"c{level}"] * 2, [f"c{level + 1}"], axis=0) for level in range(5000)]
+    assert integers(*joins, product("MatMulInteger", "c5000"))
+
+
+def test_a_node_without_an_output_and_a_weight_of_many_axes_may_saturate() -> None:
+    assert not weights_fit(model_of(helper.make_node("DequantizeLinear", ["w", "s"], []), w=FITS))
+    assert not weights_fit(model_of(product("MatMul"), w=np.full((1,) * 32 + (4, 2), 60, np.int8)))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "exact"), [(-63, 63, True), (-64, 64, True), (-65, 63, False), (-63, 100, False)]
+)
+def test_an_int8_activation_that_is_bounded_is_multiplied_exactly(low: int, high: int, exact: bool) -> None:
+    clip = helper.make_node("Clip", ["q", "low", "high"], ["c"])
+    turned = helper.make_node("Transpose", ["c"], ["t"])
+    ends = {"low": np.array(low, np.int8), "high": np.array(high, np.int8)}
+    assert integers(quantizer("k", "q"), clip, turned, product("MatMulIntegerToFloat", "t"), **ends) is exact
+    open_end = helper.make_node("Clip", ["q", "low"], ["c"])
+    assert not integers(quantizer("k", "q"), open_end, product("MatMulIntegerToFloat", "c"), **ends)
+    assert integers(quantizer("k", "q", "u"), open_end, product("MatMulIntegerToFloat", "c"), **ends)

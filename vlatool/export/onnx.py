@@ -15,6 +15,7 @@ from vlatool.data import observations_for
 from vlatool.errors import GraphError, require, require_present
 from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
+from vlatool.module.folding import fold_weights
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
 from vlatool.module.to_onnx import (
@@ -117,6 +118,7 @@ class ExportOnnx(Transform):
         exported = exported_by_torch(session.module, arguments, session.step, self.opset)
         file = f"graphs/{name}.onnx"
         (out / "graphs").mkdir(exist_ok=True)
+        fold_weights(exported.model)
         name_by_module(exported.model)
         strip_notes(exported.model)
         exported.save(str(out / file), external_data=beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES)

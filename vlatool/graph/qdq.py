@@ -114,8 +114,19 @@ class QdqWriter(OnnxGraph):
         if name not in self.dequantized:
             scale = self.activation_scale(name)
             self.nodes.append(self.node("QuantizeLinear", [name, *scale], [f"{name}.q"], f"{name}/quantize"))
-            self.dequantized[name] = self._dequantize(name, [f"{name}.q", *scale])
+            self.dequantized[name] = self._dequantize(name, [self._bounded(name), *scale])
         return self.dequantized[name]
+
+    def _bounded(self, name: str) -> str:
+        """Return the quantized value, within 7 bits also where an observation leaves the calibrated range."""
+        quantized = f"{name}.q"
+        if name not in self.signed or not self.style.reduce_range:
+            return quantized
+        lowest, highest, dtype = ACTIVATION["int7"]
+        bounds = [self.add(f"{quantized}.{side}", np.array(value, dtype))
+                  for side, value in (("lowest", lowest), ("highest", highest))]  # fmt: skip
+        self.nodes.append(self.node("Clip", [quantized, *bounds], [f"{quantized}7"], f"{name}/bound"))
+        return f"{quantized}7"
 
     def _dequantize(self, name: str, inputs: list[str], **axis: int) -> str:
         self.nodes.append(self.node("DequantizeLinear", inputs, [f"{name}.dq"], f"{name}/dequantize", **axis))

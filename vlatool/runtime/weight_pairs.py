@@ -17,21 +17,32 @@ from vlatool.errors import GraphError
 from vlatool.runtime.external_data import OpenFile, asked_of, fields, messages, varint
 from vlatool.weights import pairs
 
-INT8 = 3
+UINT8, INT8 = 2, 3
 """``TensorProto.DataType``."""
 DIMS, DATA_TYPE, TENSOR_NAME, RAW_DATA = 1, 2, 8, 9
 """Numbers of fields of ``TensorProto`` (onnx.proto)."""
-INPUT, OUTPUT, OPERATOR, ATTRIBUTE = 1, 2, 4, 5
+INPUT, OUTPUT, OPERATOR, ATTRIBUTE, DOMAIN = 1, 2, 4, 5, 7
 """Those of ``NodeProto``."""
 ATTRIBUTE_NAME, INTEGER = 1, 3
 """Those of ``AttributeProto``."""
 WEIGHT_INPUT = {
     "MatMul": 1, "Gemm": 1, "Conv": 1, "MatMulInteger": 1, "MatMulIntegerToFloat": 1, "DynamicQuantizeMatMul": 1,
-    "QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3,
+    "ConvInteger": 1, "QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3,
 }  # fmt: skip
 """Operator -> which input its weight is."""
+INTEGER_ONLY = tuple(each for each in WEIGHT_INPUT if each not in ("MatMul", "Gemm", "Conv"))
+"""Those of them whose operands are integers; the others have them behind a ``DequantizeLinear``."""
+BOUND = 64
+"""Largest magnitude of two int8 numbers whose products with 255 add up within 16 bits: 255 x 2 x 64 = 32,640."""
+MOST_AXES = 16
+"""Of a weight; no operator here reads one of more."""
 LOOKS_UP = ("Gather", "GatherND", "GatherElements")
 """Operators that read rows of a weight and multiply nothing."""
+MOVES = (
+    *LOOKS_UP, "Reshape", "Transpose", "Split", "Squeeze", "Unsqueeze", "Flatten", "Identity", "Slice", "Expand",
+    "Concat", "Tile", "DepthToSpace", "SpaceToDepth",
+)  # fmt: skip
+"""Operators of the default domain that hand on what they read, in another place."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +51,16 @@ class _Node:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     transposed: bool
+    domain: str = ""
+
+    @property
+    def moves(self) -> bool:
+        return self.operator in MOVES and self.domain in ("", "ai.onnx")
+
+    @property
+    def moved(self) -> tuple[str, ...]:
+        """What it hands on: shapes and indices are its other inputs."""
+        return self.inputs if self.operator == "Concat" else self.inputs[:1]
 
 
 @dataclass(frozen=True)
@@ -50,9 +71,12 @@ class _Weight:
 
 
 def weights_fit(model: Path | bytes) -> bool:
-    """Return whether no product of uint8 activations with a stored int8 weight saturates, whatever the activations are.
+    """Return whether no product of uint8 activations with an int8 operand saturates, whatever the activations are.
 
-    False where that cannot be told: weights beside the graph, two of one name, or readers that are not known.
+    The second operand of each product is a stored weight, whose pairs are looked at, or a quantized activation: in
+    uint8, which engines multiply exactly, or in int8 behind a ``Clip`` to 64. False where that cannot be told: weights
+    beside the graph, two of one name, readers that are not known, and other int8 operands that the graph computes
+    (from float32 weights, say).
 
     Args:
         model: A serialized ``ModelProto``, or the file of one.
@@ -68,12 +92,20 @@ def weights_fit(model: Path | bytes) -> bool:
 def _fit(model: bytes | OpenFile) -> bool:
     nodes: list[_Node] = []
     weights: dict[str, _Weight] = {}
+    types: dict[str, int] = {}
+    bounds: dict[str, int] = {}
     for message, start, end in messages(model, lambda *_: True):
         if message == "NodeProto":
             nodes.append(_node(model, start, end))
         elif message == "TensorProto":
-            name, weight = _tensor(model, start, end)
-            if weight is not None and weights.setdefault(name, weight) is not weight:
+            name, dtype, weight = _tensor(model, start, end)
+            types[name] = dtype if types.setdefault(name, dtype) == dtype else 0
+            if weight is None:
+                continue
+            if not weight.shape:
+                values = np.frombuffer(model[weight.start : weight.end], np.int8).astype(int)
+                bounds[name] = max(abs(int(values[0])) if values.size == 1 else 128, bounds.get(name, 0))
+            elif weights.setdefault(name, weight) is not weight:
                 return False
     # what a vector may be multiplied by, as it is or behind the first input of any other operator
     multiplied = {
@@ -85,12 +117,80 @@ def _fit(model: bytes | OpenFile) -> bool:
         bool(matrices)
         and not vectors & multiplied
         and all(_met(model, name, weight, nodes) for name, weight in matrices.items())
+        and _Operands(nodes, frozenset(matrices), types, bounds).known()
     )
+
+
+class _Operands:
+    """Where the second operand of each product comes from.
+
+    Args:
+        nodes: All nodes, those of branches and functions, too.
+        weights: Names of the stored int8 matrices, whose readers are looked at elsewhere.
+        types: Tensor -> its ``TensorProto.DataType``.
+        scalars: Stored int8 scalar -> its largest magnitude.
+    """
+
+    def __init__(
+        self, nodes: list[_Node], weights: frozenset[str], types: dict[str, int], scalars: dict[str, int]
+    ) -> None:
+        self._nodes, self._weights, self._types, self._scalars = nodes, weights, types, scalars
+        self._makers: dict[str, _Node] = {}
+        self._unique = True
+        for node in nodes:
+            for name in filter(None, node.outputs):
+                self._unique = self._unique and name not in self._makers and name not in weights
+                self._makers[name] = node
+
+    def known(self) -> bool:
+        """Return whether none is an int8 that the graph computes."""
+        products = [node for node in self._nodes if node.operator in WEIGHT_INPUT]
+        operands = [(node, node.inputs[WEIGHT_INPUT[node.operator] :][:1]) for node in products]
+        return self._unique and all(
+            name in self._weights or self._holds(name, node.operator in INTEGER_ONLY)
+            for node, found in operands
+            for name in found
+        )
+
+    def _holds(self, name: str, integer: bool) -> bool:
+        """Return whether a value that no weight stands for is in float32, or in uint8 where it is an integer."""
+        open_, seen = [(name, integer)], set()
+        while open_:
+            one = open_.pop()
+            if one in seen:
+                continue
+            seen.add(one)
+            name, integer = one
+            maker = self._makers.get(name)
+            if maker is None:
+                if integer:
+                    return False
+            elif maker.operator == "DequantizeLinear":
+                source = maker.inputs[0]
+                if source not in self._weights:
+                    open_.append((source, True))
+            elif maker.moves or maker.operator == "Clip":
+                if not (integer and self._bounds(maker)):
+                    open_ += [(each, integer) for each in maker.moved]
+            elif integer and not self._makes_uint8(maker):
+                return False
+        return True
+
+    def _bounds(self, maker: _Node) -> bool:
+        """Return whether a node keeps an int8 within what no pair saturates with."""
+        given = maker.inputs[1:3]
+        return maker.operator == "Clip" and len(given) == 2 and all(self._scalars.get(n, 128) <= BOUND for n in given)
+
+    def _makes_uint8(self, maker: _Node) -> bool:
+        zero = maker.inputs[2:3]
+        if maker.operator == "QuantizeLinear":
+            return bool(zero) and self._types.get(zero[0]) == UINT8
+        return maker.operator == "DynamicQuantizeLinear"
 
 
 def _met(model: bytes | OpenFile, name: str, weight: _Weight, nodes: list[_Node]) -> bool:
     """Return whether all readers of a weight are known, and none of them saturates with it."""
-    if weight.end - weight.start != math.prod(weight.shape):
+    if weight.end - weight.start != math.prod(weight.shape) or len(weight.shape) > MOST_AXES:
         return False
     readers = list(_readers(name, nodes))
     values = np.frombuffer(model[weight.start : weight.end], np.int8).reshape(weight.shape)
@@ -104,8 +204,8 @@ def _readers(name: str, nodes: list[_Node]) -> Iterator[tuple[_Node, tuple[str, 
     for node in nodes:
         if name not in node.inputs:
             continue
-        if node.operator == "DequantizeLinear" and node.inputs[0] == name:
-            yield from _readers(node.outputs[0], nodes)
+        if node.operator == "DequantizeLinear" and node.inputs[0] == name and node.outputs:
+            yield from ((reader, node.outputs[:1]) for reader in nodes if node.outputs[0] in reader.inputs)
         else:
             yield node, (name,)
 
@@ -125,15 +225,17 @@ def _order(node: _Node, names: tuple[str, ...], rank: int) -> tuple[str, int] | 
 def _node(model: bytes | OpenFile, start: int, end: int) -> _Node:
     inputs: list[str] = []
     outputs: list[str] = []
-    operator, transposed = "", False
+    operator, domain, transposed = "", "", False
     for field, at, to, _ in fields(model, start, end):
         if field in (INPUT, OUTPUT):
             (inputs if field == INPUT else outputs).append(_text(model, at, to))
         elif field == OPERATOR:
             operator = _text(model, at, to)
+        elif field == DOMAIN:
+            domain = _text(model, at, to)
         elif field == ATTRIBUTE:
             transposed = transposed or _transposes(model, at, to)
-    return _Node(operator, tuple(inputs), tuple(outputs), transposed)
+    return _Node(operator, tuple(inputs), tuple(outputs), transposed, domain)
 
 
 def _transposes(model: bytes | OpenFile, start: int, end: int) -> bool:
@@ -146,8 +248,8 @@ def _transposes(model: bytes | OpenFile, start: int, end: int) -> bool:
     return name == "transB" and bool(value)
 
 
-def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, _Weight | None]:
-    """Return the name of a tensor, and where its data are if it is int8 and no scalar."""
+def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, int, _Weight | None]:
+    """Return the name and type of a tensor, and where its data are if it is int8."""
     shape: list[int] = []
     name, dtype, place = "", 0, (0, 0)
     for field, at, to, number in fields(model, start, end):
@@ -159,7 +261,7 @@ def _tensor(model: bytes | OpenFile, start: int, end: int) -> tuple[str, _Weight
             name = _text(model, at, to)
         elif field == RAW_DATA:
             place = at, to
-    return name, _Weight(tuple(shape), *place) if dtype == INT8 and shape else None
+    return name, dtype, _Weight(tuple(shape), *place) if dtype == INT8 else None
 
 
 def _packed(model: bytes | OpenFile, start: int, end: int) -> Iterator[int]:
