@@ -1,6 +1,7 @@
 """What is measured is named, counted and comparable; no test asserts a time."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -8,12 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 from pydantic import ValidationError
 
 from vlatool.benchmark import latency
 from vlatool.benchmark.latency import Latency, processors
-from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import BundleError, ProfileError, UsageError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.files.messages import from_json, to_json
@@ -23,6 +25,7 @@ from vlatool.measurement.cold_start import ColdStart, cold_start, run
 from vlatool.measurement.interleaved import BLOCKS, Contestant, latency_measurements, speedup, unique_names
 from vlatool.measurement.jobs import ColdStartJob, LatencyJob
 from vlatool.measurement.memory import peak_rss_mb, resident_mb
+from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
@@ -374,3 +377,29 @@ def test_zeros_are_said_to_gain_nothing_as_measured(source_bundle: Bundle, float
     assert "ONNX Runtime " in reasons[0]
     back = benchmarked(exported, against=(float_bundle.path,))
     assert not [finding for finding in back.findings if "zero" in finding.reason]
+
+
+@pytest.mark.parametrize(("share", "effects"), [(0.9, []), (1.2, []), (2.2, ["note"]), (23_430.0, ["suspect"])])
+def test_a_speed_that_no_kernel_has_is_told(share: float, effects: list[str]):
+    found = list(latency._beyond([Row("mine", "subject", "", (Measurement("reach_share", share, "1"),))]))
+    assert [each.effect for each in found] == effects
+    assert all("mine seems to do its work" in each.reason and each.remedy for each in found)
+
+
+def test_work_that_the_engine_leaves_out_is_told(tmp_path: Path, float_bundle: Bundle):
+    made = copied_with_a_constant_product(float_bundle, tmp_path / "made")
+    report = Latency(iterations=20, warmup=1, duration=0, cold=False).run(made, Context())
+    assert report.validity == "suspect"
+    assert any("leaves out most of what the graph counts" in each.reason for each in report.findings)
+
+
+def copied_with_a_constant_product(bundle: Bundle, place: Path) -> Bundle:
+    """A bundle with a large product of two constants that nothing reads."""
+    shutil.copytree(bundle.path, place)
+    file = place / "graphs/main.onnx"
+    model = onnx.load(file)
+    large = np.full((1024, 1024), 0.5, np.float32)
+    model.graph.initializer.append(onnx.numpy_helper.from_array(large, "large"))
+    model.graph.node.append(onnx.helper.make_node("MatMul", ["large", "large"], ["unread"]))
+    onnx.save(model, file)
+    return seal(place, bundle.manifest)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from vlatool.boards.answer import (
 from vlatool.boards.simulate import Change
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, OutputError, UsageError
+from vlatool.errors import BundleError, DataError, OutputError, UsageError
 from vlatool.graph.stored import LAYOUT, digest, read_workload
 from vlatool.graph.workload import workload
 from vlatool.hardware.profile import load_profile, names
@@ -158,6 +159,16 @@ def test_a_policy_and_an_onnx_file_are_opened_as_sources(policy_template: Path, 
     source = opened(str(policy_template), Context())
     assert not source.manifest.graphs
     assert "factory" in source.manifest.source
+
+
+def test_a_damaged_bundle_is_not_answered_for(float_bundle: Bundle, copied: Callable[[Bundle], Bundle]) -> None:
+    damaged = copied(float_bundle)
+    file = damaged.path / "graphs/main.onnx"
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(BundleError, match=r"main\.onnx"):
+        opened(str(damaged.path), Context())
 
 
 def test_an_unknown_precision_is_refused_before_anything_is_read() -> None:

@@ -26,3 +26,10 @@ def test_products_at_that_speed_lose_nothing() -> None:
 def test_nothing_is_said_where_a_dtype_was_not_timed() -> None:
     assert reach_sentence(OPERATORS, {"float16": 1}, {"int8": 100.0}) == []
     assert reach_sentence([], {"int8": 1}, {"int8": 100.0}) == []
+
+
+def test_more_than_the_large_products_speed_is_explained():
+    (text,) = reach_sentence(OPERATORS, {"int8": 40_000_000_000}, {"int8": 100.0})
+    assert "More than all of it: other work slowed the large product down" in text
+    (text,) = reach_sentence(OPERATORS, {"int8": 6_000_000_000}, {"int8": 100.0})
+    assert "More than all of it" not in text

@@ -9,7 +9,7 @@ from _render_reports import benchmark, optimize
 
 from vlatool.render import render
 from vlatool.render._columns import board, columns, sides
-from vlatool.render._format import quantity
+from vlatool.render._format import is_share, quantity
 from vlatool.render._view import latency
 from vlatool.report import ON_BOARD, Measurement, Report
 
@@ -78,3 +78,8 @@ def test_a_benchmark_with_a_profile_has_both_sides_too() -> None:
 def test_a_limit_for_the_board_is_not_drawn_over_the_latencies_of_this_host() -> None:
     assert latency(for_pi()).limit is None
     assert latency(on_the_board()).limit == 25
+
+
+def test_a_share_of_what_an_engine_reaches_is_in_per_cent_above_the_whole_too():
+    assert [is_share(Measurement("reach_share", value, "1")) for value in (0.9, 2.23)] == [True, True]
+    assert not is_share(Measurement("occupancy", 2.23, "1"))

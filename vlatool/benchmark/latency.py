@@ -23,7 +23,7 @@ from vlatool.measurement import agent
 from vlatool.measurement.interleaved import MOST
 from vlatool.measurement.jobs import LatencyJob, Limits
 from vlatool.measurement.measured import Measured, PolicyRun
-from vlatool.measurement.reach import REPEATS, SIZE, share_of_reach
+from vlatool.measurement.reach import LIKELY, POSSIBLE, REPEATS, SIZE, share_of_reach
 from vlatool.measurement.rows import measurements, raw, sustained, tables
 from vlatool.measurement.validity import findings, validity
 from vlatool.report import Finding, Measurement, Report, Row
@@ -195,6 +195,7 @@ class Latency(Measure):
             *findings(run, job, bool(self.sustained)),
             *self._limited(run.host, where),
             *_sparse(bundles, rows, run),
+            *_beyond(rows),
         )
         valid = validity(seen)
         return Report(
@@ -286,6 +287,21 @@ def _sparse(bundles: Sequence[Bundle], rows: Sequence[Row], run: Measured) -> It
             f"{rows[0].name} in this run: {titles} {verdict}",
             "" if gained else "for speed, remove whole units: vlatool prune structured",
         )
+
+
+def _beyond(rows: Sequence[Row]) -> Iterator[Finding]:
+    """Say where a policy seems to be faster than its work at the speed of the large product."""
+    for row in rows:
+        found = row.get("reach_share")
+        if found is None or found.value <= LIKELY:
+            continue
+        what = f"{row.name} seems to do its work {found.value:,.3g} times as fast as the large product"
+        if found.value > POSSIBLE:
+            why = "the engine leaves out most of what the graph counts (it is constant, or nothing reads it)"
+            yield Finding("suspect", f"{what}: {why}", "count on the latency alone, not on GMAC/s")
+        else:
+            why = "other work slowed that product down, or the engine has a faster kernel for other layers"
+            yield Finding("note", f"{what}: {why}", "repeat on an idle machine")
 
 
 def _work(bundle: Bundle) -> Workload | None:

@@ -100,7 +100,7 @@ def _cheapest(rented: Sequence[Profile], load: Workload, model: LatencyModel, wa
 def opened(source: str, context: Context) -> Bundle:
     """Return the bundle that is named, or the source bundle of a policy."""
     if (Path(source) / MANIFEST).is_file():
-        return Bundle.open(Path(source), verify=False)
+        return Bundle.open(Path(source))
     return sourced(source, cache_directory(), context)
 
 

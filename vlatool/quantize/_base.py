@@ -41,7 +41,7 @@ TRAINED = "quantize.qat"
 """Stage after which the command line quantizes at once."""
 REDUCE_RANGE = (
     "weights of which no pair saturates, for x86 processors without VNNI: exact at full speed there, with steps up to "
-    "1.4 times as large; set where the board of --profile, or without one this host, is such a processor"
+    "1.4 times as large; without this option and its opposite, the board of --profile decides, or else this host"
 )
 REDUCED = (
     "weights: no pair of products saturates on processors without VNNI (--no-reduce-range: all 8 bits, which are "

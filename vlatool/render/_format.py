@@ -42,6 +42,8 @@ LIMIT_UNITS = {
     "points": "points", "percent": "%",
 }  # fmt: skip
 POINTS = ("_drop", "_points", "_difference")
+ABOVE_1 = ("reach_share",)
+"""Shares that may be more than the whole."""
 NOT_SHARES = re.compile(r"^error|^skill|^variation|(^|_)p(_?value)?$|ratio")
 
 
@@ -123,7 +125,7 @@ def is_share(measurement: Measurement) -> bool:
     """Return whether a number without a unit is a share of something, to be shown in per cent."""
     if measurement.unit != "1" or NOT_SHARES.search(measurement.name):
         return False
-    return not measurement.known or abs(measurement.value) <= 1
+    return not measurement.known or abs(measurement.value) <= 1 or measurement.name in ABOVE_1
 
 
 def is_points(measurement: Measurement) -> bool:
