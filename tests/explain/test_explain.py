@@ -20,6 +20,7 @@ from vlatool.explain._islands import QuantizedGraph, fallbacks, timed
 from vlatool.explain._operators import GROUPS, profile, shares
 from vlatool.explain._origin import command, observations_of, origin
 from vlatool.explain._remedy import measure
+from vlatool.machine.host import fingerprint
 from vlatool.quantize.bfloat16 import Bfloat16
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
@@ -136,6 +137,16 @@ def report(fragile: Bundle, made) -> Report:
 
 def details(report: Report, words: str) -> list[dict]:
     return next((rows for row in report.rows for title, rows in row.details.items() if words in title), [])
+
+
+@pytest.mark.parametrize(("taken", "validity"), [(1.5, "suspect"), (0.0, "valid")])
+def test_other_work_on_the_machine_is_told(fragile, made, monkeypatch, taken, validity):
+    machine = {**fingerprint(), "cores_online": 2, "processors_busy": taken}
+    monkeypatch.setattr("vlatool.explain.before_run", lambda: machine)
+    options = Options(fragile.path, samples=1, runs=2, suggest=False)
+    found = explain(made(StaticInt8(samples=16)), options, Context())
+    assert found.validity == validity
+    assert ("contended machine" in "".join(each.reason for each in found.findings)) is (validity == "suspect")
 
 
 def test_the_fragile_layer_is_named_first_and_far_ahead(report):
@@ -276,6 +287,9 @@ def test_the_bundle_of_another_policy_is_refused(fragile, made, float_bundle, so
         explain(made(StaticInt8(samples=16)), Options(float_bundle.path), Context())
     with pytest.raises(BundleError, match="no graph to explain"):
         explain(source_bundle, Options(), Context())
+    int8 = made(StaticInt8(samples=16))
+    with pytest.raises(BundleError, match=r"it is quantized itself \(int8\)"):
+        explain(int8, Options(int8.path), Context())
 
 
 def uncut(fragile: Bundle, folder: Path) -> Bundle:

@@ -28,8 +28,9 @@ from vlatool.explain._origin import (
 )
 from vlatool.explain._remedy import measure, plans
 from vlatool.graph.workload import workload
-from vlatool.machine.host import fingerprint
+from vlatool.machine.host import before_run
 from vlatool.measurement.reach import reached_in
+from vlatool.measurement.validity import busy, validity
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.report import Report, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
@@ -94,7 +95,8 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
         DataError: when the given data does not fit.
         GraphError: when a graph cannot be run.
     """
-    host = fingerprint()
+    host = before_run()
+    contended = tuple(busy(host))
     findings = _find(bundle, options, context)
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
         engine = bundle.manifest.engine or DEFAULT_ENGINE
@@ -124,6 +126,8 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
         rows=tuple(rows),
         environment=host,
         warnings=tuple(findings.warnings),
+        validity=validity(contended),
+        findings=contended,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.data import recorded_observations, synthetic_observations
 from vlatool.errors import BundleError, VlatoolError
+from vlatool.quantize._base import FLOATS
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.base import Stage
@@ -87,14 +88,16 @@ def find_baseline(bundle: Bundle, quantization: Origin, path: Path | None) -> Bu
     """Return the float32 bundle that a bundle was quantized from: the one given, else one in the cache.
 
     Raises:
-        BundleError: when the given one is damaged, or is another policy's.
+        BundleError: when the given one is damaged, is another policy's, or is quantized.
     """
     if path is None:
         return _cached(quantization.inputs)
     baseline = Bundle.open(path)
     missing = [name for name in bundle.manifest.graphs if name not in baseline.manifest.graphs and not _phases(name)]
-    if missing or baseline.manifest.spec != bundle.manifest.spec:
+    kinds = sorted({kind for graph in baseline.manifest.graphs.values() for kind in graph.precision} - {*FLOATS})
+    if missing or kinds or baseline.manifest.spec != bundle.manifest.spec:
         what = f"it has no graph '{missing[0]}'" if missing else "its inputs or outputs are others"
+        what = f"it is quantized itself ({', '.join(kinds)})" if kinds else what
         raise BundleError(
             f"{path} is not what {bundle.path} was made from: {what}.",
             "name the float32 bundle of the same policy: vlatool export SOURCE -o BUNDLE",
