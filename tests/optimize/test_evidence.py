@@ -17,11 +17,13 @@ def row(name: str, ms: float, error: float) -> Row:
     return Row(name, measurements=(Measurement("latency_p50", ms, "ms"), Measurement("error_baseline", error, "1")))
 
 
-ROWS = [row("slow", 2.0, 0.01), row("fast", 1.0, 0.04), row("level", 1.04, 0.02), row("next", 1.2, 0.03)]
+ROWS = [row("slow", 2.0, 0.01), row("fast", 1.0, 0.04), row("level", 1.008, 0.02), row("next", 1.2, 0.03)]
 
 
 def test_of_equally_fast_candidates_the_nearest_to_float32_is_first() -> None:
     assert [each.name for each in in_order(ROWS)] == ["level", "fast", "next", "slow"]
+    behind = [row("fast", 1.0, 0.04), row("accurate", 1.02, 0.001)]
+    assert [each.name for each in in_order(behind)] == ["fast", "accurate"], "two per cent are not given away"
     assert in_order([]) == []
     assert [each.name for each in in_order([Row("unknown"), ROWS[0]])] == ["slow", "unknown"]
 

@@ -177,6 +177,11 @@ def test_the_fastest_inside_is_chosen_and_praised_with_its_numbers():
     assert "Success drops by 0.5 points" in " ".join(found.sentences) or "the fastest inside" in found.row.reason
 
 
+def test_two_per_cent_of_speed_are_not_given_away_for_accuracy():
+    assert chosen(row("fast", 4.0, drop(0.005)), row("accurate", 4.08, drop(0.0))).row.name == "fast"
+    assert chosen(row("fast", 4.0, drop(0.005)), row("level", 4.03, drop(0.0))).row.name == "level"
+
+
 def test_the_success_rate_is_told_with_its_episodes():
     rate = Measurement("success", 0.96, "1", samples=200)
     assert "96.0% of 200 closed-loop episodes succeed" in chosen(row("fast", 4.0, drop(0.0), rate)).sentences[0]
