@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-import hashlib
 import importlib.metadata
 import os
 import platform
@@ -26,9 +25,10 @@ from typing import Any
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
+from _copies import without_copies  # noqa: E402
 from _interleave import CLOCKS, Contest, Contestant, build  # noqa: E402
 from _limits import LIMITS, macs_of  # noqa: E402
-from _ours import COMMANDS, HALF, MARK, OPTIMIZE, bundle_of  # noqa: E402
+from _ours import COMMANDS, HALF, MARK, bundle_of  # noqa: E402
 from _peers import PEERS, REFERENCE  # noqa: E402
 from _report import Table, markdown, read, save  # noqa: E402
 from _workload import WORKLOADS, PeersError, Workload, remove  # noqa: E402
@@ -109,28 +109,7 @@ def built(workload: Workload, given: argparse.Namespace) -> list[Contestant]:
             tell(f"  {contestant.name}: {contestant.failed}")
         elif time.perf_counter() - start > 1:
             tell(f"  {contestant.name}: made in {time.perf_counter() - start:.0f} s")
-    return without_copies(workload, contestants)
-
-
-def without_copies(workload: Workload, contestants: Sequence[Contestant]) -> list[Contestant]:
-    """Leave out what an option did not change: the fastest of several copies would be the luckiest."""
-    first: dict[str, str] = {}
-    kept = []
-    for contestant in contestants:
-        own = contestant.name.removeprefix(MARK)
-        single = contestant.ours and not contestant.failed and own in COMMANDS and COMMANDS[own][:1] != (OPTIMIZE,)
-        same = first.setdefault(graphs_digest(bundle_of(workload, own)), contestant.name) if single else contestant.name
-        if same == contestant.name:
-            kept.append(contestant)
-        else:
-            tell(f"  {contestant.name}: left out, since its graphs are those of {same}")
-    return kept
-
-
-def graphs_digest(bundle: Path) -> str:
-    """Return the SHA-256 of the graphs of a bundle."""
-    graphs = sorted((bundle / "graphs").rglob("*"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in graphs if path.is_file())).hexdigest()
+    return without_copies(workload, contestants, tell)
 
 
 def measure(workload: Workload, contestants: list[Contestant], given: argparse.Namespace) -> None:

@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import pytest
+from _copies import without_copies
 from _interleave import CLOCKS, Contestant
 from _ours import MARK, SEARCH, bundle_of
 from _report import Table
 from _workload import Workload
-from table import without_copies
 
 NOISE = [1.0, 1.05, 0.96, 1.03, 0.97, 1.01, 0.99, 1.04, 0.95, 1.02]
 

@@ -11,7 +11,7 @@ from typing import Any
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.data import recorded_observations, synthetic_observations
 from vlatool.errors import BundleError, VlatoolError
-from vlatool.quantize._base import FLOATS
+from vlatool.graph.precision import FLOATS
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.stage.base import Stage

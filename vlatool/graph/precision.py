@@ -5,6 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+FLOATS = ("float64", "float32", "float16")
+"""Precisions of a graph that is not quantized yet."""
+
 
 def precision_shares(path: Path) -> dict[str, float]:
     """Return precision -> share of the multiply-accumulates (rounded to 0.001, the largest first).

@@ -23,7 +23,7 @@ from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
-from vlatool.graph.precision import precision_shares
+from vlatool.graph.precision import FLOATS, precision_shares
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
@@ -47,8 +47,6 @@ REDUCED = (
     "weights: no pair of products saturates on processors without VNNI (--no-reduce-range: all 8 bits, which are "
     "slower there in ONNX Runtime and wrong in OpenVINO)"
 )
-FLOATS = ("float64", "float32", "float16")
-"""Precisions of a graph that is not quantized yet."""
 
 
 class Quantization(Transform):
