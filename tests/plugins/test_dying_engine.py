@@ -16,7 +16,6 @@ from _environment import environment_beside
 from vlatool.bundle.bundle import Bundle
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
 INT8 = "MatMulIntegerToFloat"
 HANGS = "engine_seconds=2"
 Run = Callable[..., subprocess.CompletedProcess[str]]

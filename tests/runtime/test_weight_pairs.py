@@ -170,10 +170,20 @@ def test_an_activation_in_uint8_is_multiplied_exactly_and_one_in_int8_may_not_be
     [helper.make_node("Constant", [], ["c"], value=numpy_helper.from_array(SATURATES, "table")),
      product("MatMulInteger", "c")],
     [product("MatMulInteger", "given")],
+    [helper.make_node("Clip", ["f", "low", "low"], ["c"], domain="own"), product("MatMulInteger", "c")],
+    [helper.make_node("QuantizeLinear", ["f", "s", "u"], ["q"], domain="own"), product("MatMulInteger", "q")],
+    [helper.make_node("DequantizeLinear", ["w", "s"], ["d"], domain="own"), product("MatMulInteger", "d")],
+    [quantizer("f", "q"), helper.make_node("Relu", ["i"], ["low"]),
+     helper.make_node("Clip", ["q", "low", "low"], ["c"]), product("MatMulInteger", "c")],
+    [helper.make_node("Relu", ["i"], ["u"]), quantizer("f", "q", "u"), product("MatMulInteger", "q")],
 ], ids=["looked up", "quantized there", "and dequantized", "and turned", "cast", "an operator of another domain",
-        "a constant of another's name", "an input"])  # fmt: skip
+        "a constant of another's name", "an input", "a clip of another domain", "a quantizer of another domain",
+        "a dequantizer of another domain", "bounds of a node's name", "a zero point of a node's name"])  # fmt: skip
 def test_an_int8_operand_that_the_graph_computes_may_saturate(nodes: list[onnx.NodeProto]) -> None:
-    assert not integers(*nodes, table=SATURATES, f=SATURATES.astype(np.float32), i=SATURATES.astype(np.int32))
+    stored = {"table": SATURATES, "f": SATURATES.astype(np.float32), "i": SATURATES.astype(np.int32)}
+    stored["low"] = np.array(9, np.int8)
+    read = {name for node in nodes for name in node.input}  # a matrix that nothing reads would be enough for the answer
+    assert not integers(*nodes, **{name: values for name, values in stored.items() if name in read})
 
 
 def test_what_is_made_twice_or_reads_itself_may_saturate() -> None:
@@ -189,7 +199,8 @@ def test_deep_and_wide_graphs_are_walked_once() -> None:
     assert not weights_fit(model_of(product("MatMul"), *nodes, product("MatMul", "d60"), w=FITS))
     joins = [quantizer("k", "c0", "u")]
     joins += [helper.make_node("Concat", [f"c{level}"] * 2, [f"c{level + 1}"], axis=0) for level in range(5000)]
-    assert integers(*joins, product("MatMulInteger", "c5000"))
+    many = [helper.make_node("MatMulInteger", ["x", "c5000"], [f"y{number}"]) for number in range(5000)]
+    assert integers(*joins, *many)
 
 
 def test_a_node_without_an_output_and_a_weight_of_many_axes_may_saturate() -> None:

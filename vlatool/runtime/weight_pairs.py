@@ -42,7 +42,9 @@ MOVES = (
     *LOOKS_UP, "Reshape", "Transpose", "Split", "Squeeze", "Unsqueeze", "Flatten", "Identity", "Slice", "Expand",
     "Concat", "Tile", "DepthToSpace", "SpaceToDepth",
 )  # fmt: skip
-"""Operators of the default domain that hand on what they read, in another place."""
+"""Operators that hand on what they read, in another place."""
+DOMAINS = ("", "ai.onnx", "com.microsoft")
+"""Whose operators these names are; one of another domain may do anything."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,6 @@ class _Node:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     transposed: bool
-    domain: str = ""
-
-    @property
-    def moves(self) -> bool:
-        return self.operator in MOVES and self.domain in ("", "ai.onnx")
 
     @property
     def moved(self) -> tuple[str, ...]:
@@ -143,48 +140,46 @@ class _Operands:
                 self._makers[name] = node
 
     def known(self) -> bool:
-        """Return whether none is an int8 that the graph computes."""
+        """Return whether each is a stored weight, in float32, or an integer with which no pair saturates."""
         products = [node for node in self._nodes if node.operator in WEIGHT_INPUT]
-        operands = [(node, node.inputs[WEIGHT_INPUT[node.operator] :][:1]) for node in products]
-        return self._unique and all(
-            name in self._weights or self._holds(name, node.operator in INTEGER_ONLY)
-            for node, found in operands
-            for name in found
-        )
-
-    def _holds(self, name: str, integer: bool) -> bool:
-        """Return whether a value that no weight stands for is in float32, or in uint8 where it is an integer."""
-        open_, seen = [(name, integer)], set()
+        open_ = [(name, node.operator in INTEGER_ONLY)
+                 for node in products for name in node.inputs[WEIGHT_INPUT[node.operator] :][:1]
+                 if name not in self._weights]  # fmt: skip
+        seen: set[tuple[str, bool]] = set()
         while open_:
-            one = open_.pop()
-            if one in seen:
+            if (one := open_.pop()) in seen:
                 continue
             seen.add(one)
-            name, integer = one
-            maker = self._makers.get(name)
-            if maker is None:
-                if integer:
-                    return False
-            elif maker.operator == "DequantizeLinear":
-                source = maker.inputs[0]
-                if source not in self._weights:
-                    open_.append((source, True))
-            elif maker.moves or maker.operator == "Clip":
-                if not (integer and self._bounds(maker)):
-                    open_ += [(each, integer) for each in maker.moved]
-            elif integer and not self._makes_uint8(maker):
+            further = self._further(*one)
+            if further is None:
                 return False
-        return True
+            open_ += further
+        return self._unique
 
-    def _bounds(self, maker: _Node) -> bool:
-        """Return whether a node keeps an int8 within what no pair saturates with."""
-        given = maker.inputs[1:3]
-        return maker.operator == "Clip" and len(given) == 2 and all(self._scalars.get(n, 128) <= BOUND for n in given)
+    def _further(self, name: str, integer: bool) -> list[tuple[str, bool]] | None:
+        """Return what a value depends on, with whether that is an integer; None when it may saturate."""
+        maker = self._makers.get(name)
+        if maker is None:
+            return None if integer else []
+        if maker.operator == "DequantizeLinear":
+            return [(source, True) for source in maker.inputs[:1] if source not in self._weights]
+        if maker.operator == "Clip" and integer and self._bounds(maker):
+            return []
+        if maker.operator in (*MOVES, "Clip"):
+            return [(each, integer) for each in maker.moved]
+        return [] if not integer or self._makes_uint8(maker) else None
+
+    def _bounds(self, clip: _Node) -> bool:
+        """Return whether a ``Clip`` keeps an int8 within what no pair saturates with."""
+        given = clip.inputs[1:3]
+        return len(given) == 2 and all(
+            self._scalars.get(name, 128) <= BOUND and name not in self._makers for name in given
+        )
 
     def _makes_uint8(self, maker: _Node) -> bool:
         zero = maker.inputs[2:3]
         if maker.operator == "QuantizeLinear":
-            return bool(zero) and self._types.get(zero[0]) == UINT8
+            return bool(zero) and self._types.get(zero[0]) == UINT8 and zero[0] not in self._makers
         return maker.operator == "DynamicQuantizeLinear"
 
 
@@ -235,7 +230,8 @@ def _node(model: bytes | OpenFile, start: int, end: int) -> _Node:
             domain = _text(model, at, to)
         elif field == ATTRIBUTE:
             transposed = transposed or _transposes(model, at, to)
-    return _Node(operator, tuple(inputs), tuple(outputs), transposed, domain)
+    own = operator if domain in DOMAINS else f"{domain}.{operator}"
+    return _Node(own, tuple(inputs), tuple(outputs), transposed)
 
 
 def _transposes(model: bytes | OpenFile, start: int, end: int) -> bool:
