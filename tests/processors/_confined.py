@@ -2,8 +2,10 @@
 
 Each CPUID instruction of the environment's libraries is replaced by one that traps, and the environment's Python is
 replaced by a program that starts the real one with a library that answers these traps without the hidden features
-(``confined/hide.c``, ``confined/launch.c``). Whatever starts the environment's Python is confined with it: children,
-isolated ones (``-I``) and those with an empty environment. Another Python is not.
+(``confined/hide.c``, ``confined/launch.c``). Where AVX-VNNI is wanted and the host has AVX512-VNNI instead, that
+library has the instructions of the one carried out by those of the other (``confined/avx_vnni.h``). Whatever starts the
+environment's Python is confined with it: children, isolated ones (``-I``) and those with an empty environment. Another
+Python is not.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,8 +107,16 @@ def environment(path: Path) -> Environment:
     return Environment(root)
 
 
-def confine(place: Environment, target: InstructionSet, tell: Callable[[str], None] = print) -> int:
+def confine(
+    place: Environment, target: InstructionSet, has: Collection[str], tell: Callable[[str], None] = print
+) -> int:
     """Confine an environment, again where packages were installed since, and return how many libraries it changed.
+
+    Args:
+        place: The environment.
+        target: The set.
+        has: The features of this host's processor.
+        tell: Takes a line for each library that is changed.
 
     Raises:
         RefusedError: when something that this takes is missing.
@@ -116,7 +126,7 @@ def confine(place: Environment, target: InstructionSet, tell: Callable[[str], No
         raise RefusedError(f"{' and '.join(missing)} cannot be imported: install capstone and pyelftools.")
     real = place.real_python()
     place.folder.mkdir(exist_ok=True)
-    (place.folder / "hidden.h").write_text(header(target, place.folder / "hide.so"), encoding="utf-8")
+    (place.folder / "hidden.h").write_text(header(target, place.folder / "hide.so", has), encoding="utf-8")
     compiled("hide.c", place.folder / "hide.so", place, "-shared", "-fPIC")
     if not (place.folder / "probe.so").exists():
         compiled("probe.c", place.folder / "probe.so", place, "-shared", "-fPIC")
@@ -135,8 +145,8 @@ def can_import(name: str) -> bool:
     return importlib.util.find_spec(name) is not None
 
 
-def header(target: InstructionSet, preloaded: Path) -> str:
-    """Return what ``hide.c`` includes: the bits and names of the hidden features."""
+def header(target: InstructionSet, preloaded: Path, has: Collection[str]) -> str:
+    """Return what ``hide.c`` includes: the bits and names of the hidden features, and whether AVX-VNNI is added."""
     rows = [
         f"  {{{leaf:#x}u, {subleaf:#x}u, {{{', '.join(f'{word:#x}u' for word in words)}}}}},"
         for (leaf, subleaf), words in masks(target.hidden).items()
@@ -147,6 +157,7 @@ def header(target: InstructionSet, preloaded: Path) -> str:
             f"// {target.name}",
             f"#define ANY {ANY:#x}u",
             f'#define PRELOADED "{preloaded}"',
+            f"#define AVX_VNNI {int('avx_vnni' in target.added(has))}",
             "static const struct { unsigned leaf, subleaf, bits[4]; } hidden[] = {",
             *rows,
             "};",

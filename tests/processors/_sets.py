@@ -52,6 +52,8 @@ BITS = {
 FEATURES = tuple(feature for bits in BITS.values() for feature in bits)
 EMPTIED = {0x1D: "amx_tile", 0x1E: "amx_tile", 0x24: "avx10"}
 """Leaf that describes a feature and reads as zeros where that is hidden -> the feature."""
+CARRIED_OUT_BY = {"avx_vnni": ("avx512_vnni", "avx512vl")}
+"""Feature that a host need not have -> features that carry its instructions out, one by one (``avx_vnni.h``)."""
 EXACT_INT8 = "exact int8 products"
 BFLOAT16 = "bfloat16 in the processor"
 """What libraries tell of themselves without the name of a feature."""
@@ -100,9 +102,14 @@ class InstructionSet:
         told = {**dict.fromkeys(self.hidden, False), **dict.fromkeys(self.needs, True)}
         return {**told, BFLOAT16: False, EXACT_INT8: self.vnni or "avx2" not in self.needs}
 
+    def added(self, flags: Collection[str]) -> tuple[str, ...]:
+        """Return the features that a processor with these flags lacks, but has instructions to carry out."""
+        able = [feature for feature, others in CARRIED_OUT_BY.items() if {*others} <= {*flags}]
+        return tuple(feature for feature in self.needs if feature not in flags and feature in able)
+
     def lacking(self, flags: Collection[str]) -> tuple[str, ...]:
         """Return what a processor with these flags lacks for it."""
-        return tuple(feature for feature in self.needs if feature not in flags)
+        return tuple(feature for feature in self.needs if feature not in {*flags, *self.added(flags)})
 
 
 SETS = (
@@ -134,10 +141,16 @@ def named(name: str, flags: Collection[str]) -> InstructionSet:
     if lacks := found.lacking(flags):
         able = ", ".join(each.name for each in possible(flags)) or "none of the sets"
         raise RefusedError(
-            f"this host cannot be confined to {name}: its processor lacks {', '.join(lacks)}, and hiding adds nothing; "
-            f"it can be confined to {able}."
+            f"this host cannot be confined to {name}: its processor lacks {', '.join(map(either, lacks))}; it can be "
+            f"confined to {able}."
         )
     return found
+
+
+def either(feature: str) -> str:
+    """Return a feature's name, with those that would do instead."""
+    others = CARRIED_OUT_BY.get(feature)
+    return f"{feature} (or {' and '.join(others)})" if others else feature
 
 
 def distinct(flags: Collection[str]) -> tuple[InstructionSet, ...]:
@@ -167,7 +180,8 @@ def listing(flags: Collection[str]) -> list[str]:
     lines = []
     for each in SETS:
         lacks = each.lacking(flags)
-        state = f"no: this host lacks {', '.join(lacks)}" if lacks else "yes"
+        added = "".join(f", with {CARRIED_OUT_BY[feature][0]} for {feature}" for feature in each.added(flags))
+        state = f"no: this host lacks {', '.join(lacks)}" if lacks else f"yes{added}"
         needs = ", ".join(feature for feature in each.needs if feature not in OLD) or ", ".join(OLD)
         lines.append(f"{each.name:<12} {state}; needs {needs} (as in {each.like})")
     return lines

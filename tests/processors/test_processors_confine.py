@@ -57,14 +57,17 @@ def test_a_set_hides_what_it_does_not_keep():
 def test_a_host_is_confined_to_what_it_has_alone():
     assert [each.name for each in possible(ALONE)] == ["sse42", "avx", "avx2"]
     assert [each.name for each in distinct(ALONE)] == ["sse42", "avx"], "avx2 is this host itself"
-    assert [each.name for each in possible(SERVER)] == ["sse42", "avx", "avx2", "avx512", "avx512_vnni"]
-    with pytest.raises(RefusedError, match=r"lacks avx_vnni, and hiding adds nothing; .* to sse42, avx, avx2\."):
+    assert [each.name for each in possible(SERVER)] == [each.name for each in SETS], "its AVX512-VNNI does for AVX-VNNI"
+    assert [each.added(SERVER) for each in SETS if each.added(SERVER)] == [("avx_vnni",)]
+    assert BY_NAME["avx2_vnni"].added(SERVER | {"avx_vnni"}) == () == BY_NAME["avx2_vnni"].added(SERVER - {"avx512vl"})
+    with pytest.raises(RefusedError, match=r"lacks avx_vnni \(or avx512_vnni and avx512vl\); .* to sse42, avx, avx2\."):
         named("avx2_vnni", ALONE)
     with pytest.raises(RefusedError, match="there is no set 'avx3'; the sets are sse42"):
         named("avx3", ALONE)
     with pytest.raises(RefusedError, match="none of the sets"):
         named("avx2", frozenset())
     assert [line.split()[1].rstrip(":;") for line in listing(ALONE)] == ["yes"] * 3 + ["no"] * 3
+    assert "avx2_vnni    yes, with avx512_vnni for avx_vnni; needs" in listing(SERVER)[3]
 
 
 def test_a_feature_is_hidden_by_its_bit_and_leaves_that_describe_it_are_emptied():
@@ -72,9 +75,11 @@ def test_a_feature_is_hidden_by_its_bit_and_leaves_that_describe_it_are_emptied(
     assert found[7, 0] == (0, 1 << 16, 0, 1 << 24)
     assert {place[0] for place in found} == {0x7, 0x1D, 0x1E}
     assert masks([]) == {}
-    text = header(BY_NAME["avx2"], Path("/e/hide.so"))
+    text = header(BY_NAME["avx2"], Path("/e/hide.so"), HERE)
     assert '"avx512_vnni"' in text
     assert '"avx2"' not in text
+    added = {name: header(each, Path("/e/hide.so"), SERVER).count("AVX_VNNI 1") for name, each in BY_NAME.items()}
+    assert added == {name: int(name == "avx2_vnni") for name in BY_NAME}
 
 
 def test_libraries_may_not_see_what_is_hidden_and_have_to_see_the_rest():
@@ -114,7 +119,7 @@ def confined(tmp_path_factory) -> Environment:
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(root)], check=True)
     place = environment(root)
     library(site(place) / "tiny.so")
-    assert confine(place, BY_NAME["avx"], tell=lambda line: None) == 2
+    assert confine(place, BY_NAME["avx"], HERE, tell=lambda line: None) == 2
     return place
 
 
@@ -190,13 +195,13 @@ def test_a_real_illegal_instruction_still_kills(confined):
 @needs_avx2
 def test_confined_again_changes_what_is_new_alone(confined):
     told: list[str] = []
-    assert confine(confined, BY_NAME["avx"], told.append) == 0
+    assert confine(confined, BY_NAME["avx"], HERE, told.append) == 0
     fresh = library(site(confined) / "fresh.so")
     assert asked(confined, library="fresh.so") == "1 False True", "a package that was installed since is not confined"
-    assert confine(confined, BY_NAME["avx"], told.append) == 1
+    assert confine(confined, BY_NAME["avx"], HERE, told.append) == 1
     assert asked(confined, library="fresh.so") == "0 False True"
     library(fresh)
-    assert confine(confined, BY_NAME["avx"], told.append) == 1, "another version of it"
+    assert confine(confined, BY_NAME["avx"], HERE, told.append) == 1, "another version of it"
     assert len(told) == 2
     assert "fresh.so: 1 CPUID replaced, 1 look-alikes left" in told[0]
     fresh.unlink()

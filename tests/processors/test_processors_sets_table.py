@@ -26,7 +26,7 @@ ACTIONS = np.arange(1.0, 7.0).reshape(2, 3)
         (ALONE, ["avx"]),
         (LAPTOP, ["avx2"]),
         (LAPTOP | SERVER, ["avx2", "avx2_vnni", "avx512", "avx512_vnni"]),
-        (SERVER, ["avx2", "avx512", "avx512_vnni"]),
+        (SERVER, ["avx2", "avx2_vnni", "avx512", "avx512_vnni"]),
         (frozenset(), []),
     ],
     ids=["avx2", "laptop", "both", "server", "nothing"],

@@ -1,10 +1,12 @@
 // Loaded before every other library of a confined environment (by launch.c): answers the instructions that stand where
-// CPUID stood, without the features that are hidden, and shows /proc/cpuinfo without them. hidden.h is written by
-// _confined.py: ANY, PRELOADED, hidden[] (leaf, subleaf, bits of eax, ebx, ecx, edx) and names[].
+// CPUID stood, without the features that are hidden, and shows /proc/cpuinfo without them; AVX-VNNI is added where it is
+// wanted and the host has AVX512-VNNI. hidden.h is written by _confined.py: ANY, PRELOADED, AVX_VNNI (whether to add it),
+// hidden[] (leaf, subleaf, bits of eax, ebx, ecx, edx) and names[].
 #define _GNU_SOURCE
 #include <cpuid.h>
 #include <dlfcn.h>
 #include <fcntl.h>
+#include <pthread.h>
 #include <signal.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -17,6 +19,8 @@
 #include "hidden.h"
 
 #define COUNT(array) (sizeof(array) / sizeof *(array))
+
+#include "avx_vnni.h"
 
 // ---- The functions of libc that stand behind ours: found before main(), since dlsym() waits for a thread that loads
 
@@ -42,6 +46,8 @@ static void answer(greg_t *registers) {
   for (size_t i = 0; i < COUNT(hidden); i++)
     if (hidden[i].leaf == leaf && (hidden[i].subleaf == subleaf || hidden[i].subleaf == ANY))
       for (int k = 0; k < 4; k++) found[k] &= ~hidden[i].bits[k];
+  if (AVX_VNNI && leaf == 7 && subleaf == 0 && !found[0]) found[0] = 1;  // the last subleaf
+  if (AVX_VNNI && leaf == 7 && subleaf == 1) found[0] |= 1 << 4;
   registers[REG_RAX] = found[0];
   registers[REG_RBX] = found[1];
   registers[REG_RCX] = found[2];
@@ -60,6 +66,8 @@ static void on_illegal(int number, siginfo_t *info, void *context) {
   int sent = info->si_code <= 0;  // by kill or raise, not by the processor
   if (!sent && !memcmp((const void *)registers[REG_RIP], "\x0f\x04", 2))
     answer(registers);
+  else if (!sent && AVX_VNNI && replaced((uint8_t *)registers[REG_RIP]))
+    return;
   else if (others.sa_flags & SA_SIGINFO)
     others.sa_sigaction(number, info, context);
   else if (others.sa_handler == SIG_DFL || (others.sa_handler == SIG_IGN && !sent))
@@ -73,6 +81,7 @@ __attribute__((constructor)) static void start(void) {
   // without SA_ONSTACK: such a stack is that of others, who free it
   struct sigaction ours = {.sa_sigaction = on_illegal, .sa_flags = SA_SIGINFO | SA_NODEFER | SA_RESTART};
   NEXT(sigaction)(SIGILL, &ours, &others);
+  pthread_atfork(enter, leave, leave);
   const char *words = getenv("LD_PRELOAD");  // launch.c put this library first: children that are other programs go without
   if (!words || strncmp(words, PRELOADED, strlen(PRELOADED))) return;
   const char *rest = words + strlen(PRELOADED);
@@ -131,6 +140,7 @@ static void write_line(FILE *out, char *line) {
   fprintf(out, "%.*s", (int)(left ? left + 1 - line : 0), line);
   for (left = left ? strtok_r(left + 1, " \n", &word) : NULL; left; left = strtok_r(NULL, " \n", &word))
     if (!is_hidden(left, strlen(left))) fprintf(out, " %s", left);
+  if (AVX_VNNI) fputs(" avx_vnni", out);
   fputc('\n', out);
 }
 
