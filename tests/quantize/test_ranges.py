@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from _full import small_or_full
 
-from vlatool.quantize._ranges import BINS, LEVELS, PER_SAMPLE, Method, Statistics, choose_range
+from vlatool.quantize._ranges import BINS, CLIPPED, LEVELS, PER_SAMPLE, Method, Statistics, choose_range
 
 METHODS: tuple[Method, ...] = ("minmax", "percentile", "entropy", "mse")
 
@@ -200,12 +200,18 @@ def test_mse_cuts_rare_outliers_whether_symmetric_or_not() -> None:
 
 
 def slow_entropy(values: np.ndarray, statistics: Statistics) -> float:
-    """Migacz's calibration, element by element, over the same bins."""
+    """Migacz's calibration, element by element, over the same bins: without zeros, and not beyond what may be clipped."""
     half = BINS // 2
-    counts = [float(statistics.counts[half + i] + statistics.counts[half - 1 - i]) for i in range(half)]
+    above = [float(statistics.counts[half + i]) for i in range(half)]
+    below = [float(statistics.counts[half - 1 - i]) for i in range(half)]
+    for side in (above, below):
+        side[0] = min(side[0], side[1])
+    counts = [a + b for a, b in zip(above, below, strict=True)]
+    energy = [count * (i + 0.5) ** 2 for i, count in enumerate(counts)]
     last = max((i for i, count in enumerate(counts) if count), default=-1) + 1
+    first = next(i + 1 for i in range(half) if sum(energy[i + 1 :]) <= CLIPPED * sum(energy))
     best, threshold = math.inf, last
-    for stop in range(128, last + 1, 8):
+    for stop in range(max(128, first), last + 1, 8):
         p = counts[:stop]
         p[-1] += sum(counts[stop:])
         q = [0.0] * stop
@@ -236,6 +242,29 @@ def test_entropy_finds_the_threshold_of_the_plain_algorithm(kind: str) -> None:
     low, high = choose_range(thinned, "entropy", 99, symmetric=True)
     assert high == pytest.approx(threshold, rel=1e-6)
     assert low == -high
+
+
+SPARSE = {
+    "relu": lambda x: np.maximum(x, 0),
+    "relu, 1 in 100": lambda x: np.maximum(x - 2.33, 0),
+    "relu squared": lambda x: np.maximum(x, 0) ** 2,
+    "leaky": lambda x: np.where(x > 0, x, x * 1e-3),
+    "relu6": lambda x: np.clip(4 * x, 0, 6),
+    "silu": lambda x: x / (1 + np.exp(-6 * x)),
+    "masked": lambda x: np.where(np.arange(len(x)) % 10 > 0, 0, x),
+    "softmax": lambda x: np.exp(4 * x) / np.exp(4 * x).reshape(-1, 50).sum(-1).repeat(50),
+    "negative": lambda x: np.minimum(x, 0),
+}
+"""Activations with many zeros, or nearly so, and fewer values that matter."""
+
+
+@pytest.mark.parametrize("kind", SPARSE)
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_entropy_is_not_decided_by_zeros_and_keeps_what_matters(kind: str, symmetric: bool) -> None:
+    normal = np.random.default_rng(5).standard_normal(50_000)
+    values = SPARSE[kind](normal).astype(np.float32)
+    low, high = choose_range(of(values), "entropy", 99, symmetric, unsigned=True)
+    assert error(values, low, high) < 5 * CLIPPED * float((values.astype(np.float64) ** 2).sum())
 
 
 @pytest.mark.parametrize("seed", range(small_or_full(6, 20)))

@@ -17,6 +17,9 @@ BINS = 4096
 PER_SAMPLE = 1 << 16
 """Elements of one tensor of one sample that enter its histogram, at an even stride; the extremes see all of them."""
 LEVELS = 256
+CLIPPED = 1e-3
+"""Share of the squared values that ``entropy`` may cut off: divergence alone would give up rare large ones, such as the
+peaks of a softmax, for many small ones."""
 
 
 @dataclass
@@ -168,19 +171,36 @@ def _least_squares(statistics: Statistics, symmetric: bool) -> tuple[float, floa
 def _entropy(statistics: Statistics) -> float:
     """Return the threshold on magnitudes whose 128-level quantization loses the least information."""
     half = BINS // 2
-    magnitudes = statistics.counts[half:] + statistics.counts[:half][::-1]
-    counts = magnitudes.astype(np.float64)
+    counts = _informative(statistics.counts[half:]) + _informative(statistics.counts[:half][::-1])
     last = int(np.nonzero(counts)[0][-1]) + 1 if counts.any() else 0
     levels = LEVELS // 2
     if last <= levels:
         return max(-statistics.low, statistics.high)
     best, chosen = math.inf, last
-    for stop in range(levels, last + 1, 8):
+    for stop in range(_first_stop(counts, levels), last + 1, 8):
         loss = _divergence(counts, stop, levels)
         if loss < best:
             best, chosen = loss, stop
     width = statistics.radius / half
     return min(chosen * width, max(-statistics.low, statistics.high))
+
+
+def _informative(side: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return counts of magnitudes with no more in the first bin than in the second.
+
+    Zero is a level of every range, so the zeros that a ReLU or a mask makes lose nothing by any; their number would
+    decide the divergence nevertheless. TensorRT's calibrator leaves the first bin out, too.
+    """
+    counts = side.astype(np.float64)
+    counts[0] = min(counts[:2])
+    return counts
+
+
+def _first_stop(counts: NDArray[np.float64], levels: int) -> int:
+    """Return the first bin, from ``levels``, beyond which at most ``CLIPPED`` of the squared magnitudes lie."""
+    energy = counts * (np.arange(len(counts)) + 0.5) ** 2
+    beyond = energy.sum() - np.cumsum(energy)
+    return max(levels, int(np.argmax(beyond <= CLIPPED * energy.sum())) + 1)
 
 
 def _divergence(counts: NDArray[np.float64], stop: int, levels: int) -> float:
