@@ -200,7 +200,7 @@ def test_mse_cuts_rare_outliers_whether_symmetric_or_not() -> None:
 
 
 def slow_entropy(values: np.ndarray, statistics: Statistics) -> float:
-    """Migacz's calibration, element by element, over the same bins: without zeros, and not beyond what may be clipped."""
+    """Migacz's calibration, element by element, over the same bins: without zeros, and within what may be clipped."""
     half = BINS // 2
     above = [float(statistics.counts[half + i]) for i in range(half)]
     below = [float(statistics.counts[half - 1 - i]) for i in range(half)]

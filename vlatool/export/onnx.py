@@ -16,6 +16,7 @@ from vlatool.errors import GraphError, require, require_present
 from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
+from vlatool.module.memory import refuse_kept_values
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
 from vlatool.module.to_onnx import (
@@ -90,6 +91,8 @@ class ExportOnnx(Transform):
         context.tell("running the torch policy", None)
         with weights_read(stored) if stored else contextlib.nullcontext():
             expected = self._actions(bundle, sessions, observations)
+            for session in sessions.values():
+                refuse_kept_values(session.module, session.step, session.last_feeds)
         graphs = {}
         for number, (name, session) in enumerate(sessions.items()):
             context.tell(f"exporting {name}", number / len(sessions))

@@ -17,6 +17,7 @@ from vlatool.graph.draws import refuse_draws
 from vlatool.graph.nodes import FOLDED
 from vlatool.module.factory import exits_caught
 from vlatool.module.failures import export_error
+from vlatool.module.memory import refuse_changed_buffers
 from vlatool.module.norms import divide_by_roots
 from vlatool.module.torchlib import built_once
 
@@ -43,6 +44,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
 
     Raises:
         GraphError: when torch cannot, or the graph would draw random numbers.
+        SourceError: when an output depends on a buffer that the module changes.
     """
     torch = require("torch", "build")
     try:
@@ -56,6 +58,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     except Exception as error:  # the seam: the exporter raises many foreign types
         raise_interrupt(error)
         raise export_error(error, step.graph, module) from error
+    refuse_changed_buffers(exported.exported_program, step.graph)
     refuse_draws(exported.model, step.graph)
     divide_by_roots(exported.model)
     return exported

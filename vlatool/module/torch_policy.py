@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,7 +86,7 @@ def policy_of(source: Bundle, modules: Mapping[str, nn.Module], seed: int | None
 
 
 class TorchSession:
-    """One torch module behind the session interface; remembers the feeds of its first run.
+    """One torch module behind the session interface; remembers the feeds of its first run and of the last two.
 
     Args:
         module: The module; takes the feeds positionally in the order of ``step.feeds``.
@@ -96,6 +97,7 @@ class TorchSession:
         self.module = module
         self.step = step
         self.first_feeds: dict[str, Any] | None = None
+        self.last_feeds: deque[Mapping[str, Any]] = deque(maxlen=2)
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run the module on numpy arrays.
@@ -106,6 +108,7 @@ class TorchSession:
         torch = require("torch", "build")
         if self.first_feeds is None:
             self.first_feeds = dict(feeds)
+        self.last_feeds.append(dict(feeds))
         arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
         with torch.inference_mode():
             outputs = run_module(self.module, self.step, arguments)

@@ -1,0 +1,196 @@
+"""What a module remembers from call to call, and whether its outputs depend on it: an exported graph remembers nothing.
+
+A buffer that ``forward()`` changes is found in what torch.export traced. Attributes that are no buffers (a counter, a
+list of past observations) leave no trace there: they are found by running the module, and by putting other values into
+those that changed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from vlatool.bundle.program import ProgramStep
+from vlatool.errors import SourceError, VlatoolError, require
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+REMEDY = (
+    "let forward() take it as an input and return it, and declare it with 'keep' in the program of policy.yaml: "
+    "docs/guides/recurrent-policy.md"
+)
+COUNTS = (0, *(2**power for power in range(21)))
+"""Values that a counter is given: it may take effect after thousands of steps."""
+FACTORS = (0.0, -1.0, 1e3, -1e3)
+"""What the numbers of other attributes are multiplied by, after 1 is added."""
+LONGER = 32
+"""How many times as long a list is made: it may take effect once it is full."""
+SAME = 1e-5
+"""Relative and absolute difference of outputs up to which they are equal."""
+
+
+def refuse_changed_buffers(exported: Any, graph: str) -> None:
+    """Look for buffers that a traced module changes and whose old value an output depends on.
+
+    Args:
+        exported: A ``torch.export.ExportedProgram``.
+        graph: Name of the graph.
+
+    Raises:
+        SourceError: naming the first one.
+    """
+    signature = exported.graph_signature
+    changed = {*signature.buffers_to_mutate.values()}
+    for placeholder, buffer in signature.inputs_to_buffers.items():
+        if buffer in changed and _reached(exported.graph, placeholder) & {*signature.user_outputs}:
+            raise _keeps(graph, f"the buffer '{buffer}'")
+
+
+def _reached(graph: Any, start: str) -> set[str]:
+    """Return the names of the nodes that a node's value flows into."""
+    reached = {start}
+    for node in graph.nodes:
+        if any(source.name in reached for source in node.all_input_nodes):
+            reached.add(node.name)
+    return reached
+
+
+def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Mapping[str, Any]]) -> None:
+    """Run a module on different inputs and see whether it changes an attribute that its outputs depend on.
+
+    Args:
+        module: A module of a policy.
+        step: What it is fed and gives.
+        feeds: Two inputs or more, arrays by name; of one alone nothing is learnt.
+
+    Raises:
+        SourceError: naming the attribute.
+    """
+    if len(feeds) < 2:
+        return
+    _run(module, step, feeds[0])
+    before = {place: _plain(value) for place, value in _attributes(module)}
+    expected = _run(module, step, feeds[1])
+    after = {place: value for place, value in _attributes(module) if _differ(before.get(place), _plain(value))}
+    for (owner, name), value in after.items():
+        original = _copy(value)
+        try:
+            for other in (original, *_others(original)):
+                _put(module, owner, name, _copy(other))
+                if not _equal(_try(module, step, feeds[1]), expected):
+                    raise _keeps(step.graph, f"'{f'{owner}.{name}'.lstrip('.')}'")
+        finally:
+            _put(module, owner, name, original)
+
+
+def _attributes(module: nn.Module) -> Iterator[tuple[tuple[str, str], Any]]:
+    """Yield (module, name) -> value of all that is neither parameter nor module nor torch's own."""
+    usual = {*vars(require("torch", "build").nn.Module())}
+    for owner, part in module.named_modules():
+        for name, value in [*part._buffers.items(), *vars(part).items()]:
+            if name not in usual and _plain(value) is not None:
+                yield (owner, name), value
+
+
+def _plain(value: Any) -> Any:
+    """Return a value that can be compared later, None for what is no number, text or tensor, or a container of them."""
+    torch = require("torch", "build")
+    if isinstance(value, torch.Tensor):
+        return value.detach().clone()
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, deque)):
+        return [_plain(item) for item in value]
+    return None
+
+
+def _differ(one: Any, other: Any) -> bool:
+    torch = require("torch", "build")
+    if isinstance(one, torch.Tensor) and isinstance(other, torch.Tensor):
+        return one.shape != other.shape or not torch.equal(one, other)
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() != other.keys() or any(_differ(one[key], other[key]) for key in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) != len(other) or any(map(_differ, one, other))
+    return type(one) is not type(other) or bool(one != other)
+
+
+def _copy(value: Any) -> Any:
+    """Return a copy that forward() does not change in place."""
+    if isinstance(value, require("torch", "build").Tensor):
+        return value.detach().clone()
+    if isinstance(value, Mapping):
+        return {key: _copy(item) for key, item in value.items()}
+    if isinstance(value, (list, deque)):
+        return _filled(value, [_copy(item) for item in value])
+    return value
+
+
+def _others(value: Any) -> Iterator[Any]:
+    """Yield other values of the kind of an attribute."""
+    torch = require("torch", "build")
+    if isinstance(value, bool):
+        yield not value
+    elif isinstance(value, int):
+        yield from COUNTS
+    elif isinstance(value, torch.Tensor) and value.numel() == 1:
+        yield from (torch.full_like(value, count) for count in COUNTS if value.dtype != torch.bool)
+    elif isinstance(value, (float, torch.Tensor)) and getattr(value, "dtype", None) != torch.bool:
+        yield from ((value + 1) * factor for factor in FACTORS)
+    elif isinstance(value, (list, deque)):
+        for items in ([], [*value] * LONGER):
+            yield _filled(value, items)
+        for place in range(len(FACTORS)):
+            yield _filled(value, [_one_of(item, place) for item in value] * LONGER)
+    elif isinstance(value, dict):
+        yield {}
+        yield from ({key: _one_of(item, place) for key, item in value.items()} for place in range(len(FACTORS)))
+
+
+def _filled(like: Any, items: list[Any]) -> Any:
+    return deque(items, like.maxlen) if isinstance(like, deque) else items
+
+
+def _one_of(value: Any, place: int) -> Any:
+    others = list(_others(value))
+    return others[place % len(others)] if others else value
+
+
+def _put(module: nn.Module, owner: str, name: str, value: Any) -> None:
+    setattr(module.get_submodule(owner), name, value)
+
+
+def _try(module: nn.Module, step: ProgramStep, feeds: Mapping[str, Any]) -> list[Tensor] | None:
+    """Return the outputs, None where the module cannot run with what was put into it."""
+    try:
+        return _run(module, step, feeds)
+    except VlatoolError:
+        return None
+
+
+def _run(module: nn.Module, step: ProgramStep, feeds: Mapping[str, Any]) -> list[Tensor]:
+    from vlatool.module.torch_policy import TorchSession
+
+    torch = require("torch", "build")
+    outputs = TorchSession(module, step).run(feeds)
+    return [torch.from_numpy(outputs[name]).clone() for name in step.gives]
+
+
+def _equal(got: list[Tensor] | None, expected: list[Tensor]) -> bool:
+    torch = require("torch", "build")
+    return got is not None and all(
+        one.shape == other.shape and torch.allclose(one.double(), other.double(), SAME, SAME, equal_nan=True)
+        for one, other in zip(got, expected, strict=True)
+    )
+
+
+def _keeps(graph: str, what: str) -> SourceError:
+    return SourceError(
+        f"The graph '{graph}' would forget: forward() changes {what} from call to call, and its outputs depend on it; "
+        "an exported graph sees it as it is now, for ever.",
+        REMEDY,
+    )
