@@ -9,6 +9,7 @@ from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import npz, observations_for, read_recording, recorded_observations, synthetic_observations
+from vlatool.data._drawn import words_of
 from vlatool.errors import DataError
 
 COUNT = 6
@@ -247,7 +248,7 @@ def test_a_directory_is_no_recording(tmp_path: Path):
         read_recording(tmp_path / "recording.npz", SPEC)
 
 
-def test_synthetic_observations_fit_the_spec_and_repeat():
+def test_synthetic_observations_fit_the_spec_and_repeat(tmp_path: Path):
     spec = PolicySpec(
         (
             *SPEC.inputs,
@@ -258,7 +259,8 @@ def test_synthetic_observations_fit_the_spec_and_repeat():
         SPEC.outputs,
         10.0,
     )
-    first, again = synthetic_observations(spec, 3), synthetic_observations(spec, 3)
+    bundle = seal(tmp_path, Manifest("bare", "1", spec))
+    first, again = synthetic_observations(bundle, 3), synthetic_observations(bundle, 3)
     assert len(first) == 3
     for one, other in zip(first, again, strict=True):
         for name, value in one.items():
@@ -271,7 +273,7 @@ def test_synthetic_observations_fit_the_spec_and_repeat():
         "ids": ((5,), "int32"),
     }
     assert not np.array_equal(first[0]["image"], first[1]["image"])
-    assert not np.array_equal(first[0]["image"], synthetic_observations(spec, 1, seed=1)[0]["image"])
+    assert not np.array_equal(first[0]["image"], synthetic_observations(bundle, 1, seed=1)[0]["image"])
 
 
 def test_a_bundle_without_recording_gives_synthetic_observations(tmp_path: Path):
@@ -279,6 +281,15 @@ def test_a_bundle_without_recording_gives_synthetic_observations(tmp_path: Path)
     assert recorded_observations(bundle, 3) == []
     assert len(observations_for(bundle, 3)) == 3
     assert observations_for(bundle, 3)[0]["say"] == ""
+
+
+def test_synthetic_instructions_are_words_of_the_vocabulary_and_never_empty(float_bundle: Bundle):
+    text = next(tensor for tensor in float_bundle.manifest.spec.inputs if tensor.kind == "text")
+    known = words_of(float_bundle.path / "assets" / text.tokenizer)
+    said = [item[text.name] for item in synthetic_observations(float_bundle, 16)]
+    assert all(sentence and {*sentence.split()} <= {*known} for sentence in said)
+    assert len({*said}) > 8
+    assert max(len(sentence.split()) for sentence in said) <= text.max_tokens
 
 
 def test_the_bundles_own_recording_comes_before_synthetic_observations(tmp_path: Path):

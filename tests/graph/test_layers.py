@@ -154,3 +154,26 @@ def test_reductions_of_older_opsets_and_those_that_keep_their_axes() -> None:
     close(run(everything, x=x)["y"], x.mean())
     for kept in ("y = ReduceMean(x)", "y = ReduceMean<keepdims=1>(x)", "y = Relu(x)"):
         assert keep_axes(graph(f"(float[4,6] x) => (float[a,b] y) {{ {kept} }}")) == 0
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        "s = Add(a, m)  z = Softmax(s)",
+        "s = Add(m, a)  z = LogSoftmax(s)",
+        "s = Add(a, m)  t = Transpose<perm=[1,0]>(s)  z = Softmax(t)",
+        "s = Add(a, m)  t = Max(s, low)  u = Div(t, low)  z = Softmax(u)",
+    ],
+    ids=["mask after", "mask before", "moved", "limited"],
+)
+def test_scores_and_a_mask_are_no_residual_sum(mask: str) -> None:
+    text = f"(float[4,4] x, float[4,4] y) => (float[4,4] z) {{ a = Relu(x)  m = Log(y)  {mask} }}"
+    assert find_layers(graph(text, low=np.full(1, -1e4, np.float32)), OPS, elementwise=True) == []
+
+
+def test_a_sum_that_something_else_reads_is_a_residual_sum() -> None:
+    text = "(float[4,4] x, float[4,4] y) => (float[4,4] z) { s = Add(x, y)  p = MatMul(s, w)  z = Softmax(p) }"
+    assert [layer.kind for layer in find_layers(graph(text, w=weight(4, 4)), OPS, elementwise=True)] == [
+        "Add",
+        "MatMul",
+    ]

@@ -24,8 +24,11 @@ from vlatool.data import recorded_observations
 from vlatool.errors import DataError, GraphError
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._ranges import Statistics
+from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.runtime import load
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
+from vlatool.stage.run import run_transform
 
 WIDTH = 64
 LOOP = """(float[1,W] x, float[1,W] h, float[1] t) => (float[1,W] g)
@@ -128,6 +131,28 @@ def test_an_activation_that_is_not_finite_names_sample_graph_and_tensor(tmp_path
     bundle = seal(bundle.path, bundle.manifest)
     with pytest.raises(DataError, match=r"Calibration sample 0 makes the tensor 'r' of the graph 'head' not finite \("):
         calibrate(bundle, {"head": ["r"]}, drawn(2), Context())
+
+
+@pytest.mark.parametrize("layout", ["ort", "qdq", "openvino"])
+def test_a_sum_that_is_infinite_stays_float(tmp_path: Path, layout: str) -> None:
+    """A mask of -infinity is added to values that no softmax reads."""
+    bundle = looping(tmp_path / "bundle")
+    text = HEAD.replace("r = Relu(g)", "i = Log(seen)  k = Add(g, g)  l = Add(g, i)  m = Max(k, l)  r = Relu(m)")
+    text = text.replace("float[1,W] g)", "float[1,W] g, float[1,1] seen)")
+    onnx.save(model(text, v=np.ones((WIDTH, 2), np.float32)), tmp_path / "bundle/graphs/head.onnx")
+    loop, head = bundle.manifest.program
+    spec = replace(bundle.manifest.spec, inputs=(*bundle.manifest.spec.inputs, TensorSpec("seen", (1, 1))))
+    program = (loop, replace(head, feeds={**head.feeds, "seen": "seen"}))
+    bundle = seal(bundle.path, replace(bundle.manifest, program=program, spec=spec))
+    x = np.random.default_rng(0).standard_normal((12, WIDTH)).astype(np.float32)
+    np.savez(tmp_path / "mine.npz", x=x, seen=np.arange(12, dtype=np.float32).reshape(12, 1) % 2)
+    stage = StaticInt8(elementwise=True, calibration=tmp_path / "mine.npz", layout=layout)
+    made = run_transform(stage, bundle, tmp_path / "int8", Context())
+    shares = made.manifest.graphs["head"].precision
+    assert shares["int8"] > 0
+    observation = {"x": x[0], "seen": np.zeros(1, np.float32)}
+    got = [load(path).infer(observation).chunk for path in (bundle.path, made.path)]
+    np.testing.assert_allclose(got[1], got[0], rtol=0.1)
 
 
 def test_the_sample_is_called_what_the_recording_calls_it(tmp_path: Path) -> None:

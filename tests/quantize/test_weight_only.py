@@ -339,7 +339,7 @@ def test_impossible_options_are_refused(options):
 
 
 def test_the_observations_of_the_sample_fit_its_spec(llama):
-    assert synthetic_observations(llama.manifest.spec, 1)[0]["ids"].shape == (TOKENS,)
+    assert synthetic_observations(llama, 1)[0]["ids"].shape == (TOKENS,)
 
 
 @pytest.mark.parametrize("pattern", ["/data/*.safetensors", "../*.safetensors", "[1]"])

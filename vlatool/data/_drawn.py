@@ -102,10 +102,15 @@ class Drawer:
         return _physical(values, self._normalisers[tensor.name], like).astype(dtype)
 
     def _sentence(self, tensor: TensorSpec, random: np.random.Generator) -> str:
-        words = self._words[tensor.name]
-        most = tensor.max_tokens
-        lengths = [length for length in LENGTHS if length <= most] or [0]
-        return " ".join(random.choice(words, size=int(random.choice(lengths))))
+        lengths = [length for length in LENGTHS if length <= tensor.max_tokens] or [0]
+        return sentence(self._words[tensor.name], random, lengths)
+
+
+def sentence(words: Sequence[str], random: np.random.Generator, lengths: Sequence[int]) -> str:
+    """Return words of a vocabulary, as many as one of the lengths says; nothing of an empty vocabulary."""
+    if not words:
+        return ""
+    return " ".join(words[place] for place in random.integers(len(words), size=int(random.choice(lengths))))
 
 
 def words_of(path: Path) -> list[str]:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.spec import PolicySpec, TensorSpec
+from vlatool.bundle.spec import TensorSpec
+from vlatool.data._drawn import sentence, words_of
 from vlatool.data._halves import LEAST, halves
 from vlatool.data._recording import Recording, read_recording
 from vlatool.errors import DataError
 
 CALIBRATION = "data/calibration.npz"
 EVALUATION = "data/evaluation.npz"
+LONGEST = 8
+"""Words of a synthetic instruction at most."""
 
 
 def calibration_recording(source: Bundle, path: Path | None = None) -> Recording | None:
@@ -110,18 +113,30 @@ def recorded_observations(source: Bundle, count: int, path: Path | None = None) 
 def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
     """Return recorded observations, in memory, or synthetic ones when the bundle carries none."""
     observations = list(recorded_observations(source, count, path))
-    return observations or synthetic_observations(source.manifest.spec, count)
+    return observations or synthetic_observations(source, count)
 
 
-def synthetic_observations(spec: PolicySpec, count: int, seed: int = 0) -> list[dict[str, Any]]:
-    """Return seeded random observations that fit the spec: good for shapes and timing, not for accuracy."""
-    random = np.random.default_rng(seed)
-    return [{tensor.name: _synthetic(tensor, random) for tensor in spec.inputs} for _ in range(count)]
+def synthetic_observations(source: Bundle, count: int, seed: int = 0) -> list[dict[str, Any]]:
+    """Return seeded random observations that fit a bundle's spec: good for shapes and timing, not for accuracy.
+
+    Instructions are words of the vocabulary: an empty one is padding alone, which many policies mask away as a whole.
+    """
+    random, inputs = np.random.default_rng(seed), source.manifest.spec.inputs
+    words = {tensor.name: _words(source, tensor) for tensor in inputs if tensor.kind == "text"}
+    return [{tensor.name: _synthetic(tensor, random, words) for tensor in inputs} for _ in range(count)]
 
 
-def _synthetic(tensor: TensorSpec, random: np.random.Generator) -> Any:
+def _words(source: Bundle, tensor: TensorSpec) -> list[str]:
+    """Return the words of an input's vocabulary; none where it cannot be read, which the encoder refuses."""
+    try:
+        return words_of(source.path / "assets" / tensor.tokenizer)
+    except DataError:
+        return []
+
+
+def _synthetic(tensor: TensorSpec, random: np.random.Generator, words: Mapping[str, Sequence[str]]) -> Any:
     if tensor.kind == "text":
-        return ""
+        return sentence(words[tensor.name], random, range(1, min(LONGEST, tensor.max_tokens) + 1))
     shape = tuple(axis if isinstance(axis, int) else 1 for axis in tensor.shape[1:])
     if tensor.dtype == "uint8":
         return random.integers(0, 256, shape, np.uint8)

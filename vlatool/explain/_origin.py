@@ -138,7 +138,7 @@ def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, 
     for source in sources:
         if values := list(recorded_observations(source, count)):
             return Observations(values, "the calibration's own observations")
-    values = synthetic_observations(bundle.manifest.spec, count)
+    values = synthetic_observations(bundle, count)
     return Observations(values, "synthetic observations", recorded=False)
 
 

@@ -12,7 +12,8 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, require, require_present
+from vlatool.errors import GraphError, SourceError, require, require_present
+from vlatool.files.typed import shown
 from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
@@ -111,7 +112,16 @@ class ExportOnnx(Transform):
         def action(values: dict[str, Any]) -> Any:
             return outputs(values, "The torch module")[spec.action.name]
 
-        return [program.run(encode(observation), finish=action) for observation in observations]
+        def run(observation: dict[str, Any]) -> Any:
+            encoded = encode(observation)
+            try:
+                return program.run(encoded, finish=action)
+            except SourceError as error:
+                texts = [f"{name} {shown(value)}" for name, value in observation.items() if isinstance(value, str)]
+                asked = f" The policy was asked with {', '.join(texts)}." if texts else ""
+                raise SourceError(error.message + asked, error.fix) from error
+
+        return [run(observation) for observation in observations]
 
     def _export(self, name: str, session: TorchSession, out: Path, beside: bool) -> Graph:
         torch = require("torch", "build")

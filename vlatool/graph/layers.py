@@ -16,6 +16,9 @@ LOWEST_OPSET = 13
 """Per-channel scales came with opset 13."""
 SHAPES = ("Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "MaxPool")
 """Operators that only move values: what is quantized before them stays quantized."""
+SOFTMAXES = ("Softmax", "LogSoftmax")
+MASKED = (*SHAPES, "Add", "Where", "Max", "Min", "Clip", "Cast", "Identity", "Mul", "Div")
+"""Operators between the sum of scores and a mask and its softmax."""
 FOLLOWS = ("Relu", "Clip")
 """Activation functions that engines fuse into the quantization of a convolution's output."""
 
@@ -79,7 +82,8 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
         model: An ``onnx.ModelProto``.
         ops: ``MatMul``, ``Gemm``, ``Conv``: operators whose layers with constant weights are returned.
         attention: Also products of two activations.
-        elementwise: Also sums of two activations (residual connections).
+        elementwise: Also sums of two activations (residual connections); not those that a softmax reads, which add a
+            mask to scores.
 
     Raises:
         GraphError: when the opset is too old.
@@ -92,14 +96,26 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
         layer = None
         if node.op_type in ops or (node.op_type == "MatMul" and attention):
             layer = _product(node, graph, node.op_type in ops, attention)
-        elif node.op_type == "Add" and elementwise and graph.constants.keys().isdisjoint(node.input):
-            floats = all(graph.types.get(name) == FLOAT for name in node.input)
-            layer = Layer(node.name, "Add", tuple(node.input)) if floats else None
+        elif node.op_type == "Add" and elementwise and _is_residual(node, graph):
+            layer = Layer(node.name, "Add", tuple(node.input))
         if layer is not None and live.issuperset(layer.activations):
             after = graph.readers[node.output[0]]
             fused = len(after) == 1 and after[0].op_type in FOLLOWS
             layers.append(replace(layer, output=(after[0] if fused else node).output[0]))
     return layers
+
+
+def _is_residual(node: Any, graph: OnnxGraph) -> bool:
+    """Say whether a node adds two float activations and its sum is no input of a softmax, however that is moved."""
+    floats = all(graph.types.get(name) == FLOAT and name not in graph.constants for name in node.input)
+    sums, seen = [node.output[0]], set()
+    while floats and sums:
+        seen.add(value := sums.pop())
+        if any(reader.op_type in SOFTMAXES for reader in graph.readers[value]):
+            return False
+        moved = (reader for reader in graph.readers[value] if reader.op_type in MASKED)
+        sums += [name for reader in moved for name in reader.output if name not in seen]
+    return floats
 
 
 def check_weights(model: Any, layers: Iterable[Layer]) -> None:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 Run = Callable[[Mapping[str, "Tensor"], Mapping[str, "Tensor"]], dict[str, "Tensor"]]
 PATH, TURN = "path.", "turn."
 """Prefix of the names of what a loop carries, all turns of it; name of the number of a turn."""
+FITS = (
+    "correct the spec in policy.yaml if the policy never gets such an input, or forward() if it may; "
+    "docs/guides/your-own-policy.md says what forward() is given"
+)
 SAME = 1e-3
 """Relative and absolute difference that the order of additions makes."""
 
@@ -219,7 +223,7 @@ def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
         raise SourceError(
             f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
             f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
-            remedy_for(error),
+            remedy_for(error) or FITS,
         ) from error
     outputs = outputs_of(result, step)
     for name, value in zip(step.gives, outputs, strict=True):

@@ -6,7 +6,7 @@ Nothing of a sample is kept: peak memory is one session, one sample's activation
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,10 @@ Values = Mapping[str, Iterable[str]]
 class _Calibrating(Watcher):
     """Adds chosen values to their statistics."""
 
-    def __init__(self, graph: str, path: Path, scratch: Path, statistics: dict[str, Statistics]) -> None:
-        self.graph, self.statistics = graph, statistics
+    def __init__(
+        self, graph: str, path: Path, scratch: Path, statistics: dict[str, Statistics], spared: Collection[str]
+    ) -> None:
+        self.graph, self.statistics, self._spared = graph, statistics, spared
         super().__init__(path, scratch / f"{graph}.onnx", self._show)
 
     def _show(self, graph: OnnxGraph) -> None:
@@ -39,6 +41,10 @@ class _Calibrating(Watcher):
         for name, statistics in self.statistics.items():
             array = np.asarray(feeds[name] if name in feeds else values[name])
             if not np.isfinite(array).all():
+                if name in self._spared:
+                    statistics.finite = False
+                    statistics.samples += 1
+                    continue
                 bad = int(np.size(array) - np.isfinite(array).sum())
                 raise DataError(
                     f"{SAMPLE} {self.sample} makes the tensor '{name}' of the graph '{self.graph}' not "
@@ -56,6 +62,7 @@ def calibrate(
     *,
     channels: bool = False,
     numbers: Sequence[int] = (),
+    spared: Mapping[str, Collection[str]] | None = None,
 ) -> dict[str, dict[str, Statistics]]:
     """Collect statistics of activations.
 
@@ -66,6 +73,7 @@ def calibrate(
         context: For progress.
         channels: Whether the largest magnitude of each entry of the last axis is kept too.
         numbers: What messages call the observations: their places in the recording; counted from 0 when empty.
+        spared: Graph name -> values that may be NaN or infinite, which their statistics then say.
 
     Returns:
         Graph name -> value name -> statistics over all runs of the graph.
@@ -78,7 +86,10 @@ def calibrate(
     statistics = {graph: {name: Statistics(channels) for name in names} for graph, names in values.items()}
     with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
         files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in statistics}
-        watchers = {graph: _Calibrating(graph, file, Path(scratch), statistics[graph]) for graph, file in files.items()}
+        watchers = {
+            graph: _Calibrating(graph, file, Path(scratch), statistics[graph], (spared or {}).get(graph, ()))
+            for graph, file in files.items()
+        }
         run_watched(bundle, watchers, observations, context, "calibrating on", numbers)
     for graph, collected in statistics.items():
         idle = [name for name, of_value in collected.items() if not of_value.samples]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -63,9 +63,18 @@ class Calibrated(Quantization):
         return numbers, seen.watch(recording.observation(number) for number in numbers)
 
     def statistics(
-        self, bundle: Bundle, values: Values, seen: SampleSet, context: Context
+        self,
+        bundle: Bundle,
+        values: Values,
+        seen: SampleSet,
+        context: Context,
+        spared: Mapping[str, Collection[str]] | None = None,
     ) -> dict[str, dict[str, Statistics]]:
         """Run the calibration samples, and what a training kept; return graph -> value -> statistics.
+
+        Args:
+            bundle, values, context, spared: As for ``calibrate``.
+            seen: Takes the hash of each sample that goes by.
 
         Raises:
             DataError, GraphError: see ``calibrate``.
@@ -74,7 +83,8 @@ class Calibrated(Quantization):
         alone = played and calibration_recording(bundle) is None
         numbers, recorded = ([], iter(())) if alone else self.observed(bundle, seen)
         observations = itertools.chain(recorded, seen.watch(played))
-        return calibrate(bundle, values, observations, context, numbers=[*numbers, *range(len(played))])
+        numbers = [*numbers, *range(len(played))]
+        return calibrate(bundle, values, observations, context, numbers=numbers, spared=spared)
 
     def _missing(self, bundle: Bundle) -> DataError:
         plays = ", or quantize.qat, which plays episodes" if self.without and bundle.manifest.environment else ""

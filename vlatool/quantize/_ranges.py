@@ -31,6 +31,7 @@ class Statistics:
 
     Args:
         channels: Whether the largest magnitude of each entry of the last axis is kept too.
+        finite: False once a value was NaN or infinite where that is allowed: then there is no range.
     """
 
     channels: bool = False
@@ -41,6 +42,7 @@ class Statistics:
     zeros: int = 0
     counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, np.int64))
     peaks: Array | None = None
+    finite: bool = True
 
     def add(self, values: Array) -> None:
         """Take in one tensor of any shape, finite float."""

@@ -164,7 +164,8 @@ class StaticInt8(Calibrated):
         self.check(bundle, None)
         layers, values = self.plan(bundle)
         samples = SampleSet()
-        statistics = self.statistics(bundle, values, samples, context)
+        statistics = self.statistics(bundle, values, samples, context, _of_sums_alone(layers))
+        layers = {name: _with_ranges(chosen, statistics[name]) for name, chosen in layers.items()}
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
@@ -222,6 +223,22 @@ class StaticInt8(Calibrated):
         names = {layer.name for layer in layers}
         again = find_layers(model, QUANTIZED_OPS, attention=self.attention)
         return [layer for layer in again if layer.name in names] + [layer for layer in layers if layer.kind == "Add"]
+
+
+def _of_sums_alone(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
+    """Return graph -> values that only sums of two activations read: a sum that has no range stays float32."""
+    read = {
+        name: [{value for layer in chosen if (layer.kind == "Add") is sums for value in layer.activations}
+               for sums in (True, False)]
+        for name, chosen in layers.items()
+    }  # fmt: skip
+    return {name: sums - others for name, (sums, others) in read.items()}
+
+
+def _with_ranges(layers: list[Layer], statistics: Mapping[str, Statistics]) -> list[Layer]:
+    """Return the layers whose activations were finite: a mask of -infinity makes some that are not."""
+    infinite = {name for name, seen in statistics.items() if not seen.finite}
+    return [layer for layer in layers if layer.kind != "Add" or infinite.isdisjoint(layer.activations)]
 
 
 def _other(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:

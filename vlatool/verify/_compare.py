@@ -65,7 +65,7 @@ def _observations(
     """
     keeps = policy.program.keeps
     if recording is None:
-        for number, observation in enumerate(synthetic_observations(policy.spec, count)):
+        for number, observation in enumerate(synthetic_observations(policy.bundle, count)):
             yield number, observation, not keeps or number == 0
         return
     before = None
