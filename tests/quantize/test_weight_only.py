@@ -14,6 +14,9 @@ from _llama import make, write_llama
 from safetensors.torch import load_file, save_file
 
 from vlatool.bundle.bundle import Bundle, seal
+from vlatool.bundle.manifest import FileRecord, Graph, Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.cli.inspect import describe
 from vlatool.data import synthetic_observations
 from vlatool.errors import BundleError, DataError, GraphError, OutputError, RecipeError, SourceError
@@ -203,7 +206,8 @@ def test_both_layouts_mean_the_same(float_bundle, quantized, drift, options):
 def test_a_bundle_with_external_data_is_streamed_too(float_bundle, copied, quantized, drift):
     bundle = copied(float_bundle)
     model = onnx.load(bundle.path / "graphs/main.onnx")
-    onnx.save(model, bundle.path / "graphs/main.onnx", save_as_external_data=True, location="w.data", size_threshold=0)
+    whole = bundle.path / "graphs/main.onnx"
+    onnx.save(model, whole, save_as_external_data=True, location="w.data", size_threshold=1024)
     external = seal(bundle.path, bundle.manifest)
     assert "graphs/w.data" in external.manifest.files
     made = quantized(WeightOnly(), external)
@@ -220,7 +224,7 @@ def test_every_method_gives_a_policy_near_float(llama_float, llama_int4, tmp_pat
     assert len(told["layers"]) == 15
     if method != "hqq":
         assert all(0 < layer["product_error"] < 0.15 for layer in told["layers"])
-        assert made.manifest.made_by["calibration"]["samples"] == 16
+        assert made.manifest.made_by["calibration"]["samples"] == 24
 
 
 def test_calibrated_methods_take_bundles_and_the_qdq_layout(float_bundle, quantized, drift):
@@ -230,6 +234,36 @@ def test_calibrated_methods_take_bundles_and_the_qdq_layout(float_bundle, quanti
     scaled = quantized(WeightOnly(method="awq", layout="qdq"))
     assert 0 < drift(scaled) < 0.15
     assert drift(scaled, quantized(WeightOnly(method="awq"))) < 1e-5
+
+
+def wide_policy(folder: Path) -> Bundle:
+    """One product with 207 inputs, of which a sample gives one row."""
+    (folder / "graphs").mkdir(parents=True)
+    made = onnx.parser.parse_model(
+        '<ir_version: 10, opset_import: ["" : 20]> g (float[1,207] x) => (float[1,64] y) { y = MatMul(x, w) }'
+    )
+    made.graph.node[0].name = "wide"
+    weight = np.random.default_rng(0).standard_normal((207, 64)).astype(np.float32)
+    made.graph.initializer.append(onnx.numpy_helper.from_array(weight, "w"))
+    onnx.save(made, folder / "graphs/main.onnx")
+    spec = PolicySpec((TensorSpec("x", (1, 207)),), (TensorSpec("y", (1, 64)),), 10.0)
+    step = ProgramStep("main", {"x": "x"}, {"y": "y"})
+    files = {"graphs/main.onnx": FileRecord("", 0)}
+    graphs = {"main": Graph("graphs/main.onnx", {"float32": 1.0}, 20)}
+    return seal(folder, Manifest("wide", "1", spec, graphs, (step,), files))
+
+
+def test_states_are_taken_as_many_as_were_recorded_and_too_few_are_warned_of(tmp_path):
+    bundle = wide_policy(tmp_path / "bundle")
+    values = np.random.default_rng(1).standard_normal((400, 207)).astype(np.float32)
+    values[:, ::3] = values[:, 1::3] + 0.1 * values[:, ::3]
+    for count, options, taken in ((400, {}, 400), (400, {"samples": 20}, 20), (90, {}, 90)):
+        np.savez(tmp_path / "mine.npz", x=values[:count])
+        stage = WeightOnly(method="gptq", calibration=tmp_path / "mine.npz", **options)
+        made = run_transform(stage, bundle, tmp_path / f"{count}{taken}", Context())
+        assert made.manifest.made_by["calibration"]["samples"] == taken
+        warned = [line for line in stage.lines(made) if "warning: wide has 207 inputs" in line]
+        assert [f"the samples give it {taken} rows" in line for line in warned] == ([] if taken >= 207 else [True])
 
 
 def test_without_calibration_data_the_other_methods_are_named(llama_dir, tmp_path):

@@ -16,7 +16,15 @@ from vlatool.runtime import arithmetic, load
 from vlatool.runtime.arithmetic import EXACT, SATURATING
 from vlatool.runtime.engines.ort_cpu import OrtCpuSession
 from vlatool.runtime.golden import load_golden
-from vlatool.stage.finish import ENGINE_DIFFERENCE, carry_over, finish, reseal, save_npz
+from vlatool.stage.finish import (
+    ENGINE_DIFFERENCE,
+    Difference,
+    carry_over,
+    finish,
+    read_difference,
+    reseal,
+    save_npz,
+)
 
 
 def test_equal_arrays_give_equal_bytes(tmp_path: Path):
@@ -201,6 +209,30 @@ def test_eight_observations_decide_whether_an_engine_rounds_otherwise(float_bund
     monkeypatch.setattr(OrtCpuSession, "run", run)
     (found,) = scaled(float_bundle, tmp_path, 1.1).manifest.findings
     assert found["value"] == pytest.approx(0.182, abs=0.002)
+
+
+@pytest.mark.parametrize("first", [3, 20])
+def test_an_engine_that_is_wrong_on_few_observations_is_a_finding(float_bundle, tmp_path, monkeypatch, first):
+    """The golden observations and many more are right: products that saturate are not there in each of them."""
+    real, calls = OrtCpuSession.run, itertools.count()
+
+    def run(self, feeds):
+        by = np.float32(1.3 if self.optimized and next(calls) == first else 1)
+        return {name: value * by for name, value in real(self, feeds).items()}
+
+    monkeypatch.setattr(OrtCpuSession, "run", run)
+    carry_over(float_bundle, tmp_path, ("assets", "data", "graphs"))
+    seen = observations_for(float_bundle, 24)
+    graphs = float_bundle.manifest.graphs
+    made = finish(float_bundle, tmp_path, made_by={"stage": "x"}, graphs=graphs, observations=seen, recorded=True)
+    (found,) = made.manifest.findings
+    assert (found["name"], found["value"]) == ("engine-difference", pytest.approx(0.3, abs=1e-3))
+    difference = read_difference(made)
+    assert difference == Difference(pytest.approx(0.3 / 24, abs=1e-3), pytest.approx(0.3, abs=1e-3), 24, True)
+
+
+def test_a_bundle_that_was_made_from_no_graphs_is_held_against_nothing(float_bundle):
+    assert read_difference(float_bundle) is None
 
 
 def test_where_graphs_are_near_the_source_an_engine_beyond_rounding_is_a_finding(float_bundle, wrong_engine, tmp_path):

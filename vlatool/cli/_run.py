@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import shlex
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -27,6 +28,7 @@ from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
 from vlatool.stage.controls import controls
+from vlatool.stage.finish import read_difference
 from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured, measured_with, run_transform
 
 if TYPE_CHECKING:
@@ -126,6 +128,7 @@ def transform(
         document({
             "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
             "findings": result.manifest.findings, "board": on_board.values() if on_board else None,
+            "difference": asdict(difference) if (difference := read_difference(result)) else None,
         })  # fmt: skip
         _refuse(result, baseline)
         return
@@ -139,9 +142,24 @@ def transform(
             typer.echo(f"  {name}: no matrix product or convolution")
             continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
-    for line in on_board.lines() if on_board else ():
+    for line in (*_moved(result), *(on_board.lines() if on_board else ())):
         typer.echo(f"  {line}")
     _refuse(result, baseline)
+
+
+def _moved(bundle: Bundle) -> Iterator[str]:
+    """Yield how far the action of a new bundle is from that of the float32 bundle that it was made from."""
+    if (difference := read_difference(bundle)) is None:
+        return
+    observations = f"{difference.samples} {'recorded' if difference.recorded else 'random'} observations"
+    action = bundle.manifest.spec.action
+    if action.kind == "discrete":
+        yield f"{action.name}: another one than that of float32 in {difference.mean:.1%} of {observations}"
+        return
+    yield (
+        f"{action.name}: error against float32 {difference.mean:.2%} on average, {difference.worst:.2%} at worst "
+        f"({observations})"
+    )
 
 
 def following(stage: Transform, board: Profile | None) -> list[Transform]:

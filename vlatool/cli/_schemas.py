@@ -127,6 +127,9 @@ def _documents() -> dict[str, Schema]:
                 predictions=by_name(record(value=NUMBER, low=NUMBER, high=NUMBER, unit=TEXT, note=TEXT)),
                 actions={"anyOf": [record(name=TEXT, value=NUMBER), {"type": "null"}]},
             ), {"type": "null"}]},
+            difference={"anyOf": [
+                record(mean=NUMBER, worst=NUMBER, samples=INTEGER, recorded=FLAG), {"type": "null"},
+            ]},
         ),
         "manifest": {
             "type": "object", "description": "manifest.json of the bundle, byte by byte, when there is no error.",

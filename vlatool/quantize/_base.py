@@ -18,7 +18,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.unexported import no_graph
-from vlatool.data import observations_for
+from vlatool.data import calibration_recording, observations_for
 from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
@@ -27,7 +27,7 @@ from vlatool.graph.precision import FLOATS, precision_shares
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
-from vlatool.stage.finish import TRIALS, carry_over, finish, history
+from vlatool.stage.finish import HELD, carry_over, finish, history
 from vlatool.stage.products import products_apart
 
 if TYPE_CHECKING:
@@ -122,15 +122,27 @@ class Quantization(Transform):
         observations = self.golden(bundle)
         changes = {"program": program, "engine": engine or bundle.manifest.engine}
         made_by = made_by or self.made_by()
-        return finish(bundle, out, made_by=made_by, graphs=graphs, observations=observations, changes=changes)
+        return finish(
+            bundle, out, made_by=made_by, graphs=graphs, observations=observations, changes=changes,
+            recorded=self.is_recorded(bundle),
+        )  # fmt: skip
+
+    @property
+    def recording(self) -> Path | None:
+        """The recording that golden observations come from; the bundle's own when None."""
+        return getattr(self, "calibration", None)
 
     def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return observations, the first of which become golden; all are looked at where the engine differs.
+        """Return observations, the first of which become golden; on all of them the new bundle is held against it.
 
         They are those that the stage was given, where it takes any: drawn ones, of which ids are zero, do not show all
         that engines do wrong.
         """
-        return observations_for(bundle, TRIALS, getattr(self, "calibration", None))
+        return observations_for(bundle, HELD, self.recording)
+
+    def is_recorded(self, bundle: Bundle) -> bool:
+        """Say whether golden observations were recorded, not drawn."""
+        return calibration_recording(bundle, self.recording) is not None
 
     def chosen_graphs(self, bundle: Bundle) -> list[str]:
         """Return the names of the graphs that are quantized."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,8 @@ from vlatool.runtime.program import draw
 from vlatool.stage.base import SampleSet
 
 Array = NDArray[Any]
+FEW, MOST = 4096, 1024
+"""Numbers of an observation up to which it is a state, and how many samples are taken of such ones."""
 SLACK = 2.0
 """How much more of a weight's norm a method may lose that spares the product instead."""
 
@@ -37,9 +40,8 @@ def calibrated_records(
     plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, seen: SampleSet
 ) -> list[Record]:
     """Return all records; those of quantized weights drive the policy from layer to layer and must run in order."""
-    observations = [
-        dict(observation) for observation in seen.watch(recorded_observations(bundle, stage.samples, stage.calibration))
-    ]
+    recorded = recorded_observations(bundle, _count(bundle, stage), stage.calibration)
+    observations = [dict(observation) for observation in seen.watch(recorded)]
     walk = _Walk(plan, bundle, stage, place, observations)
     records: list[Record] = []
     for number, task in enumerate(plan.tasks):
@@ -48,6 +50,19 @@ def calibrated_records(
             continue
         records.append(Record(task.label, padded(task.size), partial(walk.fill, number), task.source.count, False))
     return records
+
+
+def _count(bundle: Bundle, stage: WeightOptions) -> int:
+    """Return how many samples to take, unless that was said: more where each has one row for a layer, and costs little.
+
+    An image or a text has a row for each patch or token; a state has one, and a layer as wide as it needs as many
+    samples as it has inputs.
+    """
+    inputs = bundle.manifest.spec.inputs
+    numbers = all(tensor.kind != "text" and tensor.dtype.startswith("float") for tensor in inputs)
+    sizes = [math.prod(axis for axis in tensor.shape if isinstance(axis, int)) for tensor in inputs]
+    few = numbers and sum(sizes) <= FEW
+    return MOST if few and "samples" not in stage.model_fields_set else stage.samples
 
 
 class _Walk:
@@ -165,4 +180,5 @@ def _note(task: Task, weight: Array, rounded: Rounded, rows: Array, tolerance: f
     products = rows @ weight.T
     of_product = np.linalg.norm(rows @ difference.T) / (np.linalg.norm(products) or 1.0)
     note = figures(task, lost, norm, tolerance)
-    return {**note, "product_error": float(of_product), "sha256": ""}
+    seen = {"rows": len(rows), "inputs": weight.shape[1]}
+    return {**note, "product_error": float(of_product), **seen, "sha256": ""}

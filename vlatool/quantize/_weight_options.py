@@ -23,7 +23,9 @@ class WeightOptions(Quantization):
     accuracy_level: int = Field(4, ge=0, le=4, description="MatMulNBits: 4 lets activations be rounded to int8, 1 not")
     embeddings: Literal["float16", "float32"] = Field("float16", description="how tables that are looked up are kept")
     calibration: Path | None = Field(None, description="recorded observations for gptq and awq")
-    samples: int = Field(16, ge=1, description="calibration samples for gptq and awq")
+    samples: int = Field(
+        64, ge=1, description="calibration samples for gptq and awq, spread over the recording; up to 1024 of states"
+    )
     verify: Literal["auto", "layers", "run"] = Field(
         "auto", description="compare each layer's weights, or also run the new bundle; auto runs below 1 GiB"
     )

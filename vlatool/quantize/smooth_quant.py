@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for
 from vlatool.errors import GraphError
 from vlatool.graph.files import foreign_errors, load, save
 from vlatool.graph.nodes import reads
@@ -25,7 +24,6 @@ from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smoot
 from vlatool.runtime.golden import load_golden
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
-from vlatool.stage.finish import TRIALS
 
 Array = NDArray[Any]
 
@@ -99,9 +97,9 @@ class SmoothQuant(Calibrated):
         _check_same(bundle, smoothed)
         return smoothed
 
-    def golden(self, bundle: Bundle) -> list[dict[str, Any]]:
-        """Return those of the bundle that is smoothed, whose golden action must stay."""
-        return observations_for(bundle, TRIALS)
+    @property
+    def recording(self) -> None:
+        """That of the bundle which is smoothed: its golden action must stay."""
 
     def lines(self, made: Bundle) -> tuple[str, ...]:
         """Return what a person wants to know about the new bundle."""

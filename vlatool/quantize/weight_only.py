@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -128,7 +130,10 @@ class WeightOnly(WeightOptions):
         }
         if self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW):
             context.tell("running the quantized graphs", None)
-            return finish(bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle))
+            return finish(
+                bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle),
+                recorded=self.is_recorded(bundle),
+            )  # fmt: skip
         return _sealed(bundle, out, written, made_by, graphs)
 
     def work(self, source: Bundle) -> Path:
@@ -145,7 +150,20 @@ class WeightOnly(WeightOptions):
         return (
             f"{len(report['layers'])} weights in int{self.bits}, blocks of {self.block}{again}; relative L2 error: "
             f"mean {report['mean']:.4f}, largest {report['max']:.4f} ({report['worst']})",
+            *self._undecided(report["layers"]),
         )
+
+    def _undecided(self, layers: list[dict[str, Any]]) -> Iterator[str]:
+        """Warn of layers with more inputs than the samples give rows: the rounding fits these, and others at random."""
+        few = [note for note in layers if note.get("rows", math.inf) < note.get("inputs", 0)]
+        if few:
+            worst = max(few, key=lambda note: note["inputs"] / note["rows"])
+            others = f" (as {len(few) - 1} others)" if few[1:] else ""
+            yield (
+                f"warning: {worst['layer']} has {worst['inputs']} inputs, the samples give it {worst['rows']} rows: "
+                f"too few to decide how {self.method} rounds it{others}; record more and raise --samples, or use "
+                "--method rtn"
+            )
 
     def _records(self, plan: WeightsPlan, bundle: Bundle, place: Path, samples: SampleSet | None) -> list[Record]:
         if samples is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlatool.bundle.bundle import Bundle, restate, seal
+from vlatool.bundle.bundle import REPORTS, Bundle, restate, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
 from vlatool.machine.risky import risky
@@ -33,12 +34,16 @@ right engines and processors it was seen to be at most 0.035, on wrong ones at l
 saturate from 0.045 on."""
 FARTHER = 1.2
 """How many times as far from the source as the graphs an engine may be that rounds differently, as root mean square of
-``TRIALS`` observations: it draws an error of the same size again. A loop over int8 layers carries a rounding that falls
+``HELD`` observations: it draws an error of the same size again. A loop over int8 layers carries a rounding that falls
 the other way into all that follow: in ten steps of a denoising UNet the engine was as far from the graphs (up to 0.09)
 as either was from float32. Of its observations 99 in 100 choices of 8 give at most 1.18; a fault of the engine's own
 beside the rounding, at least as large as it, gives 1.41."""
-TRIALS = 8
-"""Observations on which that is asked, and how many a stage should give ``finish``."""
+HELD = 32
+"""Observations on which a new bundle is held against the one that it was made from, and how many a stage should give
+``finish``: what an engine does wrong, products that saturate for instance, may show in one of ten."""
+FEWEST = 8
+"""How many times observations are looked at where fewer are given, each with other noise."""
+DIFFERENCE = f"{REPORTS}/difference.json"
 REDRAWN = 1.5
 """How many times that difference is allowed on other machines, where it is drawn again: of 18 observations, the largest
 was up to 1.44 times what two of them showed, but for one choice of two in twenty."""
@@ -77,6 +82,22 @@ class Golden:
     of_chunk: float
 
 
+@dataclass(frozen=True)
+class Difference:
+    """How far the actions that an engine gives are from those of the graphs that a bundle was made from.
+
+    Args:
+        mean, worst: Of the relative L2 differences of an output; the share of actions that are others, if discrete.
+        samples: Observations.
+        recorded: Whether they were recorded.
+    """
+
+    mean: float
+    worst: float
+    samples: int
+    recorded: bool
+
+
 def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> None:
     """Copy the folders that a derived bundle keeps; large files are shared among the stages of a cache."""
     known = source.manifest.files
@@ -97,6 +118,7 @@ def finish(
     graphs: Mapping[str, Graph],
     observations: list[dict[str, Any]],
     changes: Mapping[str, Any] | None = None,
+    recorded: bool = False,
 ) -> Bundle:
     """Write golden file and manifest of a bundle whose graphs and carried folders are in ``out`` already.
 
@@ -104,8 +126,10 @@ def finish(
         source: What the bundle was made from.
         made_by: Stage, options and versions.
         graphs: Graph name -> graph.
-        observations: Raw observations; the first two become golden. ``TRIALS`` are looked at where the engine differs.
+        observations: Raw observations; the first two become golden. On ``HELD`` of them the bundle is held against the
+            source, where that has graphs.
         changes: Other fields of the manifest that the stage changes, such as program and engine.
+        recorded: Whether the observations were recorded.
 
     Raises:
         GraphError: when the engine refuses a graph or gives an action that is not finite.
@@ -118,9 +142,11 @@ def finish(
     golden = write_golden(draft, observations, out)
     build = (*history(source), _step(source, draft.manifest))
     bundle = seal(out, replace(draft.manifest, golden=GOLDEN, build=build))
-    limit = _limit(source, bundle, golden)
-    redrawn = golden.difference > limit and _rounds_differently(source, bundle, observations)
-    new = [] if golden.difference <= limit or redrawn else [_engine_difference(bundle, golden.difference, limit)]
+    held = _Held(source, bundle, observations) if source.manifest.graphs else None
+    if held is not None:
+        held.write(out / DIFFERENCE, recorded)
+    difference, limit, redrawn = _judged(bundle, golden, held)
+    new = [] if difference <= limit or redrawn else [_engine_difference(bundle, difference, limit)]
     if is_int8(bundle.manifest) and reference().arithmetic() == SATURATING:
         new.append(_inexact_reference(bundle))
     kept = [finding for finding in source.manifest.findings if finding["name"] not in (ENGINE_DIFFERENCE, INEXACT)]
@@ -143,32 +169,60 @@ def _tolerance(seen: float, bundle: Bundle, redrawn: bool) -> float:
     return math.ceil(tolerance * 1000) / 1000 if math.isfinite(tolerance) else 1.0
 
 
-def _limit(source: Bundle, bundle: Bundle, golden: Golden) -> float:
-    """Return how far the engine may be from what the graphs say: as far as the graphs are from those of the source.
+class _Held:
+    """What the engine of a bundle gives for observations, beside what the graphs say that it was made from.
 
-    What is computed in bfloat16 differs by what bfloat16 costs, which is judged as accuracy.
+    Args:
+        source, bundle: Both with graphs.
+        observations: Raw ones, at least one.
+    """
+
+    def __init__(self, source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> None:
+        count = max(FEWEST, min(HELD, len(observations)))
+        self._bundle, self._name = bundle, bundle.manifest.spec.action.name
+        self._samples = _samples(bundle.manifest, observations, count)
+        self._before = _outputs(reference_policy(source), self._samples)
+        policy = Policy.open(bundle, threads=1, seed=SEED)
+        self._own = _outputs(policy, self._samples, engine_class(policy.engine))
+        self.errors = _differences(self._own, self._before, self._name)
+
+    def against_graphs(self) -> tuple[list[float], list[float]]:
+        """Return how far the engine is from what the bundle's graphs say, and how far these are from the source's."""
+        graphs = _outputs(reference_policy(self._bundle), self._samples)
+        return _differences(self._own, graphs, self._name), _differences(graphs, self._before, self._name)
+
+    def write(self, path: Path, recorded: bool) -> None:
+        """Write a ``Difference`` as JSON."""
+        discrete = self._bundle.manifest.spec.action.kind == "discrete"
+        errors = [float(error > 0) if discrete else error for error in self.errors]
+        worst = _worst(errors)
+        mean = float(np.mean(errors)) if math.isfinite(worst) else math.inf
+        path.parent.mkdir(exist_ok=True)
+        values = {"mean": mean, "worst": worst, "samples": len(errors), "recorded": recorded}
+        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+
+
+def read_difference(bundle: Bundle) -> Difference | None:
+    """Return what ``finish`` saw of a bundle; None where there was nothing to hold it against."""
+    path = bundle.path / DIFFERENCE
+    return Difference(**json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else None
+
+
+def _judged(bundle: Bundle, golden: Golden, held: _Held | None) -> tuple[float, float, bool]:
+    """Return how far the engine is from what the graphs say, how far it may be, and whether it only rounds otherwise.
+
+    It may be as far as the graphs are from those of the source. It rounds otherwise where it is as near to the source
+    as they are: then it computes the same policy, and no other one. What is computed in bfloat16 differs by what
+    bfloat16 costs, which is judged as accuracy.
     """
     if any(graph.compute == "bfloat16" for graph in bundle.manifest.graphs.values()):
-        return math.inf
-    if golden.difference <= ROUNDING or not source.manifest.graphs:
-        return ROUNDING
-    before = _outputs(reference_policy(source), golden.samples)
-    return max(ROUNDING, _worst(_differences(golden.expected, before, bundle.manifest.spec.action.name)))
-
-
-def _rounds_differently(source: Bundle, bundle: Bundle, observations: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether an engine that is far from the graphs is as near to their source as they are.
-
-    Then it computes the same policy with other roundings, and no other one.
-    """
-    if not source.manifest.graphs:
-        return False
-    samples = _samples(bundle.manifest, observations, TRIALS)
-    before = _outputs(reference_policy(source), samples)
-    name = bundle.manifest.spec.action.name
-    graphs = _differences(_outputs(reference_policy(bundle), samples), before, name)
-    engine = _differences(_outputs(Policy.open(bundle, threads=1, seed=SEED), samples), before, name)
-    return float(np.linalg.norm(engine)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
+        return golden.difference, math.inf, False
+    if held is None or max(golden.difference, _worst(held.errors)) <= ROUNDING:
+        return golden.difference, ROUNDING, False
+    engine, graphs = held.against_graphs()
+    difference, limit = max(golden.difference, _worst(engine)), max(ROUNDING, _worst(graphs))
+    near = float(np.linalg.norm(held.errors)) <= FARTHER * float(np.linalg.norm(graphs)) < math.inf
+    return difference, limit, difference > limit and near
 
 
 def _samples(
