@@ -315,8 +315,47 @@ def test_a_factory_that_lacks_a_graph_of_the_program(source, tmp_path: Path):
 
 
 def test_options_outside_the_range_are_refused():
-    with pytest.raises(RecipeError, match=r"opset = 12.*tolerance = 0"):
-        build_stage("export.onnx", {"opset": 12, "tolerance": 0})
+    with pytest.raises(RecipeError, match=r"opset = 6.*tolerance = 0"):
+        build_stage("export.onnx", {"opset": 6, "tolerance": 0})
+
+
+@pytest.mark.parametrize(
+    ("options", "said"), [({"opset": 17}, "torch exports opset 18"), ({"shape": ("x=1",)}, "ONNX file")]
+)
+def test_options_of_an_onnx_file_are_refused_for_a_torch_policy(source_bundle, options, said):
+    with pytest.raises(RecipeError, match=said) as caught:
+        ExportOnnx(**options).check(source_bundle, None)
+    assert caught.value.fix
+
+
+FLOATS = {
+    "bfloat16": "self.net(obs.bfloat16())", "float16": "self.net(obs.half())", "float64": "self.net(obs.double())",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_a_policy_in_another_float_is_exported_in_float32_and_told(tmp_path: Path, name: str):
+    (tmp_path / "policy.py").write_text(
+        "import torch\nfrom torch import nn\n\n\nclass Net(nn.Module):\n    def __init__(self):\n"
+        "        super().__init__()\n        torch.manual_seed(0)\n"
+        f"        self.net = nn.Linear(17, 6).to(torch.{name})\n\n"
+        f"    def forward(self, obs):\n        return {FLOATS[name]}{'' if name == 'bfloat16' else '.float()'}\n\n\n"
+        "def make():\n    return Net()\n"
+    )
+    (tmp_path / "policy.yaml").write_text(
+        "name: net\nsource: policy.py:make\nspec:\n  inputs: [{name: obs, shape: [1, 17]}]\n"
+        "  outputs: [{name: action, shape: [1, 6]}]\n  control_hz: 10\n"
+    )
+    folders = [tmp_path / "source", tmp_path / "out"]
+    for folder in folders:
+        folder.mkdir()
+    source = TorchModule(policy=tmp_path).run(None, folders[0], Context())
+    context = Context()
+    exported = ExportOnnx().run(source, folders[1], context)
+    assert f"layers compute in {name}; the graph is written in float32" in context.said[0]
+    graph = onnx.load(exported.path / "graphs/main.onnx").graph
+    assert {tensor.data_type for tensor in graph.initializer} == {1}
+    assert exported.manifest.graphs["main"].precision == {"float32": 1.0}
 
 
 def test_the_error_of_a_tight_tolerance_names_the_number(source_bundle, tmp_path: Path):
