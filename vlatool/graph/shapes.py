@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,31 +140,29 @@ class Tensors:
             if any(inner.op_type in operators for inner in nodes_inside(node)):
                 yield node.name or node.output[0]
 
-    def runs(self) -> list[tuple[Any, int]]:
-        """Return the nodes that run, and how often each does.
+    def runs(self, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
+        """Return the nodes that run, and how often each does; 0: nobody knows how often.
 
-        Of the branches of an If it is the one with the most multiply-accumulates. 0: nobody knows how often.
+        Of the branches of an If it is the one with the most multiply-accumulates.
+
+        Args:
+            macs: Returns those of a node.
         """
-        return self._runs(self.items, 1)
+        return self._runs(self.items, 1, macs)
 
-    def _runs(self, items: Sequence[Any], times: int) -> list[tuple[Any, int]]:
+    def _runs(self, items: Sequence[Any], times: int, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
         found: list[tuple[Any, int]] = []
         for item in items:
             if isinstance(item, Branches):
-                bodies = [self._runs(body, times) for body in item.bodies]
-                found += max(bodies, key=self._cost)
+                bodies = [self._runs(body, times, macs) for body in item.bodies]
+                costs = [sum(macs(node) * max(1, count) for node, count in body) for body in bodies]
+                found += bodies[costs.index(max(costs))]
             elif isinstance(item, Turns):
-                found += [] if item.count == 0 else self._runs(item.body, times * self._turns(item))
+                found += [] if item.count == 0 else self._runs(item.body, times * self._turns(item), macs)
             else:
                 seen = self._seen.get(item.name)
                 found.append((item, times or (seen.times if seen else 0)))
         return found
-
-    def _cost(self, runs: Iterable[tuple[Any, int]]) -> int:
-        from vlatool.graph.macs import COMPUTE, node_macs
-
-        layers = [(node, times) for node, times in runs if node.op_type in COMPUTE]
-        return sum((node_macs(node, self) or 0) * max(1, times) for node, times in layers)
 
     def _turns(self, item: Turns) -> int:
         if item.count is not None:

@@ -163,7 +163,7 @@ def _count(
     tally = Tally()
     activation_bytes = 0
     unknown = [*tensors.hidden(COMPUTE)]
-    for node, times in tensors.runs():
+    for node, times in tensors.runs(lambda node: (node.op_type in COMPUTE and node_macs(node, tensors)) or 0):
         tally.concat(node.op_type == "Concat")
         if node.op_type not in COMPUTE:
             continue
