@@ -12,6 +12,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.measurement.jobs import LatencyJob
 from vlatool.measurement.worker import measure, opened
 from vlatool.module.torch_policy import load_modules, torch_policy
+from vlatool.quantize.qat import Qat
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
@@ -326,6 +327,37 @@ def test_options_of_an_onnx_file_are_refused_for_a_torch_policy(source_bundle, o
     with pytest.raises(RecipeError, match=said) as caught:
         ExportOnnx(**options).check(source_bundle, None)
     assert caught.value.fix
+
+
+def test_a_scalar_of_a_torch_policy_is_an_input_like_others(tmp_path: Path):
+    (tmp_path / "policy.py").write_text(
+        "import torch\nfrom torch import nn\n\n\nclass Net(nn.Module):\n    def __init__(self):\n"
+        "        super().__init__()\n        self.net = nn.Linear(16, 6)\n\n"
+        "    def forward(self, state, rate):\n        return self.net(state * rate), 2 * rate\n\n\n"
+        "def make():\n    return Net()\n"
+    )
+    (tmp_path / "policy.yaml").write_text(
+        "name: net\nsource: policy.py:make\ncalibration: c.npz\nspec:\n"
+        "  inputs: [{name: state, shape: [1, 16]}, {name: rate, shape: []}]\n"
+        "  outputs: [{name: action, shape: [1, 6]}, {name: twice, shape: []}]\n  control_hz: 10\n"
+    )
+    random = np.random.default_rng(0)
+    recorded = {
+        "state": random.normal(size=(64, 16)).astype(np.float32),
+        "rate": np.linspace(1, 2, 64, dtype=np.float32),
+    }
+    np.savez(tmp_path / "c.npz", **recorded)
+    bundles = {}
+    for name, stage in (("s", TorchModule(policy=tmp_path)), ("e", ExportOnnx()), ("q", StaticInt8())):
+        (tmp_path / name).mkdir()
+        bundles[name] = stage.run(next(reversed(bundles.values()), None), tmp_path / name, Context())
+    wide, narrow = (load(bundles[name].path, threads=1) for name in "eq")
+    for rate in (1.25, np.float32(1.5), np.array([1.75])):
+        observation = {"state": recorded["state"][0], "rate": rate}
+        assert wide.infer(observation).outputs["twice"] == 2 * np.float32(np.squeeze(rate))
+        assert relative_error(narrow.infer(observation).chunk, wide.infer(observation).chunk) < 0.1
+    with pytest.raises(RecipeError, match="'rate' has no axes"):
+        Qat().check(bundles["s"], None)
 
 
 FLOATS = {

@@ -140,7 +140,8 @@ class ExportOnnx(Transform):
         torch = require("torch", "build")
         for module in ("onnxscript", "onnx"):
             require(module, "build")
-        arguments = tuple(torch.from_numpy(np.ascontiguousarray(feed)) for feed in (session.first_feeds or {}).values())
+        feeds = [np.asarray(feed, order="C") for feed in (session.first_feeds or {}).values()]
+        arguments = tuple(map(torch.from_numpy, feeds))
         exported = exported_by_torch(session.module, arguments, session.step, self.opset)
         file = f"graphs/{name}.onnx"
         (out / "graphs").mkdir(exist_ok=True)
