@@ -12,6 +12,7 @@ from vlatool.export.onnx import ExportOnnx
 from vlatool.measurement.jobs import LatencyJob
 from vlatool.measurement.worker import measure, opened
 from vlatool.module.torch_policy import load_modules, torch_policy
+from vlatool.quantize.qat import Qat
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
@@ -316,8 +317,78 @@ def test_a_factory_that_lacks_a_graph_of_the_program(source, tmp_path: Path):
 
 
 def test_options_outside_the_range_are_refused():
-    with pytest.raises(RecipeError, match=r"opset = 12.*tolerance = 0"):
-        build_stage("export.onnx", {"opset": 12, "tolerance": 0})
+    with pytest.raises(RecipeError, match=r"opset = 6.*tolerance = 0"):
+        build_stage("export.onnx", {"opset": 6, "tolerance": 0})
+
+
+@pytest.mark.parametrize(
+    ("options", "said"), [({"opset": 17}, "torch exports opset 18"), ({"shape": ("x=1",)}, "ONNX file")]
+)
+def test_options_of_an_onnx_file_are_refused_for_a_torch_policy(source_bundle, options, said):
+    with pytest.raises(RecipeError, match=said) as caught:
+        ExportOnnx(**options).check(source_bundle, None)
+    assert caught.value.fix
+
+
+def test_a_scalar_of_a_torch_policy_is_an_input_like_others(tmp_path: Path):
+    (tmp_path / "policy.py").write_text(
+        "import torch\nfrom torch import nn\n\n\nclass Net(nn.Module):\n    def __init__(self):\n"
+        "        super().__init__()\n        self.net = nn.Linear(16, 6)\n\n"
+        "    def forward(self, state, rate):\n        return self.net(state * rate), 2 * rate\n\n\n"
+        "def make():\n    return Net()\n"
+    )
+    (tmp_path / "policy.yaml").write_text(
+        "name: net\nsource: policy.py:make\ncalibration: c.npz\nspec:\n"
+        "  inputs: [{name: state, shape: [1, 16]}, {name: rate, shape: []}]\n"
+        "  outputs: [{name: action, shape: [1, 6]}, {name: twice, shape: []}]\n  control_hz: 10\n"
+    )
+    random = np.random.default_rng(0)
+    recorded = {
+        "state": random.normal(size=(64, 16)).astype(np.float32),
+        "rate": np.linspace(1, 2, 64, dtype=np.float32),
+    }
+    np.savez(tmp_path / "c.npz", **recorded)
+    bundles = {}
+    for name, stage in (("s", TorchModule(policy=tmp_path)), ("e", ExportOnnx()), ("q", StaticInt8())):
+        (tmp_path / name).mkdir()
+        bundles[name] = stage.run(next(reversed(bundles.values()), None), tmp_path / name, Context())
+    wide, narrow = (load(bundles[name].path, threads=1) for name in "eq")
+    for rate in (1.25, np.float32(1.5), np.array([1.75])):
+        observation = {"state": recorded["state"][0], "rate": rate}
+        assert wide.infer(observation).outputs["twice"] == 2 * np.float32(np.squeeze(rate))
+        assert relative_error(narrow.infer(observation).chunk, wide.infer(observation).chunk) < 0.1
+    with pytest.raises(RecipeError, match="'rate' has no axes"):
+        Qat().check(bundles["s"], None)
+
+
+FLOATS = {
+    "bfloat16": "self.net(obs.bfloat16())", "float16": "self.net(obs.half())", "float64": "self.net(obs.double())",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_a_policy_in_another_float_is_exported_in_float32_and_told(tmp_path: Path, name: str):
+    (tmp_path / "policy.py").write_text(
+        "import torch\nfrom torch import nn\n\n\nclass Net(nn.Module):\n    def __init__(self):\n"
+        "        super().__init__()\n        torch.manual_seed(0)\n"
+        f"        self.net = nn.Linear(17, 6).to(torch.{name})\n\n"
+        f"    def forward(self, obs):\n        return {FLOATS[name]}{'' if name == 'bfloat16' else '.float()'}\n\n\n"
+        "def make():\n    return Net()\n"
+    )
+    (tmp_path / "policy.yaml").write_text(
+        "name: net\nsource: policy.py:make\nspec:\n  inputs: [{name: obs, shape: [1, 17]}]\n"
+        "  outputs: [{name: action, shape: [1, 6]}]\n  control_hz: 10\n"
+    )
+    folders = [tmp_path / "source", tmp_path / "out"]
+    for folder in folders:
+        folder.mkdir()
+    source = TorchModule(policy=tmp_path).run(None, folders[0], Context())
+    context = Context()
+    exported = ExportOnnx().run(source, folders[1], context)
+    assert f"layers compute in {name}; the graph is written in float32" in context.said[0]
+    graph = onnx.load(exported.path / "graphs/main.onnx").graph
+    assert {tensor.data_type for tensor in graph.initializer} == {1}
+    assert exported.manifest.graphs["main"].precision == {"float32": 1.0}
 
 
 def test_the_error_of_a_tight_tolerance_names_the_number(source_bundle, tmp_path: Path):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,10 +38,13 @@ def save(
     kind: int = FLOAT,
     opset: int = 21,
     functions: list[onnx.FunctionProto] | None = None,
+    note: str = "",
 ) -> Path:
     graph = helper.make_graph(nodes, "g", [value("x", shape, kind)], [value("y", None, kind)], weights)
     imports = [helper.make_opsetid("", opset), helper.make_opsetid("com.microsoft", 1), helper.make_opsetid("own", 1)]
     model = helper.make_model(graph, opset_imports=imports, functions=functions or [])
+    if note:
+        model.metadata_props.add(key="vlatool.seen", value=note)
     path.write_bytes(model.SerializeToString())
     return path
 
@@ -264,13 +268,77 @@ def test_shapes_follow_data(count: Build) -> None:
     assert count(nodes, ["b", 3, 4], [weight("w", (12, 2)), rest]).macs == {"float32": 24}
 
 
-def test_branches_are_not_left_out_silently(count: Build) -> None:
-    inner = helper.make_graph([helper.make_node("MatMul", ["x", "w"], ["o"])], "then", [], [value("o", [2, 2])])
-    nodes = [
-        helper.make_node("Constant", [], ["c"], value=helper.make_tensor("c", TensorProto.BOOL, [], [True])),
-        helper.make_node("If", ["c"], ["y"], name="choose", then_branch=inner, else_branch=inner),
+def chosen(first: int, second: int) -> list[Any]:
+    """An If with a product of so many columns in one branch and in the other, under the same names."""
+    bodies = [
+        helper.make_graph([helper.make_node("MatMul", ["x", f"w{n}"], ["o"], "p")], "b", [], [value("o", [2, n])])
+        for n in (first, second)
     ]
-    assert count(nodes, [2, 2], [weight("w", (2, 2))]).unknown == ("choose",)
+    return [
+        helper.make_node("ReduceMax", ["x"], ["m"], keepdims=0),
+        helper.make_node("Cast", ["m"], ["c"], to=TensorProto.BOOL),
+        helper.make_node("If", ["c"], ["y"], name="choose", then_branch=bodies[0], else_branch=bodies[1]),
+    ]
+
+
+@pytest.mark.parametrize("columns", [(3, 5), (5, 3)])
+def test_of_two_branches_the_dearer_one_counts(count: Build, columns: tuple[int, int]) -> None:
+    found = count(chosen(*columns), [2, 2], [weight("w3", (2, 3)), weight("w5", (2, 5))])
+    assert (found.macs, found.layers, found.unknown) == ({"float32": 20}, 1, ())
+    assert (found.weights, found.activations) == (10, 10)
+
+
+def looped(trips: str) -> list[Any]:
+    body = helper.make_graph(
+        [
+            helper.make_node("MatMul", ["s", "w"], ["t"], "turn"),
+            helper.make_node("MatMul", ["t", "inside"], ["u"], "again"),
+            helper.make_node("Identity", ["go"], ["on"]),
+        ],
+        "body",
+        [value("i", [], TensorProto.INT64), value("go", [], TensorProto.BOOL), value("s", [2, 2])],
+        [value("on", [], TensorProto.BOOL), value("u", [2, 2]), value("t", [2, 2])],
+        [weight("inside", (2, 2))],
+    )
+    nodes = [helper.make_node("Loop", [trips, "", "x"], ["last", "all"], name="loop", body=body)]
+    return [*nodes, helper.make_node("MatMul", ["all", "v"], ["y"], "after")]
+
+
+@pytest.mark.parametrize("trips", [0, 1, 7])
+def test_the_turns_of_a_loop_count(count: Build, trips: int) -> None:
+    turns = numpy_helper.from_array(np.array(trips), "n")
+    found = count(looped("n"), [2, 2], [turns, weight("w", (2, 2)), weight("v", (2, 3))])
+    if trips:
+        assert (found.macs, found.unknown) == ({"float32": trips * (8 + 8) + trips * 12}, ())
+        assert (found.layers, found.weights, found.read_again) == (2 * trips + 1, 14, 8 * (trips - 1))
+    else:
+        assert found.unknown == ("after",), "what it stacks has no length"
+
+
+def test_a_loop_that_ends_nobody_knows_when_has_layers_that_are_named(count: Build) -> None:
+    found = count(looped(""), [2, 2], [weight("w", (2, 2)), weight("v", (2, 3))])
+    assert set(found.unknown) == {"turn", "again", "after"}
+
+
+def test_a_run_that_was_noted_counts_what_no_shape_says(count: Build) -> None:
+    note = {"turn": [3, [[2, 2]], [[2, 2]]], "again": [3, [[2, 2]], [[2, 2]]], "after": [1, [[3, 2, 2]], [[3, 2, 3]]]}
+    found = count(looped(""), [2, 2], [weight("w", (2, 2)), weight("v", (2, 3))], note=json.dumps(note))
+    assert (found.macs, found.unknown) == ({"float32": 3 * 16 + 36}, ())
+    spoiled = count(looped(""), [2, 2], [weight("w", (2, 2)), weight("v", (2, 3))], note='{"turn": 3}')
+    assert spoiled.unknown
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_scan_counts_once_for_each_entry_of_what_it_reads(count: Build, axis: int) -> None:
+    body = helper.make_graph(
+        [helper.make_node("MatMul", ["row", "w"], ["out"], "each")],
+        "body",
+        [value("row", [2, 2])],
+        [value("out", [2, 3])],
+    )
+    scan = helper.make_node("Scan", ["x"], ["y"], body=body, num_scan_inputs=1, scan_input_axes=[axis])
+    shape = [4, 2, 2] if axis == 0 else [2, 4, 2]
+    assert count([scan], shape, [weight("w", (2, 3))]).macs == {"float32": 4 * 12}
 
 
 def test_functions_are_looked_into(count: Build) -> None:

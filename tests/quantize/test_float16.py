@@ -1,5 +1,6 @@
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -14,6 +15,7 @@ from vlatool.graph.files import load, save
 from vlatool.quantize._float16_graph import around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize.float16 import Float16
+from vlatool.sources.onnx import OnnxFile
 from vlatool.stage.base import Context
 
 HALF, FLOAT = TensorProto.FLOAT16, TensorProto.FLOAT
@@ -229,3 +231,89 @@ def test_a_sample_that_does_not_fit_is_named(float_bundle):
 def test_the_calibration_file_is_an_input(tmp_path: Path):
     assert Float16().inputs() == ()
     assert Float16(calibration=tmp_path / "c.npz").inputs() == (tmp_path / "c.npz",)
+
+
+def vector(*numbers: float) -> np.ndarray:
+    return np.array(numbers, np.float32)
+
+
+EYE = np.eye(4, dtype=np.float32)
+TURNED = np.random.default_rng(0).normal(size=(4, 4)).astype(np.float32)
+SMALL = {
+    "weights": ([node("MatMul", "x w", "t"), node("Mul", "t s", "y")], {"w": TURNED * 1e-9, "s": vector(1e9)}),
+    "scales": ([node("Mul", "x w", "t"), node("Mul", "t s", "y")], {"w": vector(1e-6), "s": vector(1e4)}),
+    "both products": ([node("MatMul", "x w", "t"), node("MatMul", "t v", "y")], {"w": TURNED * 1e-7, "v": EYE * 6e4}),
+    "addend": ([node("Mul", "x w", "t"), node("Add", "t b", "u"), node("Mul", "u s", "y")],
+               {"w": vector(1e-8), "b": vector(1e-8, 2e-8, 3e-8, 4e-8), "s": vector(1e8)}),
+    "one channel": ([node("Mul", "x w", "t"), node("Mul", "t s", "y")],
+                    {"w": vector(1, 1e-9, 1, 1), "s": vector(1, 1e9, 1, 1)}),
+    "division": ([node("Abs", "x", "a"), node("Mul", "a w", "t"), node("Div", "t d", "y")],
+                 {"w": vector(1e-9), "d": vector(1e-9)}),
+}  # fmt: skip
+"""Graphs that compute ordinary numbers through small ones."""
+
+
+def halved(folder: Path, nodes: list, constants: dict[str, np.ndarray], **options) -> tuple[Bundle, Bundle]:
+    onnx.save(model_of(nodes, constants), folder / "a.onnx")
+    for name in ("float", "half"):
+        (folder / name).mkdir()
+    bundle = OnnxFile(model=folder / "a.onnx").run(None, folder / "float", Context())
+    return bundle, Float16(**options).run(bundle, folder / "half", Context())
+
+
+def drifted(bundle: Bundle, half: Bundle) -> float:
+    wide, narrow = (onnx.load(each.path / "graphs/main.onnx") for each in (bundle, half))
+    random = np.random.default_rng(1)
+    pairs = []
+    for _ in range(24):
+        feeds = {"x": random.normal(size=(1, 2, 4)).astype(np.float32)}
+        pairs.append([ReferenceEvaluator(model).run(None, feeds)[0] for model in (wide, narrow)])
+    return max(float(np.linalg.norm(got - wanted) / np.linalg.norm(wanted)) for wanted, got in pairs)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_small_numbers_that_matter_stay_float32(tmp_path: Path, name: str):
+    nodes, constants = SMALL[name]
+    bundle, half = halved(tmp_path, nodes, constants)
+    assert drifted(bundle, half) < 0.01
+    assert all(moved < 0.01 for moved in half.manifest.made_by["float16"]["moved"].values())
+
+
+@pytest.mark.parametrize(
+    ("constants", "named"),
+    [
+        ({"w": EYE, "b": vector(1e-9, 0, 0, 0)}, "addend"),
+        ({"w": np.where(EYE > 0, EYE, 1e-8).astype(np.float32)}, "few"),
+    ],
+)
+def test_small_numbers_that_change_nothing_do_not_keep_a_node(tmp_path: Path, constants, named):
+    nodes = [node("MatMul", "x w", "m"), node("Add", "m b", "y") if named == "addend" else node("Neg", "m", "y")]
+    _, half = halved(tmp_path, nodes, constants)
+    assert half.manifest.made_by["float16"]["kept"] == 0
+
+
+@pytest.mark.parametrize("epsilon", [1e-5, 1e-9, 1e-12])
+def test_an_epsilon_does_not_become_zero(tmp_path: Path, epsilon: float):
+    """What never changes is divided by its deviation, which is zero."""
+    nodes = [
+        node("Sub", "x x", "zero"), node("Mul", "zero zero", "v"), node("Add", "v e", "u"), node("Sqrt", "u", "r"),
+        node("Add", "zero e", "top"), node("Div", "top r", "q"), node("Add", "x q", "y"),
+    ]  # fmt: skip
+    bundle, half = halved(tmp_path, nodes, {"e": vector(epsilon)})
+    assert drifted(bundle, half) < 0.01
+    plain = [node("Mul", "x x", "v"), node("Add", "v e", "u"), node("Sqrt", "u", "r"), node("Div", "x r", "y")]
+    (tmp_path / "b").mkdir()
+    _, half = halved(tmp_path / "b", plain, {"e": vector(epsilon)})
+    stored = onnx.load(half.path / "graphs/main.onnx").graph.initializer
+    floats = [numpy_helper.to_array(tensor) for tensor in stored if tensor.data_type in (FLOAT, HALF)]
+    assert floats
+    assert all((values != 0).all() for values in floats)
+
+
+def test_what_still_moves_is_told():
+    made = SimpleNamespace(manifest=SimpleNamespace(made_by={"float16": {
+        "kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {"main": 0.3, "other": 0.001},
+    }}))  # fmt: skip
+    lines = Float16().lines(made)
+    assert any("main: what it gives moves by up to 0.3" in line for line in lines)
+    assert not any("other" in line for line in lines)

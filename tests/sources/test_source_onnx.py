@@ -1,3 +1,5 @@
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import GraphError, RecipeError, SourceError
+from vlatool.graph.layers import find_layers
 from vlatool.graph.workload import graph_workload
 from vlatool.runtime import load
 from vlatool.sources import is_bundle, source_stage
@@ -105,15 +108,34 @@ def test_a_corrupt_file(tmp_path: Path, content):
         build(tmp_path / "out", tmp_path / "a.onnx")
 
 
-def test_a_dtype_that_no_spec_has(tmp_path: Path):
-    with pytest.raises(SourceError, match="'x' has the ONNX type 11; allowed: float32, uint8"):
-        build(tmp_path / "out", linear(tmp_path / "a.onnx", dtype=TensorProto.DOUBLE))
+@pytest.mark.parametrize(
+    ("dtype", "name"), [(TensorProto.STRING, "string"), (TensorProto.COMPLEX64, "complex64"), (17, "float8e4m3fn")]
+)
+def test_a_dtype_that_no_spec_has_is_refused_by_name(tmp_path: Path, dtype: int, name: str) -> None:
+    with pytest.raises(SourceError, match=f"The input 'x' has the type {name}; allowed: .*float64") as caught:
+        build(tmp_path / "out", linear(tmp_path / "a.onnx", dtype=dtype))
+    assert "where it is made" in caught.value.fix
 
 
-@pytest.mark.parametrize("shape", [(), (1, 0)])
-def test_a_shape_that_no_observation_has(tmp_path: Path, shape):
+def test_an_output_that_is_no_tensor_is_left_out_by_a_description(tmp_path: Path) -> None:
+    path = linear(tmp_path / "a.onnx")
+    model = onnx.load(path)
+    model.graph.node.append(helper.make_node("SequenceConstruct", ["y"], ["parts"]))
+    model.graph.output.append(helper.make_tensor_sequence_value_info("parts", TensorProto.FLOAT, None))
+    onnx.save(model, path)
+    with pytest.raises(SourceError, match="The output 'parts' has the type sequence") as caught:
+        build(tmp_path / "out", path)
+    assert "zipmap" in caught.value.fix
+    (tmp_path / "policy.yaml").write_text(
+        "name: w\nspec:\n  inputs: [{name: x, shape: [1, 3]}]\n  outputs: [{name: y, shape: [1, 2]}]\n  control_hz: 9\n"
+    )
+    bundle = build(tmp_path / "other", path, policy=tmp_path)
+    np.testing.assert_allclose(load(bundle.path, threads=1).infer({"x": [1.0, 0.0, 1.0]}).chunk, [[4, 6]])
+
+
+def test_a_shape_that_no_observation_has(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="'x' has the shape"):
-        build(tmp_path / "out", linear(tmp_path / "a.onnx", shape=shape))
+        build(tmp_path / "out", linear(tmp_path / "a.onnx", shape=(1, 0)))
 
 
 def test_an_operator_that_the_engine_does_not_know(tmp_path: Path):
@@ -192,6 +214,73 @@ def shapes(bundle: Bundle) -> tuple[list[int], list[int]]:
         [axis.dim_value for axis in each.type.tensor_type.shape.dim] for each in (graph.input[0], graph.output[0])
     )
     return found, given
+
+
+FREE = [((None, "rows", 4), "rows"), ((1, -1, 4), "n1"), (("batch", None, 4), "n1"), (("b", "h w", 4), "h w")]
+
+
+@pytest.mark.parametrize(("shape", "named"), FREE)
+def test_free_axes_other_than_the_batch_are_asked_for_by_name(tmp_path: Path, shape: object, named: str) -> None:
+    path = reshaped(tmp_path / "a b.onnx", shape)
+    with pytest.raises(SourceError, match=f"'x' has the free axes {named} in its shape") as caught:
+        build(tmp_path / "out", path)
+    option = next(word for word in shlex.split(caught.value.fix) if word.startswith("x="))
+    numbers = re.sub("^x=(b|batch|n0),", "x=1,", option).replace(re.sub(r"\W", "_", named), "6")
+    bundle = build(tmp_path / "other", path, shape=(numbers,))
+    assert shapes(bundle) == ([1, 6, 4], [1, 2, 6])
+    assert bundle.manifest.made_by["options"]["shape"] == [numbers]
+    again = OnnxFile(model=path).as_recorded(dict(bundle.manifest.made_by), bundle)
+    assert again.shape == (numbers,)
+
+
+def test_an_axis_can_stay_free_by_name(tmp_path: Path) -> None:
+    bundle = build(tmp_path / "out", reshaped(tmp_path / "a.onnx"), shape=("x=1,rows,4",))
+    assert bundle.manifest.spec.inputs[0].shape == (1, "rows", 4)
+    assert load(bundle.path, threads=1).infer({"x": np.ones((3, 4), np.float32)}).outputs["y"].shape == (1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x", "is no shape"), ("x=1,,4", "is no shape"), ("x=1,0,4", "is no shape"), ("y=1,6,4", "no input.*known: x"),
+        ("x=1,6", "the file has"), ("x=1,6,5", "the file has"), ("=1,6,4", "is no shape"), ("x=1,-6,4", "is no shape"),
+    ],
+)  # fmt: skip
+def test_a_shape_that_does_not_fit_the_file(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(SourceError, match=said):
+        build(tmp_path / "out", reshaped(tmp_path / "a.onnx"), shape=(text,))
+
+
+@pytest.mark.parametrize("opset", [7, 9, 11, 12])
+def test_an_old_opset_is_raised_so_that_int8_can_be_written(tmp_path: Path, opset: int) -> None:
+    path = linear(tmp_path / "a.onnx")
+    model = onnx.load(path)
+    model.opset_import[0].version, model.ir_version = opset, 6
+    onnx.save(model, path)
+    (tmp_path / "out").mkdir()
+    context = Context()
+    bundle = OnnxFile(model=path).run(None, tmp_path / "out", context)
+    assert bundle.manifest.graphs["main"].opset == 13
+    assert context.said == [f"converted from opset {opset} to 13; the same on 32 observations"]
+    assert len(find_layers(onnx.load(bundle.path / "graphs/main.onnx"), ("MatMul",))) == 1
+
+
+def test_an_old_opset_that_onnx_cannot_raise_stays_and_is_told(tmp_path: Path) -> None:
+    path = linear(tmp_path / "a.onnx")
+    model = onnx.load(path)
+    model.graph.node[0].output[0] = "m"
+    model.graph.node.append(helper.make_node("Upsample", ["m", "s"], ["y"], mode="nearest"))
+    model.graph.initializer.append(numpy_helper.from_array(np.ones(2, np.float32), "s"))
+    model.opset_import[0].version, model.ir_version = 9, 6
+    onnx.save(model, path)
+    (tmp_path / "out").mkdir()
+    context = Context()
+    bundle = OnnxFile(model=path).run(None, tmp_path / "out", context)
+    opset = bundle.manifest.graphs["main"].opset
+    with pytest.raises(GraphError, match="opset 9; int8 needs opset 13") as caught:
+        find_layers(onnx.load(path), ("MatMul",))
+    assert "--opset" in caught.value.fix
+    assert opset == 13 or context.said[0].startswith("opset 9 stays")
 
 
 @pytest.mark.parametrize("batch", ["batch", None, -1, 0])

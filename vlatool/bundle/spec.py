@@ -11,7 +11,9 @@ from vlatool.errors import SpecError, nearest
 from vlatool.files.limits import check
 from vlatool.files.typed import known, mapping, outside, shown, text, whole
 
-DTYPES = ("float32", "float16", "int64", "int32", "uint8", "bool")
+DTYPES = (
+    "float32", "float16", "int64", "int32", "uint8", "bool", "float64", "int8", "int16", "uint16", "uint32", "uint64",
+)  # fmt: skip
 KINDS = ("tensor", "text", "discrete")
 NORMALISATIONS = ("none", "mean_std", "min_max", "quantiles")
 STATISTICS_OF = {"none": (), "mean_std": ("mean", "std"), "min_max": ("min", "max"), "quantiles": ("q01", "q99")}
@@ -29,8 +31,10 @@ class TensorSpec:
 
     Args:
         name: The key of the observation, or of the result.
-        shape: With the batch axis in front; a string names an axis whose length is free.
-        dtype: What the graph sees: float32, float16, int64, int32, uint8 or bool.
+        shape: With the batch axis in front; a string names an axis whose length is free. Empty for one number without
+            axes, which an action is not.
+        dtype: What the graph sees: float32, float16, float64, int8 to int64, uint8 to uint64 or bool; uint8 holds
+            pixels.
         kind: ``tensor``; ``text`` (the observation holds a string, the graph sees token ids); ``discrete`` (an output
             of logits over ``labels``; the action is the index of the largest).
         unit: One unit for all elements, or one for each element of the last axis (SI symbols, ``rgb``, ``1``).
@@ -195,6 +199,8 @@ class PolicySpec:
                 raise SpecError(
                     f"The name '{name}' occurs {names.count(name)} times; each input and output needs its own."
                 )
+        if not self.action.shape:
+            raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")
         if isinstance(self.control_hz, bool) or not _between(self.control_hz, 0, MOST_HZ):
             allowed = f"a rate in Hz above 0 and below {MOST_HZ:,}"
             raise SpecError(f"control_hz is {shown(self.control_hz)}; allowed: {allowed}.")

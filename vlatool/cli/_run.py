@@ -104,11 +104,11 @@ def transform(
     with progress() as context:
         if is_bundle(source):
             bundle = Bundle.open(source)
+        elif stage.kind() == "export" and source_stage(source).has_graphs:
+            # an ONNX file, whose source stage is all the export that there is
+            stage, bundle = _onnx_source(stage, source_stage(source)), None
         elif stage.takes_modules:
             bundle = sourced(source, cache_directory(), context)
-            if bundle.manifest.graphs and stage.kind() == "export":
-                # of an ONNX file, whose source stage is all the export that there is
-                stage, bundle = _onnx_source(stage, source_stage(source)), None
         else:
             bundle = streamed(stage, source, context) or exported(source, cache_directory(), context)
         context = replace(context, events=str(events.absolute()) if events else "")
@@ -169,9 +169,9 @@ def following(stage: Transform, board: Profile | None) -> list[Transform]:
 
 
 def _onnx_source(export: Transform, source: Transform) -> Transform:
-    """Return the source stage of an ONNX file, with the opset that the export was asked for."""
-    asked = "opset" in export.model_fields_set
-    return source.model_copy(update={"opset": getattr(export, "opset", None)}) if asked else source
+    """Return the source stage of an ONNX file, with the opset and the shapes that the export was asked for."""
+    asked = export.model_fields_set & {"opset", "shape"}
+    return source.model_copy(update={name: getattr(export, name) for name in asked})
 
 
 def _refuse(bundle: Bundle, baseline: str = "") -> None:

@@ -53,7 +53,7 @@ def calibration_checks(
         elif values.dtype.kind in "iuf" and np.dtype(tensor.dtype).kind == "f":
             sentences += [] if same else _of_channels(where, tensor, values)
             sentences += _of_distance(where, tensor, values, numbers, assets)
-            if values.dtype == np.float64:
+            if values.dtype == np.float64 and tensor.dtype != "float64":
                 sentences.append(f"{where} is float64; the policy takes {tensor.dtype}, so it is rounded")
     return sentences
 

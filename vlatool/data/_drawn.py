@@ -142,11 +142,12 @@ def _shape(tensor: TensorSpec, like: Any) -> tuple[int, ...]:
 def _whole_numbers(
     tensor: TensorSpec, like: Any, shape: tuple[int, ...], random: np.random.Generator, structured: Structures
 ) -> Array:
-    """Pixels over their range; other whole numbers over that of a recorded sample, else 0, which is always one."""
+    """Pixels over their range; other whole numbers over that of a recorded sample."""
     if tensor.dtype == "uint8":
         values = structured(tensor.name, shape)
         return np.clip(np.rint(127.5 + 127.5 / EXTREME * 2 * values), 0, 255).astype(np.uint8)
-    low, high = (0, 0) if like is None or not np.size(like) else (int(np.min(like)), int(np.max(like)))
+    least = 0 if tensor.shape else 1  # 0 is an id of any vocabulary; a number without axes may be divided by
+    low, high = (least, least) if like is None or not np.size(like) else (int(np.min(like)), int(np.max(like)))
     return random.integers(low, high + 1, shape).astype(tensor.dtype)
 
 

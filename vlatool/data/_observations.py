@@ -142,6 +142,6 @@ def _synthetic(tensor: TensorSpec, random: np.random.Generator, words: Mapping[s
         return random.integers(0, 256, shape, np.uint8)
     if tensor.dtype == "bool":
         return np.ones(shape, np.bool_)
-    if tensor.dtype.startswith("int"):
-        return np.zeros(shape, tensor.dtype)
-    return random.standard_normal(shape).astype(tensor.dtype)
+    if np.dtype(tensor.dtype).kind in "iu":  # 0 is an id of any vocabulary; a number without axes may be divided by
+        return np.full(shape, 0 if tensor.shape else 1, tensor.dtype)
+    return np.asarray(random.standard_normal(shape), tensor.dtype)

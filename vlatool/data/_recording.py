@@ -156,7 +156,7 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
         if values.size != _length(path, tensor.name, values):
             raise DataError(f"{where} has the shape {list(values.shape)}; a text input has one string a sample.")
         return values.reshape(-1)
-    if values.ndim == len(tensor.shape) + 1 and values.shape[1] == 1:
+    if values.ndim == max(1, len(tensor.shape)) + 1 and values.shape[1] == 1:
         values = values.without_second_axis() if isinstance(values, Rows) else values[:, 0]
     if not _fits(tensor, values):
         others = [other.name for other in spec.inputs if other.kind != "text" and _fits(other, values)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,8 +13,9 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, SourceError, require, require_present
+from vlatool.errors import GraphError, RecipeError, SourceError, require, require_present
 from vlatool.files.typed import shown
+from vlatool.graph.as_float32 import ROUNDING, float32_text, written_in_float32
 from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
@@ -36,10 +38,15 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import carry_over, finish, named
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
+
+
+LOWEST_OPSET = 18
+"""Of torch's dynamo exporter."""
 
 
 class ExportOnnx(Transform):
@@ -53,7 +60,8 @@ class ExportOnnx(Transform):
     packages: ClassVar[tuple[str, ...]] = ("torch", "onnx", "onnxscript", "onnxruntime", "numpy")
     imports: ClassVar[tuple[str, ...]] = IMPORTS
 
-    opset: int = Field(OPSET, ge=18, le=23, description="opset of the default ONNX domain")
+    opset: int = Field(OPSET, ge=7, le=23, description="opset of the default ONNX domain; of a torch policy from 18")
+    shape: tuple[str, ...] = Field((), description="lengths of an ONNX file's free axes: NAME=1,3,224,224")
     samples: int = Field(8, ge=1, le=1024, description="observations on which torch and ONNX Runtime must agree")
     tolerance: float = Field(1e-3, gt=0, description="largest relative L2 difference between torch and ONNX Runtime")
 
@@ -65,6 +73,15 @@ class ExportOnnx(Transform):
         """What exports is installed: the child process that imports it takes seconds to say so."""
         for module in ("torch", "onnxscript", "onnx"):
             require_present(module, "build")
+        if self.opset < LOWEST_OPSET:
+            raise RecipeError(
+                f"opset = {self.opset}: torch exports opset {LOWEST_OPSET} and later.", "leave --opset out"
+            )
+        if self.shape:
+            raise RecipeError(
+                "--shape gives the free axes of an ONNX file their lengths; a torch policy has none.",
+                "write the shapes into policy.yaml",
+            )
 
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Export, run, compare, and write the bundle."""
@@ -72,10 +89,19 @@ class ExportOnnx(Transform):
         check_chunk(bundle.manifest.spec)
         observations = observations_for(bundle, self.samples)
         expected, graphs = self._exported(bundle, observations, out, context)
+        gone = {name: written_in_float32(out / graph.file) for name, graph in graphs.items()}
+        for name, graph in graphs.items():
+            graphs[name] = replace(graph, precision=counted_shares(out / graph.file, context))
         carry_over(bundle, out)
         context.tell("checking in ONNX Runtime", None)
         exported = finish(bundle, out, made_by=self.made_by(), graphs=graphs, observations=observations)
-        self._compare(exported, observations, expected)
+        rounding = max((ROUNDING.get(kind, 0) for types in gone.values() for kind in types), default=0)
+        error = self._compare(exported, observations, expected, max(self.tolerance, rounding))
+        for name, types in gone.items():
+            if types:
+                context.said.append(
+                    f"{name}: {float32_text(types)}; its action differs from torch's by up to {error:.2g}"
+                )
         return exported
 
     def _exported(
@@ -127,7 +153,8 @@ class ExportOnnx(Transform):
         torch = require("torch", "build")
         for module in ("onnxscript", "onnx"):
             require(module, "build")
-        arguments = tuple(torch.from_numpy(np.ascontiguousarray(feed)) for feed in (session.first_feeds or {}).values())
+        feeds = [np.asarray(feed, order="C") for feed in (session.first_feeds or {}).values()]
+        arguments = tuple(map(torch.from_numpy, feeds))
         exported = exported_by_torch(session.module, arguments, session.step, self.opset)
         file = f"graphs/{name}.onnx"
         (out / "graphs").mkdir(exist_ok=True)
@@ -137,16 +164,26 @@ class ExportOnnx(Transform):
         exported.save(str(out / file), external_data=beside or weight_bytes(session.module) > EXTERNAL_DATA_BYTES)
         return Graph(file, {"float32": 1.0}, self.opset)
 
-    def _compare(self, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any]) -> None:
+    def _compare(
+        self, exported: Bundle, observations: list[dict[str, Any]], expected: list[Any], tolerance: float
+    ) -> float:
+        """Return the largest difference from what torch gives.
+
+        Raises:
+            GraphError: when it is beyond the tolerance.
+        """
+        largest = 0.0
         policy = Policy.open(exported, threads=1, seed=0)
         for number, (observation, reference) in enumerate(zip(observations, expected, strict=True)):
             with risky(engine_class(policy.engine), f"ran {named(exported.manifest)}"):
                 got = policy.infer(observation).outputs[exported.manifest.spec.action.name]
             error = relative_error(got, reference)
-            if not error <= self.tolerance:
+            largest = max(largest, error)
+            if not error <= tolerance:
                 raise GraphError(
                     f"ONNX Runtime and torch differ on calibration sample {number}: relative L2 error {error:.3g}, "
-                    f"allowed {self.tolerance:g}.",
+                    f"allowed {tolerance:g}.",
                     "look for state that forward() keeps in its modules (declare it with 'keep' in the program), or "
                     "raise --tolerance if you know why",
                 )
+        return largest

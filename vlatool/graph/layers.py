@@ -90,7 +90,11 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
     """
     graph, live = OnnxGraph(model), varying(model)
     if 0 < graph.opset < LOWEST_OPSET:
-        raise GraphError(f"The graph has opset {graph.opset}; int8 needs opset {LOWEST_OPSET} or later.")
+        raise GraphError(
+            f"The graph has opset {graph.opset}; int8 needs opset {LOWEST_OPSET} or later.",
+            f"convert the file that it came from: vlatool export FILE.onnx --opset {LOWEST_OPSET} -o BUNDLE; where "
+            "onnx cannot, which that says, export it again where it was made",
+        )
     layers = []
     for node in model.graph.node:
         layer = None

@@ -14,10 +14,12 @@ INTEGER_OPS = {
 """They compute in int8 whatever surrounds them."""
 WEIGHT_AT = {"QLinearMatMul": 3, "QLinearConv": 3, "QGemm": 3}
 """Position of the second operand where it is not 1."""
-MATMULS = {"MatMul", "MatMulInteger", "QLinearMatMul", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
+MATMULS = {"MatMul", "FusedMatMul", "MatMulInteger", "QLinearMatMul", "DynamicQuantizeMatMul", "MatMulIntegerToFloat"}
 CONVOLUTIONS = {"Conv", "ConvInteger", "QLinearConv", "FusedConv"}
 OTHERS = {"Gemm", "QGemm", "ConvTranspose", "MatMulNBits", "Einsum", "Attention", "LSTM", "GRU", "RNN"}
-OPAQUE = {"FusedMatMul", "QAttention", "MultiHeadAttention", "GroupQueryAttention"}
+TURNING = ("Gemm", "QGemm", "FusedMatMul")
+"""They can turn the last two axes of their first operand."""
+OPAQUE = {"QAttention", "MultiHeadAttention", "GroupQueryAttention"}
 """They compute, but nothing here counts them: a graph that has one has an unknown layer, never a wrong sum."""
 MOVED = {"Reshape", "Transpose", "Unsqueeze", "Squeeze", "Flatten", "Split", "Slice", "Pad", "MaxPool"}
 """They move values and leave their precision as it is."""
@@ -87,7 +89,7 @@ def node_macs(node: Any, tensors: Tensors) -> int | None:
         return None
     if kind in CONVOLUTIONS:  # each output element sums (inputs / group) x kernel products
         return math.prod(out) * math.prod(second[1:])
-    inner = first[0] if kind in ("Gemm", "QGemm") and tensors.attribute(node, "transA", 0) else first[-1]
+    inner = first[-2] if kind in TURNING and tensors.attribute(node, "transA", 0) else first[-1]
     return math.prod(out) * inner
 
 

@@ -35,6 +35,17 @@ def read_names(nodes: Iterable[Any]) -> set[str]:
     return {name for node in nodes for name in reads(node)}
 
 
+def rename_reads(graph: Any, old: str, new: str) -> None:
+    """Rename a value wherever nodes of a graph, or of its subgraphs, read it."""
+    for node in graph.node:
+        node.input[:] = [new if name == old else name for name in node.input]
+        for attribute in node.attribute:
+            for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
+                rename_reads(inner, old, new)
+                for value in inner.output:  # what a branch hands on as it is
+                    value.name = new if value.name == old else value.name
+
+
 def varying(model: Any) -> set[str]:
     """Return the values that depend on an input of a graph, or on chance; all others are computed once, or could be."""
     values = {value.name for value in model.graph.input} - {tensor.name for tensor in model.graph.initializer}

@@ -190,6 +190,17 @@ class OnnxGraph:
         self.replace_nodes(nodes[place] for place in order)
 
 
+def type_name(code: int) -> str:
+    """Return a ``TensorProto.DataType`` as numpy calls it: ``float64``, ``bfloat16``.
+
+    Example:
+        >>> type_name(11)
+        'float64'
+    """
+    label = str(require("onnx", "build").TensorProto.DataType.Name(code)).lower()
+    return {"float": "float32", "double": "float64"}.get(label, label)
+
+
 def static_shape(tensor_type: Any) -> tuple[int, ...] | None:
     """Return the shape of an ``onnx.TypeProto.Tensor``; None where an axis is free or nothing is known."""
     if not tensor_type.HasField("shape"):

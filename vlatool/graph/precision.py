@@ -14,12 +14,17 @@ def precision_shares(path: Path) -> dict[str, float]:
 
     Layers whose weights alone are quantized count as ``int4 weights`` and the like, in whatever form they are stored.
     """
+    return shares_and_unknown(path)[0]
+
+
+def shares_and_unknown(path: Path) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return those shares, and the layers that cannot be counted, because nobody knows their shapes."""
     from vlatool.graph.workload import graph_workload
 
-    macs = graph_workload(path, count_as=_by_weights).macs
-    total = sum(macs.values()) or 1
-    shares = {name: round(count / total, 3) for name, count in macs.items() if count}
-    return dict(sorted(shares.items(), key=lambda item: -item[1]))
+    load = graph_workload(path, count_as=_by_weights)
+    total = sum(load.macs.values()) or 1
+    shares = {name: round(count / total, 3) for name, count in load.macs.items() if count}
+    return dict(sorted(shares.items(), key=lambda item: -item[1])), load.unknown
 
 
 def _by_weights(node: Any, tensors: Any) -> str:

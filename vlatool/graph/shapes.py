@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlatool.errors import require
+from vlatool.graph.flat import Branches, Turns, all_nodes, flatten, named_everywhere
 from vlatool.graph.nodes import nodes_inside
-from vlatool.graph.onnx_graph import LARGE, static_shape
+from vlatool.graph.onnx_graph import DOMAINS, LARGE, static_shape, type_name
+from vlatool.graph.seen import Seen, read_seen
 
 Shape = tuple[int, ...]
 
@@ -30,12 +31,14 @@ class Tensors:
 
     Args:
         onnx: The imported ``onnx`` package.
-        nodes: In the order in which they run.
+        items: Nodes in the order in which they run, and bodies that one of them has (``vlatool.graph.flat``).
         graph: The graph after shape inference.
+        seen: Node -> what a run has shown, where shapes are not static.
     """
 
-    def __init__(self, onnx: Any, nodes: list[Any], graph: Any) -> None:
-        self._onnx, self.nodes, self._graph = onnx, nodes, graph
+    def __init__(self, onnx: Any, items: list[Any], graph: Any, seen: Mapping[str, Seen]) -> None:
+        self._onnx, self.items, self._graph, self._seen = onnx, items, graph, seen
+        self.nodes = [*all_nodes(items)]
         self._types: dict[str, int] = {}
         self._shapes: dict[str, Shape | None] = {}
         for value in (*graph.input, *graph.value_info, *graph.output):
@@ -43,8 +46,21 @@ class Tensors:
             self._shapes[value.name] = static_shape(value.type.tensor_type)
         for item in graph.initializer:
             self._types[item.name], self._shapes[item.name] = item.data_type, tuple(item.dims)
-        self._producers = {name: node for node in nodes for name in node.output if name}
+        self._producers = {name: node for node in self.nodes for name in node.output if name}
         self._stored = {item.name for item in graph.initializer}
+        for node in (node for node in self.nodes if node.name in seen):
+            self._learn(node, seen[node.name])
+
+    def _learn(self, node: Any, seen: Seen) -> None:
+        """Take in the shapes that a run has shown of a node, where they are not static."""
+        pending, missing = list(seen.inputs), sum(map(bool, node.input)) - len(seen.inputs)
+        for name in filter(None, node.input):
+            packed = missing > 0 and name in self._stored and pending[:1] != [self._shapes[name]]
+            missing -= packed
+            shape = pending.pop(0) if pending and not packed else None
+            self._shapes[name] = self._shapes.get(name) or shape
+        for name, shape in zip(filter(None, node.output), seen.outputs, strict=False):
+            self._shapes[name] = self._shapes.get(name) or shape
 
     def shape(self, name: str) -> Shape | None:
         """Return a shape of whole numbers, None when an axis is free or nothing is known."""
@@ -55,10 +71,8 @@ class Tensors:
         known = self._types.get(name, 0)
         if not known:
             return "float32"
-        label = str(self._onnx.TensorProto.DataType.Name(known)).lower()
-        if label.startswith(("float8", "float4")):  # float8e4m3fn and its kin
-            return label[: len("float8")]
-        return {"float": "float32", "double": "float64"}.get(label, label)
+        label = type_name(known)
+        return label[: len("float8")] if label.startswith(("float8", "float4")) else label  # float8e4m3fn and its kin
 
     def producer(self, name: str) -> Any | None:
         """Return the node that gives a tensor."""
@@ -121,19 +135,46 @@ class Tensors:
         return peak
 
     def hidden(self, operators: set[str]) -> Iterator[str]:
-        """Yield the names of nodes that run such operators inside (branches and loops), which nothing here counts."""
+        """Yield the names of nodes that run such operators inside, which nothing here counts: bodies of other nodes."""
         for node in self.nodes:
             if any(inner.op_type in operators for inner in nodes_inside(node)):
                 yield node.name or node.output[0]
 
+    def runs(self, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
+        """Return the nodes that run, and how often each does; 0: nobody knows how often.
+
+        Of the branches of an If it is the one with the most multiply-accumulates.
+
+        Args:
+            macs: Returns those of a node.
+        """
+        return self._runs(self.items, 1, macs)
+
+    def _runs(self, items: Sequence[Any], times: int, macs: Callable[[Any], int]) -> list[tuple[Any, int]]:
+        found: list[tuple[Any, int]] = []
+        for item in items:
+            if isinstance(item, Branches):
+                bodies = [self._runs(body, times, macs) for body in item.bodies]
+                costs = [sum(macs(node) * max(1, count) for node, count in body) for body in bodies]
+                found += bodies[costs.index(max(costs))]
+            elif isinstance(item, Turns):
+                found += [] if item.count == 0 else self._runs(item.body, times * self._turns(item), macs)
+            else:
+                seen = self._seen.get(item.name)
+                found.append((item, times or (seen.times if seen else 0)))
+        return found
+
+    def _turns(self, item: Turns) -> int:
+        if item.count is not None:
+            return item.count
+        shape = self.shape(item.along[0]) if item.along else None
+        return shape[item.along[1]] if shape is not None and item.along else 0
+
 
 def open_graph(onnx: Any, path: Path) -> Tensors:
     """Read an ONNX file without its external weights and infer shapes, a free first axis of an input being 1."""
-    model = onnx.load(str(path), load_external_data=False)
-    if model.functions:
-        model = require("onnx.inliner", "build").inline_local_functions(model)
+    model = named_everywhere(onnx.load(str(path), load_external_data=False))
     graph = model.graph
-    nodes = copy.deepcopy([*graph.node])
     for value in graph.input:
         axes = value.type.tensor_type.shape.dim
         if axes and not axes[0].HasField("dim_value"):
@@ -143,11 +184,17 @@ def open_graph(onnx: Any, path: Path) -> Tensors:
     for item in graph.initializer:  # shapes do not depend on weights; this keeps a copy of them out of the inference
         if len(item.raw_data) > LARGE:
             item.ClearField("raw_data")
-    standard = [item for node in nodes for item in _standard(onnx, node, graph)]
+    items: list[Any] = copy.deepcopy([*graph.node])
+    if any(item.HasField("g") for node in items for item in node.attribute):
+        before = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+        known = {value.name: value for value in (*before.input, *before.value_info, *before.output)}
+        opset = next((entry.version for entry in model.opset_import if entry.domain in DOMAINS), 0)
+        items = flatten(graph, opset, known)
+    standard = [item for node in copy.deepcopy([*graph.node]) for item in _standard(onnx, node, graph)]
     del graph.node[:]
     graph.node.extend(standard)
     inferred = onnx.shape_inference.infer_shapes(model, data_prop=True)
-    return Tensors(onnx, nodes, inferred.graph)
+    return Tensors(onnx, items, inferred.graph, read_seen(model))
 
 
 def _standard(onnx: Any, node: Any, graph: Any) -> list[Any]:

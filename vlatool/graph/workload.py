@@ -163,22 +163,22 @@ def _count(
     tally = Tally()
     activation_bytes = 0
     unknown = [*tensors.hidden(COMPUTE)]
-    for node in tensors.nodes:
+    for node, times in tensors.runs(lambda node: (node.op_type in COMPUTE and node_macs(node, tensors)) or 0):
         tally.concat(node.op_type == "Concat")
         if node.op_type not in COMPUTE:
             continue
         count = node_macs(node, tensors)
         written = [tensors.bytes_of(name) for name in node.output if name]
-        if count is None or written[0] is None:
+        if count is None or written[0] is None or not times:
             tally.layers += 1
             unknown.append(node.name or node.output[0])
             continue
-        macs[count_as(node, tensors)] += count
-        activation_bytes += sum(size or 0 for size in written)
+        macs[count_as(node, tensors)] += times * count
+        activation_bytes += times * sum(size or 0 for size in written)
         part = part_named(node.name, parts)
         written_numbers = math.prod(tensors.shape(node.output[0]) or ())
         weights, groups = _operands(node, tensors)
-        tally.layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors))
+        tally.layer(count, written_numbers, weights, groups, part, _weight_of(node, tensors), times)
     integer = any(node.op_type in INTEGER_OPS for node in tensors.nodes)
     return GraphWorkload(
         dict(macs), tally.layers, tally.weights, tally.activations, tally.traits(), tensors.weight_bytes,
@@ -220,27 +220,36 @@ class Tally:
     _seen: set[Hashable] = field(default_factory=set)
 
     def layer(
-        self, macs: int, written: int, weights: int, groups: int = 1, part: str = "", weight: Hashable = ""
+        self,
+        macs: int,
+        written: int,
+        weights: int,
+        groups: int = 1,
+        part: str = "",
+        weight: Hashable = "",
+        times: int = 1,
     ) -> None:
         """Take in a layer: its multiply-accumulates, the numbers that it writes, its weights, groups and part.
 
         Args:
             weight: What tells its weight from others; a weight that was seen before is read again, not stored again.
                 Empty: a weight of its own.
+            times: How often it runs.
         """
         before = self._parts.get(part, (0, 0, 0, 0))
-        added = zip(before, (macs, weights, written, 1), strict=True)
+        added = zip(before, (times * macs, times * weights, times * written, times), strict=True)
         self._parts[part] = tuple(old + new for old, new in added)  # type: ignore[assignment]
-        self.layers += 1
-        self.weights += 0 if weight in self._seen else weights
-        self.read_again += weights if weight in self._seen else 0
+        again = times - (weight not in self._seen)
+        self.layers += times
+        self.weights += (times - again) * weights
+        self.read_again += again * weights
         self._seen.update([weight] if weight else [])
-        self.activations += written
-        self._macs += macs
-        self._depthwise += groups > 1 and macs <= DEPTHWISE * written
-        self._grouped += macs if groups > 1 and macs > DEPTHWISE * written else 0
-        self._products += macs if not weights else 0
-        self._rows += weights if macs <= ONE_ROW * weights else 0
+        self.activations += times * written
+        self._macs += times * macs
+        self._depthwise += times * (groups > 1 and macs <= DEPTHWISE * written)
+        self._grouped += times * (macs if groups > 1 and macs > DEPTHWISE * written else 0)
+        self._products += times * (macs if not weights else 0)
+        self._rows += times * (weights if macs <= ONE_ROW * weights else 0)
 
     def concat(self, concatenates: bool) -> None:
         """Take in a node that may be a concatenation."""

@@ -112,4 +112,5 @@ class TorchSession:
         arguments = [torch.from_numpy(np.array(feeds[name])) for name in self.step.feeds]  # it may change them
         with torch.inference_mode():
             outputs = run_module(self.module, self.step, arguments)
-        return {name: value.numpy() for name, value in zip(self.step.gives, outputs, strict=True)}
+        wide = (value.float() if value.dtype == torch.bfloat16 else value for value in outputs)  # numpy has no bfloat16
+        return {name: value.numpy() for name, value in zip(self.step.gives, wide, strict=True)}

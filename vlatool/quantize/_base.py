@@ -23,10 +23,11 @@ from vlatool.errors import BundleError, RecipeError, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
-from vlatool.graph.precision import FLOATS, precision_shares
+from vlatool.graph.precision import FLOATS
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
+from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import HELD, carry_over, finish, history
 from vlatool.stage.products import products_apart
 
@@ -113,7 +114,7 @@ class Quantization(Transform):
                 if compute == "bfloat16":
                     program, parted = part_phases(program, name, target)
                     graphs.update({key: replace(part, opset=graph.opset) for key, part in parted.items()})
-                shares = precision_shares(target)
+                shares = counted_shares(target, context)
             if compute:
                 shares = {compute if key == "float32" else key: share for key, share in shares.items()}
             graphs[name] = Graph(graph.file, shares, graph.opset, compute or "")

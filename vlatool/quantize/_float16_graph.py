@@ -17,6 +17,7 @@ LARGEST = 65504.0
 """Largest finite float16."""
 NORMAL = 2.0**-14
 """Smallest float16 with all its bits; what is smaller has fewer, and is zero on engines that flush."""
+HALF = 10  # onnx.TensorProto.FLOAT16
 UNKNOWN = 0  # onnx.TensorProto.UNDEFINED
 INTEGERS = (2, 3, 4, 5, 6, 7, 12, 13)  # onnx.TensorProto: (u)int8, (u)int16, (u)int32, (u)int64
 

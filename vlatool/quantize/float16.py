@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,13 +13,22 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for, recorded_observations
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
+from vlatool.machine.risky import risky
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize._trial_compile import open_apart
+from vlatool.quantize._underflow import find_small, too_small
+from vlatool.runtime.engine import engine_class
+from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context, SampleSet, source_of
 
 APART = "leave layers beside a Transpose in float32 with --exclude, or use another method"
+
+MOVED = 0.02
+"""Relative L2 change of what a graph gives above which every small number is kept, and that is told."""
+BEYOND_ALL = 1e9
+"""What stands for a change that is not finite."""
 
 
 class Float16(Quantization):
@@ -25,8 +36,9 @@ class Float16(Quantization):
 
     For GPUs and TensorRT, and for half the file: ONNX Runtime on a processor runs the result too, but casts most of it
     back to float32. In float32 stay excluded nodes, phases (what leads to Sin and Cos) and indices, constants beyond
-    65504, and every value that goes beyond it on calibration data, with the nodes that give and read it. Sums inside a
-    product are not watched: an engine that adds up in float16 can overflow where the result does not.
+    65504, and every value that goes beyond it on calibration data, with the nodes that give and read it; likewise what
+    is so small that float16 loses it, where that changes what a node computes. Sums inside a product are not watched:
+    an engine that adds up in float16 can overflow where the result does not.
     """
 
     packages: ClassVar[tuple[str, ...]] = ("onnx", "onnxruntime", "numpy")
@@ -50,9 +62,9 @@ class Float16(Quantization):
         selected = self.selected(candidates, bundle)
         samples = SampleSet()
         recorded = recorded_observations(bundle, self.samples, self.calibration)
-        seen = samples.watch(recorded or observations_for(bundle, self.samples, self.calibration))
+        seen = list(samples.watch(recorded or observations_for(bundle, self.samples, self.calibration)))
         beyond = find_beyond(bundle, chosen, seen, LARGEST, context)
-        report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": []}
+        report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {}}
         for graph, values in beyond.items():
             for value, excess in values.items():
                 size = float(f"{excess.largest:.4g}")
@@ -61,22 +73,21 @@ class Float16(Quantization):
                     f"{value} reaches {size:g} in sample {excess.sample}, beyond float16: it stays float32", None
                 )
 
+        small = find_small(bundle, chosen, seen, context)
+
         def convert(name: str, original: Path, target: Path) -> None:
             model = load(original)
-            kept = {node.name for node in model.graph.node} - selected
-            kept |= phase_nodes(model) | around(model, beyond.get(name, {}))
-            weights = look_at_weights(model, kept)
-            kept.update(weights.beyond)
+            always = {node.name for node in model.graph.node} - selected
+            always |= phase_nodes(model) | around(model, beyond.get(name, {}))
+            always.update(look_at_weights(model, always).beyond)
+            for strict in (False, True):
+                kept = always | too_small(model, small[name], always, strict)
+                moved = _written(original, target, kept, small[name].feeds)
+                if moved <= MOVED:
+                    break
             report["kept"] += len(kept)
-            report["subnormal_weights"] += weights.subnormal
-            turning = {node.name for node in model.graph.node if node.op_type == "Transpose"}
-            save(to_float16(model, kept), target)
-            try:
-                open_apart(target, "", "float16", APART)
-            except GraphError:  # with what is transposed in float32 it does not
-                report["kept"] += len(turning - kept)
-                save(to_float16(load(original), kept | turning), target)
-                open_apart(target, "", "float16", APART)
+            report["subnormal_weights"] += look_at_weights(model, kept).subnormal
+            report["moved"][name] = float(f"{moved:.2g}")
 
         made_by = {**self.made_by(calibration=samples), "float16": report}
         return self.transform(bundle, out, context, convert, made_by=made_by)
@@ -86,7 +97,31 @@ class Float16(Quantization):
         report = made.manifest.made_by["float16"]
         small = report["subnormal_weights"]
         lines = [f"{report['kept']} nodes stay float32; {small} weights are too small for all their bits"]
+        for graph, moved in report["moved"].items():
+            if moved > MOVED:
+                lines.append(f"{graph}: what it gives moves by up to {moved:.2g} (relative L2) on calibration data")
         for excess in report["beyond"]:
             where = f"{excess['graph']}/{excess['value']} reaches {excess['largest']:g} in sample {excess['sample']}"
             lines.append(f"{where}: beyond float16, so its nodes stay float32")
         return tuple(lines)
+
+
+def _written(original: Path, target: Path, kept: set[str], feeds: Sequence[Mapping[str, Any]]) -> float:
+    """Write a graph in float16 apart from some nodes; return the largest relative L2 change of what it gives."""
+    save(to_float16(load(original), kept), target)
+    try:
+        open_apart(target, "", "float16", APART)
+    except GraphError:  # with what is transposed in float32 it does not
+        model = load(original)
+        kept |= {node.name for node in model.graph.node if node.op_type == "Transpose"}
+        save(to_float16(model, kept), target)
+        open_apart(target, "", "float16", APART)
+    before, after = engine_class()(original, 1), engine_class()(target, 1)
+    moved = 0.0
+    for fed in feeds:
+        with risky(engine_class(), f"ran {target.name}"):
+            expected, got = before.run(fed), after.run(fed)
+        floats = [name for name, value in expected.items() if value.dtype.kind == "f"]
+        errors = [relative_error(got[name], expected[name]) for name in floats]
+        moved = max([moved, *(error if error == error else math.inf for error in errors)])
+    return min(moved, BEYOND_ALL)

@@ -30,6 +30,7 @@ from vlatool.quantize._weight_options import WeightOptions
 from vlatool.quantize._weights_plan import WeightsPlan, make_plan
 from vlatool.runtime.engine import STANDARD_LAYOUT, class_for
 from vlatool.stage.base import Context, SampleSet, source_of
+from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import SEED, carry_over, finish, history
 
 if TYPE_CHECKING:
@@ -124,11 +125,13 @@ class WeightOnly(WeightOptions):
         carry_over(bundle, out)
         made_by = {**self.made_by(calibration=samples), **_summarize(written, out / LOSSES)}
         context.tell("counting", None)
-        graphs = {
-            name: Graph(f"graphs/{name}.onnx", precision_shares(out / f"graphs/{name}.onnx"), opset)
-            for name, opset in opsets.items()
-        }
-        if self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW):
+        runs = self.verify == "run" or (self.verify == "auto" and written.bytes < RUN_BELOW)
+        graphs = {}
+        for name, opset in opsets.items():
+            file = out / f"graphs/{name}.onnx"
+            shares = counted_shares(file, context) if runs else precision_shares(file)
+            graphs[name] = Graph(f"graphs/{name}.onnx", shares, opset)
+        if runs:
             context.tell("running the quantized graphs", None)
             return finish(
                 bundle, out, made_by=made_by, graphs=graphs, observations=self.golden(bundle),

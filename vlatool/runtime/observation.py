@@ -112,10 +112,8 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
             values = array.tolist()
             if normaliser is not None and math.isfinite(sum(values)):
                 return normaliser.forward_row(values)
-        if shape == single:
-            array = array[None]
-        elif shape != batched:
-            array = _batched(array, tensor)
+        if shape != batched:
+            array = array[None] if shape == single else _batched(array, tensor)
         if floating and not all_finite(array):
             raise DataError(
                 f"The input '{tensor.name}' holds {_not_finite(array)}.", "check the sensor or the recording"
@@ -157,6 +155,8 @@ def _cast(array: Array, dtype: np.dtype[Any], tensor: TensorSpec) -> Array:
 
 
 def _batched(array: Array, tensor: TensorSpec) -> Array:
+    if not tensor.shape and array.shape == (1,):
+        return array.reshape(())
     if array.ndim == len(tensor.shape) - 1:
         array = array[None]
     fits = array.ndim == len(tensor.shape) and all(
@@ -176,8 +176,8 @@ def all_finite(array: Array) -> bool:
     Few elements are summed without numpy: right after an inference, whose weights have filled the processor's caches,
     that takes half as long as a numpy reduction (``vlatool benchmark overhead``).
     """
-    if array.size <= FEW:  # a spec knows no float64, and the sum of few float32 cannot overflow
-        return math.isfinite(sum(array.ravel().tolist()))
+    if array.size <= FEW and math.isfinite(sum(array.ravel().tolist())):  # that of float64 can overflow
+        return True
     return bool(np.isfinite(array).all())
 
 

@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import SourceError, require
+from vlatool.errors import SourceError, nearest, require
 
+Shapes = Mapping[str, tuple[int | str, ...]]
 INFERRED_BYTES = 1_500_000_000
 """Above this protobuf cannot hand a model to the inference of shapes."""
 
 
-def fix_axes(model: Any, spec: PolicySpec | None) -> dict[str, dict[int, int]]:
+def fix_axes(model: Any, shapes: Shapes, described: bool, file: str = "FILE.onnx") -> dict[str, dict[int, int]]:
     """Give the free axes of a model's inputs their lengths, in place: input -> axis -> length.
 
-    An axis has the length that the spec gives; else the first one is the batch, which is 1. An axis that is named like
-    one of these has that length too. What depends on them is inferred again.
+    An axis has the length that is given; else the first one is the batch, which is 1. An axis that is named like one of
+    these has that length too. What depends on them is inferred again.
 
     Args:
         model: A ``ModelProto``.
-        spec: Of the description; None where the file describes itself.
+        shapes: Input -> axes: lengths, and names of axes that stay free.
+        described: Whether they are those of a description, which knows all inputs; where it has none, they are those
+            that a person gave beside the file.
+        file: What messages call it.
+
+    Raises:
+        SourceError: where a shape that was given does not fit the file, or an axis other than the first is free and
+            nobody gave it a length.
     """
     inputs = _inputs(model)
+    if not described:
+        _check_given(inputs, shapes)
     names = {value.name for value in inputs}
     named: dict[str, int] = {}
     fixed: dict[str, dict[int, int]] = {}
     for value in inputs:
-        declared = _declared(value.name, spec)
+        _put_rank(value, shapes.get(value.name))
+        declared = dict(enumerate(shapes.get(value.name, ())))
         for place, axis in enumerate(_axes(value)):
-            length = declared.get(place, 1 if place == 0 and spec is None else 0)
+            length = declared.get(place, 1 if place == 0 and not described else 0)
+            if isinstance(length, str):
+                if _is_free(axis, place):
+                    axis.dim_param = length
+                continue
             if not _is_free(axis, place) or length < 1:
                 continue
             if axis.dim_param:
@@ -44,9 +58,37 @@ def fix_axes(model: Any, spec: PolicySpec | None) -> dict[str, dict[int, int]]:
                     fixed.setdefault(value.name, {})[place] = axis.dim_value
             elif _is_free(axis, place) and not axis.dim_param:  # -1 is no length
                 axis.Clear()
-    if fixed and model.ByteSize() < INFERRED_BYTES:
+    if not described:
+        _refuse_free(inputs, shapes, file)
+    if (fixed or shapes or not all(_is_known(value) for value in model.graph.output)) and (
+        model.ByteSize() < INFERRED_BYTES
+    ):
         _infer(model)
     return fixed
+
+
+def shapes_from(texts: Iterable[str]) -> dict[str, tuple[int | str, ...]]:
+    """Return input -> axes of what a person typed as ``NAME=1,3,224,224``; a word names an axis that stays free.
+
+    Raises:
+        SourceError: for anything else.
+
+    Example:
+        >>> shapes_from(["image=1,3,224,224", "ids=1,n"])
+        {'image': (1, 3, 224, 224), 'ids': (1, 'n')}
+    """
+    shapes: dict[str, tuple[int | str, ...]] = {}
+    for text in texts:
+        name, equals, listed = text.rpartition("=")
+        axes = [axis.strip() for axis in listed.split(",")] if listed.strip() else []
+        right = all(axis.isidentifier() or (axis.isdecimal() and int(axis)) for axis in axes)
+        if not equals or not name or not right:
+            raise SourceError(
+                f"--shape {text!r} is no shape of an input; wanted NAME=1,3,224,224: each axis a whole number from 1, "
+                "or a name for one that stays free."
+            )
+        shapes[name] = tuple(int(axis) if axis.isdecimal() else axis for axis in axes)
+    return shapes
 
 
 def axes_text(fixed: Mapping[str, Mapping[int, int]]) -> str:
@@ -94,9 +136,64 @@ def _is_free(axis: Any, place: int) -> bool:
     return not axis.HasField("dim_value") or axis.dim_value < (1 if place == 0 else 0)
 
 
-def _declared(name: str, spec: PolicySpec | None) -> dict[int, int]:
-    tensor = next((entry for entry in spec.inputs if entry.name == name), None) if spec else None
-    return {place: axis for place, axis in enumerate(tensor.shape if tensor else ()) if isinstance(axis, int)}
+def _is_known(value: Any) -> bool:
+    """Return whether a value has a shape, be its axes free or not."""
+    return bool(value.type.tensor_type.HasField("shape"))
+
+
+def _put_rank(value: Any, given: tuple[int | str, ...] | None) -> None:
+    """Give a value of which the file does not say how many axes it has those that are given."""
+    if given is not None and not _is_known(value):
+        value.type.tensor_type.shape.SetInParent()
+        for _ in given:
+            value.type.tensor_type.shape.dim.add()
+
+
+def _check_given(inputs: list[Any], shapes: Shapes) -> None:
+    known = {value.name: value for value in inputs}
+    for name, given in shapes.items():
+        if name not in known:
+            raise SourceError(f"--shape names '{name}', which is no input of the file; {nearest(name, known)}.")
+        own = [_length(axis, place) for place, axis in enumerate(_axes(known[name]))]
+        fits = len(own) == len(given) and all(
+            isinstance(axis, str) or axis == length for axis, length in zip(own, given, strict=True)
+        )
+        if _is_known(known[name]) and not fits:
+            text = ",".join(map(str, own))
+            raise SourceError(
+                f"--shape gives '{name}' the shape {list(given)}; the file has {own}.",
+                f"write {_option(name, text)} with numbers in the place of names",
+            )
+
+
+def _refuse_free(inputs: list[Any], shapes: Shapes, file: str) -> None:
+    """Refuse inputs whose shape nobody knows: a length that is made up decides what is checked, counted and timed."""
+    found, options = [], []
+    for value in inputs:
+        own = [_length(axis, place) for place, axis in enumerate(_axes(value))]
+        free = [axis for place, axis in enumerate(own) if isinstance(axis, str) and place and value.name not in shapes]
+        if not _is_known(value):
+            found.append(f"'{value.name}' has a shape that the file does not say")
+            options.append(_option(value.name, "1,AXIS,AXIS"))
+        elif free:
+            found.append(f"'{value.name}' has the free axes {', '.join(free)} in its shape {own}")
+            options.append(_option(value.name, ",".join(map(str, own))))
+    if found:
+        raise SourceError(
+            f"{'; '.join(found)}. The lengths that the robot gives them decide what is checked and timed.",
+            f"name them: vlatool export {shlex.quote(file)} {' '.join(options)} -o BUNDLE, with numbers in place of "
+            "names (a name that is left leaves its axis free)",
+        )
+
+
+def _length(axis: Any, place: int) -> int | str:
+    """Return the length of an axis, or its name; one that has neither is named by its place."""
+    return (axis.dim_param or f"n{place}") if _is_free(axis, place) else int(axis.dim_value)
+
+
+def _option(name: str, axes: str) -> str:
+    words = "".join(character if character.isalnum() or character in "_," else "_" for character in axes)
+    return f"--shape {shlex.quote(f'{name}={words}')}"
 
 
 def _infer(model: Any) -> None:
@@ -109,7 +206,7 @@ def _infer(model: Any) -> None:
     outputs = {value.name: value for value in inferred.graph.output}
     for value in model.graph.output:
         axes = _axes(outputs[value.name])
-        if len(axes) and math.prod(axis.dim_value for axis in axes) > 0:
+        if _is_known(outputs[value.name]) and (not _is_known(value) or all(axis.dim_value > 0 for axis in axes)):
             value.CopyFrom(outputs[value.name])
     del model.graph.value_info[:]
     model.graph.value_info.extend(inferred.graph.value_info)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -16,18 +17,24 @@ from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, InputError, SourceError, nearest, require
+from vlatool.graph.as_float32 import ROUNDING, as_float32, float32_text
 from vlatool.graph.draws import refuse_drawing_file
-from vlatool.graph.precision import precision_shares
+from vlatool.graph.files import save
+from vlatool.graph.layers import LOWEST_OPSET
+from vlatool.graph.onnx_graph import type_name
 from vlatool.machine.risky import risky
 from vlatool.module.description import FILE, Description, copy_assets, description_file, read_description
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.policy import relative_error
 from vlatool.runtime.program import Program
-from vlatool.sources._onnx_axes import axes_text, fix_axes, opset_of, with_opset
+from vlatool.sources._onnx_axes import axes_text, fix_axes, opset_of, shapes_from, with_opset
 from vlatool.sources._onnx_batch import add_batch_axes
+from vlatool.sources._onnx_ends import complete_outputs, refuse_types
+from vlatool.sources._onnx_plain import plain
 from vlatool.sources._source import Source
 from vlatool.stage.base import Context
+from vlatool.stage.counted import counted_shares
 from vlatool.stage.finish import SEED, finish
 
 if TYPE_CHECKING:
@@ -37,8 +44,8 @@ if TYPE_CHECKING:
 
 TOLERANCE = 1e-3
 """Largest relative L2 difference between a file and what it was converted to."""
-DTYPE_OF = {1: "float32", 2: "uint8", 6: "int32", 7: "int64", 9: "bool", 10: "float16"}
-"""ONNX element type -> dtype of a spec."""
+SAMPLES = 32
+"""Observations on which a file and what it was converted to are compared."""
 
 
 class OnnxFile(Source):
@@ -53,6 +60,7 @@ class OnnxFile(Source):
         None, description="policy.yaml with spec and assets; the file's own shapes when not given"
     )
     opset: int | None = Field(None, ge=7, le=23, description="convert the default ONNX domain to this opset")
+    shape: tuple[str, ...] = Field((), description="lengths of free axes: NAME=1,3,224,224")
     control_hz: float = Field(10.0, gt=0, description="rate of the control loop when there is no policy.yaml, in Hz")
 
     @classmethod
@@ -67,9 +75,11 @@ class OnnxFile(Source):
         return cls(model=path, policy=beside if beside.is_file() else None)
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
-        """Convert to the opset of the record, where it has one."""
-        opset = entry.get("options", {}).get("opset")
-        return self.model_copy(update={"opset": opset}) if isinstance(opset, int) else self
+        """Convert to the opset of the record and take its shapes, where it has them."""
+        options = entry.get("options", {})
+        opset, shape = options.get("opset"), options.get("shape")
+        update = {"opset": opset} if isinstance(opset, int) else {}
+        return self.model_copy(update=update | ({"shape": tuple(shape)} if isinstance(shape, list) else {}))
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file exists."""
@@ -87,42 +97,128 @@ class OnnxFile(Source):
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Load the file, store it, and run it once."""
         self.check(None, None)
-        model = _load(self.model)
+        model = plain(_load(self.model))
         description = _description(self.policy) if self.policy else None
-        fixed = axes_text(fix_axes(model, description.spec if description else None))
-        further = [] if description else add_batch_axes(model)
+        changes = self._prepare(model, description, context)
+        (out / "graphs").mkdir()
+        file = out / "graphs/main.onnx"
+        if description is None:
+            with _named_after(self.model, file):
+                complete_outputs(model, file, _tensors(model.graph.input))
+        described = description or self._described(model)
+        _check_names(model, described.spec)
+        refuse_drawing_file(model, self.model)
+        copy_assets(described, out)
+        manifest = described.manifest(program=described.program or single_graph(described.spec))
+        options = {"opset": self.opset, "shape": list(self.shape)}
+        given = {name: value for name, value in options.items() if value}
+        made_by = {**self.made_by(), "options": {"model": self.model.name, **given}}
+        with _named_after(self.model, file):
+            opset = self._store(model, out, manifest, changes, context)
+            observations = observations_for(Bundle(out, manifest), 2)
+            graphs = {"main": Graph("graphs/main.onnx", counted_shares(file, context), opset)}
+            return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
+
+    def _prepare(self, model: Any, description: Description | None, context: Context) -> _Changes:
+        """Bring types and axes into the form that stages take, in place."""
+        refuse_types(model, described=description is not None)
+        if description is not None and self.shape:
+            raise SourceError(
+                f"--shape is given, and {self.policy} says the shapes of all inputs.",
+                "leave --shape out, or change them there",
+            )
+        if gone := as_float32(model):
+            context.said.append(float32_text(gone))
+        declared = {tensor.name: tensor.shape for tensor in description.spec.inputs} if description else None
+        fixed = axes_text(fix_axes(model, declared or shapes_from(self.shape), declared is not None, str(self.model)))
+        further = [] if description else add_batch_axes(model, opset_of(model))
         if further:
             axes = f"{', '.join(further)} of the file have no batch axis: one of 1 is put in front"
             fixed = f"{fixed}; {axes}" if fixed else axes
         if fixed:
             context.tell(fixed, None)
-        described = description or self._described(model)
-        _check_names(model, described.spec)
-        refuse_drawing_file(model, self.model)
-        if self.opset is not None:
-            model = with_opset(model, self.opset)
-        copy_assets(described, out)
-        (out / "graphs").mkdir()
-        onnx = require("onnx", "build")
-        large = model.ByteSize() > 1_500_000_000
-        onnx.save(model, str(out / "graphs/main.onnx"), save_as_external_data=large, location="main.onnx.data")
-        manifest = described.manifest(program=described.program or single_graph(described.spec))
-        converted = {"opset": self.opset} if self.opset is not None else {}
-        made_by = {**self.made_by(), "options": {"model": self.model.name, **converted}}
-        with _named_after(self.model, out / "graphs/main.onnx"):
-            graphs = {"main": Graph("graphs/main.onnx", precision_shares(out / "graphs/main.onnx"), opset_of(model))}
-            observations = observations_for(seal(out, manifest), 2)
-            if converted:
-                _compare(self.model, out, manifest, observations, further)
-            return finish(Bundle(out, manifest), out, made_by=made_by, graphs=graphs, observations=observations)
+        return _Changes(further, max(TOLERANCE, *(ROUNDING.get(kind, 0) for kind in gone), 0))
+
+    def _store(self, model: Any, out: Path, manifest: Manifest, changes: _Changes, context: Context) -> int:
+        """Write the graph, in the opset that is asked for or that stages need; return its opset.
+
+        Raises:
+            GraphError: when ONNX Runtime refuses it.
+            SourceError: when it cannot be converted, or computes something else than the file.
+        """
+        opset, file = opset_of(model), out / "graphs/main.onnx"
+        wanted = self.opset or max(opset, LOWEST_OPSET if opset else 0)
+        save(model, file)
+        before, unbatched = self._before(file, changes.further)
+        if wanted != opset:
+            try:
+                save(with_opset(model, wanted), file)
+                self._compare(before, unbatched, out, manifest, changes.tolerance)
+                context.said.append(f"converted from opset {opset} to {wanted}; the same on {SAMPLES} observations")
+                return wanted
+            except InputError as error:
+                if self.opset:
+                    raise
+                words = f"opset {opset} stays, in which nothing can be quantized to int8 ({LOWEST_OPSET} or later): "
+                context.said.append(f"{words}{error.message}")
+                save(model, file)
+        self._compare(before, unbatched, out, manifest, changes.tolerance)
+        return opset
+
+    def _before(self, file: Path, further: list[str]) -> tuple[Any, list[str]]:
+        """Open the file itself, or where ONNX Runtime refuses it what is written of it; and what has no batch axis."""
+        for path, unbatched in ((self.model, further), (file, [])):
+            try:
+                with risky(engine_class(), f"opened {path.name}"):
+                    return engine_class()(path, threads=1), unbatched
+            except GraphError:
+                if path == file:
+                    raise
+        raise AssertionError
 
     def _described(self, model: Any) -> Description:
-        initializers = {tensor.name for tensor in model.graph.initializer}
-        inputs = tuple(_tensor(value) for value in model.graph.input if value.name not in initializers)
-        outputs = tuple(_tensor(value) for value in model.graph.output)
+        inputs, outputs = _tensors(model.graph.input), _tensors(model.graph.output)
         rows = math.prod(axis for axis in outputs[0].shape[:-1] if isinstance(axis, int)) if outputs else 1
         spec = PolicySpec(inputs, outputs, self.control_hz, chunk=rows, execute=1 if rows > 1 else 0)
         return Description(self.model.parent, self.model.stem, "0.0.0", spec)
+
+    def _compare(self, before: Any, unbatched: list[str], out: Path, manifest: Manifest, tolerance: float) -> None:
+        """Compare the stored graph with a session of the file, which has no batch axis in some tensors.
+
+        Raises:
+            SourceError: when ONNX Runtime computes something else.
+        """
+        with risky(engine_class(), "opened main.onnx"):
+            after = engine_class()(out / "graphs/main.onnx", threads=1)
+        programs = [Program(manifest.program, {"main": session}, SEED) for session in (before, after)]
+        encode = ObservationEncoder(manifest.spec, out / "assets")
+        for observation in observations_for(seal(out, manifest), SAMPLES):
+            feeds = encode(observation)
+            as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
+            expected, got = (
+                program.run(inputs) for program, inputs in zip(programs, (as_before, dict(feeds)), strict=True)
+            )
+            for tensor in manifest.spec.outputs:
+                error = relative_error(got[tensor.name], expected[tensor.name])
+                if not error <= tolerance:
+                    raise SourceError(
+                        f"Converted, '{tensor.name}' of the ONNX file is another one: relative L2 error {error:.3g}, "
+                        f"allowed {tolerance:g}.",
+                        "leave --opset out, or export the file again where it was made",
+                    )
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """What was done to a file.
+
+    Args:
+        further: Inputs and outputs that were given a batch axis.
+        tolerance: Relative L2 difference that this may make.
+    """
+
+    further: list[str]
+    tolerance: float = TOLERANCE
 
 
 def _description(path: Path) -> Description:
@@ -150,18 +246,21 @@ def _load(path: Path) -> Any:
     return model
 
 
+def _tensors(values: Iterable[Any]) -> tuple[TensorSpec, ...]:
+    return tuple(_tensor(value) for value in values)
+
+
 def _tensor(value: Any) -> TensorSpec:
     kind = value.type.tensor_type
-    if kind.elem_type not in DTYPE_OF:
-        raise SourceError(
-            f"'{value.name}' has the ONNX type {kind.elem_type}; allowed: {', '.join(DTYPE_OF.values())}."
-        )
     axes = [axis.dim_value if axis.HasField("dim_value") else (axis.dim_param or "n") for axis in kind.shape.dim]
     if axes and isinstance(axes[0], str):
         axes[0] = 1
-    if math.prod(axis for axis in axes if isinstance(axis, int)) < 1 or not axes:
-        raise SourceError(f"'{value.name}' has the shape {axes}; a policy needs at least one axis of 1 or more.")
-    return TensorSpec(value.name, tuple(axes), DTYPE_OF[kind.elem_type])
+    if math.prod(axis for axis in axes if isinstance(axis, int)) < 1:
+        raise SourceError(
+            f"'{value.name}' has the shape {axes}; each axis of a policy's tensors has a length of 1 or more.",
+            "export the file again where it was made, without what is empty",
+        )
+    return TensorSpec(value.name, tuple(axes), type_name(kind.elem_type))
 
 
 def _check_names(model: Any, spec: PolicySpec) -> None:
@@ -184,35 +283,6 @@ def _named_after(model: Path, copy: Path) -> Iterator[None]:
         if isinstance(error, GraphError) and not error.fix:
             error.fix = "fix the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
         raise
-
-
-def _compare(
-    before: Path, out: Path, manifest: Manifest, observations: list[dict[str, Any]], unbatched: list[str]
-) -> None:
-    """Compare the converted graph with the file that it came from, which has no batch axis in some tensors.
-
-    Raises:
-        SourceError: when ONNX Runtime computes something else.
-    """
-    programs = []
-    for path in (before, out / "graphs/main.onnx"):
-        with risky(engine_class(), f"opened {path.name}"):
-            programs.append(Program(manifest.program, {"main": engine_class()(path, threads=1)}, SEED))
-    encode = ObservationEncoder(manifest.spec, out / "assets")
-    for observation in observations:
-        feeds = encode(observation)
-        as_before = {name: value[0] if name in unbatched else value for name, value in feeds.items()}
-        expected, got = (
-            program.run(inputs)[manifest.spec.action.name]
-            for program, inputs in zip(programs, (as_before, dict(feeds)), strict=True)
-        )
-        error = relative_error(got, expected)
-        if not error <= TOLERANCE:
-            raise SourceError(
-                f"Converted to another opset, the ONNX file computes something else: relative L2 error {error:.3g}, "
-                f"allowed {TOLERANCE:g}.",
-                "leave --opset out, or export the file again where it was made",
-            )
 
 
 def _refuse_bare(folder: Path) -> None:

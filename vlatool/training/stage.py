@@ -115,6 +115,12 @@ class TrainingStage(ModuleStage):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """No episode of the training is one of the evaluation's, and the teacher is another policy."""
         super().check(source, profile)
+        for tensor in source.manifest.spec.inputs if source else ():
+            if not tensor.shape:
+                raise RecipeError(
+                    f"{self.name()} learns from batches, and the input '{tensor.name}' has no axes.",
+                    "write its shape as [1] in policy.yaml, and take it so in forward()",
+                )
         if self.device == "cuda":
             self._device()
         if self.teacher:

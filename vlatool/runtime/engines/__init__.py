@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 from vlatool.errors import require
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from vlatool.runtime.engines._branches import BranchesSession
+    from vlatool.runtime.engines._ort_profile import OrtProfiled
     from vlatool.runtime.engines._reference import ReferenceSession
 
 
@@ -41,6 +44,23 @@ def build_tool(name: str) -> Any:
     """
     require("onnx", "build")
     return require(f"onnxruntime.{name}", "ort")
+
+
+def traced(path: Path, scratch: Path) -> OrtProfiled:
+    """Open a graph as it is written, without any rewriting, to see what its nodes are fed and give.
+
+    Raises:
+        GraphError: when ONNX Runtime refuses it.
+        MissingExtra: when onnxruntime is not installed.
+    """
+    from vlatool.runtime.engines._ort_profile import OrtProfiled
+
+    ort = require("onnxruntime", "ort")
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    options.intra_op_num_threads = 1
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+    return OrtProfiled(ort, path, options, scratch, [])
 
 
 def node_session(content: bytes) -> Any:

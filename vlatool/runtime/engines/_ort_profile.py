@@ -12,6 +12,7 @@ from vlatool.errors import GraphError
 from vlatool.runtime.engine import FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
 
 INTEGER = ("MatMulInteger", "QLinear", "QGemm", "ConvInteger", "DynamicQuantize", "QAttention", "QEmbed")
+Ran = tuple[int, tuple[tuple[int, ...], ...], tuple[tuple[int, ...], ...]]
 CONTAINERS = ("If", "Loop", "Scan")
 """Their time is that of the nodes inside, which have entries of their own."""
 
@@ -33,6 +34,16 @@ class OrtProfiled:
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         return dict(zip(self._outputs, self._session.run(self._outputs, feeds), strict=True))
 
+    def ran(self) -> dict[str, Ran]:
+        """Return node -> how often it ran, and the shapes of its inputs and of its outputs the last time."""
+        seen: dict[str, Ran] = {}
+        for event in json.loads(Path(self._session.end_profiling()).read_text(encoding="utf-8")):
+            about, name = event.get("args", {}), event["name"].removesuffix("_kernel_time")
+            if event["cat"] == "Node" and name != event["name"]:
+                times = seen[name][0] + 1 if name in seen else 1
+                seen[name] = (times, _shapes(about, "input_type_shape"), _shapes(about, "output_type_shape"))
+        return seen
+
     def times(self) -> list[dict[Node, float]]:
         events = json.loads(Path(self._session.end_profiling()).read_text(encoding="utf-8"))
         starts = sorted(event["ts"] for event in events if event["name"] == "model_run")
@@ -46,6 +57,10 @@ class OrtProfiled:
             run = runs[bisect_right(starts, event["ts"]) - 1]
             run[key] = run.get(key, 0.0) + event["dur"]
         return runs
+
+
+def _shapes(about: Mapping[str, Any], side: str) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(map(int, shape)) for tensor in about.get(side, ()) for shape in tensor.values())
 
 
 def precision(node: Node) -> str:

@@ -31,11 +31,8 @@ NUMPY_OF: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype(np.float32),
     "tensor(float16)": np.dtype(np.float16),
     "tensor(double)": np.dtype(np.float64),
-    "tensor(uint8)": np.dtype(np.uint8),
-    "tensor(int8)": np.dtype(np.int8),
-    "tensor(int32)": np.dtype(np.int32),
-    "tensor(int64)": np.dtype(np.int64),
     "tensor(bool)": np.dtype(np.bool_),
+    **{f"tensor({sign}int{bits})": np.dtype(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
 }
 Array = NDArray[Any]
 IGNORED_PROVIDERS = ("AzureExecutionProvider",)
@@ -250,7 +247,7 @@ class _BoundBuffers:
     def of(cls, session: Any, ort: Any) -> _BoundBuffers | None:
         """Return buffers for a session, or None when a shape is dynamic, a type is not numpy's, or they are large."""
         inputs = {node.name: _buffer(node) for node in session.get_inputs()}
-        outputs = {node.name: _buffer(node) for node in session.get_outputs()}
+        outputs = {node.name: _buffer(node) if node.shape else None for node in session.get_outputs()}  # see _port
         small = {name: buffer for name, buffer in inputs.items() if buffer is not None}
         results = {name: buffer for name, buffer in outputs.items() if buffer is not None}
         total = sum(buffer.nbytes for buffer in (*small.values(), *results.values()))

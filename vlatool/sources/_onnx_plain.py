@@ -1,0 +1,81 @@
+"""What other tools write, as the stages read it: constants as initializers, which are no inputs, in one graph."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from vlatool.errors import require
+from vlatool.graph.nodes import name_nodes
+
+MOVERS = ("Identity", "Cast", "Transpose", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Split")
+"""Operators through which exporters let a weight go on its way to a layer."""
+LATER_IR = 4
+"""Version of the file format from which initializers need not be inputs."""
+
+
+def plain(model: Any) -> Any:
+    """Return a model with the same outputs whose weights are initializers, and that has no local functions.
+
+    What depends on nothing but constants, and moves or casts them, is done here: a product whose weight is a node is
+    not a layer to what quantizes or counts.
+
+    Args:
+        model: A ``ModelProto`` with its weights, changed in place where it can be.
+    """
+    if model.functions:
+        model = require("onnx.inliner", "build").inline_local_functions(model)
+    graph = model.graph
+    stored = {tensor.name: tensor for tensor in graph.initializer}
+    inputs = [value for value in graph.input if value.name not in stored]
+    if len(inputs) < len(graph.input):
+        del graph.input[:]
+        graph.input.extend(inputs)
+    model.ir_version = max(model.ir_version, LATER_IR)
+    given = {value.name for value in graph.output}
+    nodes = []
+    for node in graph.node:
+        made = {} if given.intersection(node.output) else _made(model, node, stored)
+        for name, tensor in made.items():
+            graph.initializer.append(tensor)
+            stored[name] = graph.initializer[-1]
+        if not made:
+            nodes.append(node)
+    nodes = copy.deepcopy(nodes)
+    del graph.node[:]
+    graph.node.extend(nodes)
+    name_nodes(model)
+    return model
+
+
+def _made(model: Any, node: Any, stored: dict[str, Any]) -> dict[str, Any]:
+    """Return the constants that a node makes of constants; none where it does something else."""
+    if node.domain not in ("", "ai.onnx"):
+        return {}
+    held = next((item.t for item in node.attribute if item.name == "value"), None)
+    if node.op_type == "Constant" and held is not None:
+        tensor = copy.deepcopy(held)
+        tensor.name = node.output[0]
+        return {tensor.name: tensor}
+    constant = node.op_type == "Constant" or (node.op_type in MOVERS and node.input)
+    if not constant or not all(name in stored for name in node.input if name):
+        return {}
+    return _evaluated(model, node, [stored[name] for name in node.input if name])
+
+
+def _evaluated(model: Any, node: Any, constants: list[Any]) -> dict[str, Any]:
+    onnx = require("onnx", "build")
+    reference, helper = require("onnx.reference", "build"), onnx.helper
+    outputs = [onnx.ValueInfoProto(name=name) for name in node.output if name]
+    alone = helper.make_model(
+        helper.make_graph([node], "constant", [], outputs, constants),
+        opset_imports=model.opset_import, ir_version=model.ir_version,
+    )  # fmt: skip
+    try:
+        values = reference.ReferenceEvaluator(alone).run(None, {})
+        return {
+            value.name: onnx.numpy_helper.from_array(array, value.name)
+            for value, array in zip(outputs, values, strict=True)
+        }
+    except Exception:  # the seam: what onnx cannot compute stays a node
+        return {}
