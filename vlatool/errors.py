@@ -16,7 +16,8 @@ VlatoolError                 70  our bug, unless a subclass says otherwise
 │   └── PluginError              another package that adds something to vlatool
 ├── MissingExtra              4  an optional dependency is absent; names the extra
 ├── GateFailed                1  measured, and outside the limits
-└── Inconclusive              5  measured, and the samples cannot decide
+├── Inconclusive              5  measured, and the samples cannot decide
+└── FallsShort                5  what can be made is clearly less than what was asked for
 """
 
 from __future__ import annotations
@@ -129,6 +130,16 @@ class Inconclusive(VlatoolError):
     """The measurement cannot decide; more samples would."""
 
     exit_code = 5
+
+
+class FallsShort(VlatoolError):
+    """What can be made is clearly less than what was asked for."""
+
+    exit_code = 5
+
+
+NOT_MADE = (3, 4, 5)
+"""Exit codes of errors that say that something cannot be made of a policy; where others are tried, these go on."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

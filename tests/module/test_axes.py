@@ -10,6 +10,7 @@ from torch import nn
 from torch.nn import functional
 
 from vlatool.errors import SourceError
+from vlatool.module._resized import Resizer
 from vlatool.module.axes import Member, Walk
 from vlatool.module.cut import RETRACE, cut, traced
 from vlatool.module.edits import Edit
@@ -127,6 +128,158 @@ def test_what_is_normalised_over_read_or_given_stays():
             return torch.cumsum(self.two(self.norm(self.one(self.table(ids)))), -1)
 
     assert units(walked(Net(), torch.ones(2, 3, dtype=torch.int64))) == {}
+
+
+class Spatial(nn.Module):
+    """Grouped, transposed and depthwise convolutions, normalisation in groups, pools, interpolation, clamps."""
+
+    def __init__(self):
+        super().__init__()
+        self.first = nn.Linear(3, 8 * 16)
+        self.up = nn.ConvTranspose2d(8, 12, 4, 2, 1)
+        self.norm = nn.GroupNorm(4, 12)
+        self.grouped = nn.Conv2d(12, 24, 3, padding=1, groups=4)
+        self.deep = nn.Conv2d(24, 48, 3, padding=1, groups=24)
+        self.down = nn.ConvTranspose2d(48, 16, 2, groups=8)
+        self.least, self.most = nn.Parameter(-torch.rand(16, 1, 1)), nn.Parameter(torch.rand(16, 1, 1))
+        self.last = nn.Linear(16 * 4, 5)
+
+    def forward(self, state):
+        x = self.up(self.first(state).relu().view(-1, 8, 4, 4))
+        x = functional.max_pool2d(functional.silu(self.norm(x)), 2)
+        x = self.deep(self.grouped(x).relu())
+        x = self.down(functional.interpolate(x, scale_factor=2, mode="bilinear"))
+        x = torch.clamp(x, min=self.least, max=self.most)
+        return self.last(functional.adaptive_avg_pool2d(x, 2).flatten(1))
+
+
+class Mixed(nn.Module):
+    """Products in einsum, attention with a bias for each head, a recurrent layer and a cell that begin with zeros."""
+
+    def __init__(self):
+        super().__init__()
+        self.up, self.down = nn.Parameter(torch.randn(3, 6, 8)), nn.Parameter(torch.randn(3, 8, 6))
+        self.joint, self.bias, self.out = nn.Linear(6, 3 * 4 * 2), nn.Parameter(torch.randn(4, 1, 1)), nn.Linear(8, 6)
+        self.layer, self.cell, self.last = nn.GRU(6, 8, batch_first=True), nn.LSTMCell(8, 10), nn.Linear(10, 2)
+
+    def forward(self, x):
+        parts = torch.softmax(x[..., :3], -1)
+        hidden = torch.einsum("btd,edh->bteh", x, self.up).relu()
+        x = x + torch.einsum("bteh,ehd,bte->btd", hidden, self.down, parts)
+        q, k, v = self.joint(x).unflatten(-1, (3, 4, 2)).transpose(1, 3).unbind(2)
+        x = x + self.out((torch.softmax(q @ k.mT + self.bias, -1) @ v).transpose(1, 2).flatten(2))
+        x, state = self.layer(x)[0], (torch.zeros(len(x), 10), x.new_zeros(len(x), 10))
+        for step in range(2):
+            state = self.cell(x[:, step], state)
+        return self.last(state[0])
+
+
+@pytest.mark.parametrize(("make", "shape", "wanted"), [
+    (Spatial, (1, 3), {
+        "first.weight 0.0": 8, "least 0.0": 4, "least 0.1": 2, "least 0.2": 2, "grouped.weight 0.2": 3,
+        "deep.weight 0.3": 2,
+    }),
+    (Mixed, (1, 4, 6), {
+        "up 2.0": 8, "bias 0.0": 4, "joint.weight 0.2": 2, "layer.weight_ih_l0 0.1": 8,
+        "cell.weight_ih 0.1": 10,
+    }),
+])  # fmt: skip
+def test_units_of_odd_operators_go_without_a_trace(make: type[nn.Module], shape: tuple[int, ...], wanted: dict):
+    torch.manual_seed(0)
+    module, feed = make().eval(), torch.randn(shape)
+    walk = walked(module, feed)
+    assert (walk.unknown, units(walk)) == (set(), wanted)
+    edits, whole = [], copy.deepcopy(module)
+    for members in walk.members().values():
+        first, keep = members[0], tuple(range(0, members[0].sizes[members[0].place], 2))
+        edits.append(Edit("main", first.weight, f"units {first.axis}.{first.place}", keep))
+        for member in members:
+            silence(whole.get_parameter(member.weight), member, keep)
+    small = cut(module, [feed], edits)
+    with torch.no_grad():
+        torch.testing.assert_close(small(feed), whole(feed))
+
+
+class Blocked(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.one, self.two, self.three = nn.Linear(4, 6), nn.Linear(6, 6), nn.Linear(6, 5)
+
+    def forward(self, x):
+        return self.three(self.two(torch.cummax(self.one(x), -1)[0]).relu())
+
+
+def test_an_operator_without_a_rule_keeps_what_touches_it_and_is_named():
+    walk = walked(Blocked(), torch.randn(1, 4))
+    assert walk.unknown == {"aten.cummax"}
+    assert units(walk) == {"two.weight 0.0": 6}
+    assert [walk.keeps(product) for product in range(3)] == [
+        {"the policy's inputs", "aten.cummax"}, {"aten.cummax"}, {"the policy's outputs"},
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "macs"), [
+    (lambda w, x: torch.chain_matmul(x, w), 3 * 4 * 5), (lambda w, x: torch.tensordot(x, w, dims=1), 3 * 4 * 5),
+    (lambda w, x: torch.cummax(x @ w, 1)[0], 3 * 4 * 5), (lambda w, x: torch.einsum("ij,jk", x, w), 3 * 4 * 5),
+    (lambda w, x: torch.einsum("ij,ik,jl->kl", x, x, w), 4 * 3 * 4 + 4 * 4 * 5),
+    (lambda w, x: torch.mv(w.t(), x[0]), 4 * 5), (lambda w, x: functional.conv1d(x[:, :, None], w.t()[:, :, None]), 60),
+    (lambda w, x: functional.conv_transpose1d(x[:, :, None], w[:, :, None]), 60),
+])  # fmt: skip
+def test_multiply_accumulates_are_counted_with_a_rule_and_without_one(call, macs: int):
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = nn.Parameter(torch.randn(4, 5))
+
+        def forward(self, x):
+            return call(self.weight, x)
+
+    walk = walked(Net(), torch.randn(3, 4)[None][0])
+    assert sum(walk.factors.size(axis for each in product for axis in each) for product in walk.products) == macs
+
+
+def test_an_operator_of_another_package_is_not_taken_for_one_of_torch():
+    @torch.library.custom_op("apart::relu", mutates_args=())
+    def relu(x: torch.Tensor) -> torch.Tensor:
+        return x.flip(-1)
+
+    relu.register_fake(torch.empty_like)
+    walk = walked(nn.Sequential(nn.Linear(4, 6), Called(relu), nn.Linear(6, 2)), torch.randn(1, 4))
+    assert (walk.unknown, units(walk)) == ({"apart.relu"}, {})
+
+
+class Called(nn.Module):
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def forward(self, x):
+        return self.function(x)
+
+
+def test_a_cut_that_cannot_run_is_not_the_policys_fault(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Resizer, "resize", lambda self, node: None)
+    module = nn.Sequential(nn.Linear(4, 8), nn.Unflatten(1, (8, 1)), nn.Flatten(), nn.Linear(8, 3))
+    with pytest.raises(RuntimeError, match="what pruning left of the module cannot run: "):
+        cut(module, [torch.randn(1, 4)], [Edit("main", "0.weight", "units 0.0", (0, 2))])
+
+
+def test_a_tied_weight_is_one_axis_of_both_names_and_stays_tied():
+    class Tied(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.a, self.b, self.c, self.d = nn.Linear(4, 8), nn.Linear(8, 8), nn.Linear(8, 8), nn.Linear(8, 2)
+            self.c.weight = self.b.weight
+
+        def forward(self, x):
+            return self.d(self.c(self.b(self.a(x)).relu()))
+
+    module, feed = Tied(), torch.randn(1, 4)
+    (members,) = walked(module, feed).members().values()
+    assert {each.weight for each in members} >= {"b.weight", "c.weight"}
+    small = cut(module, [feed], [Edit("main", "a.weight", "units 0.0", (0, 2, 4))])
+    assert small.get_parameter("b.weight") is small.get_parameter("c.weight")
+    assert small.get_parameter("b.weight").shape == (3, 3)
 
 
 def test_work_is_counted():

@@ -12,7 +12,17 @@ from torch import nn
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import SourceError
-from vlatool.module.edits import EDITS, Edit, apply, edited, is_changed, read_edits, write_module
+from vlatool.module.edits import (
+    EDITS,
+    Edit,
+    apply,
+    edited,
+    is_changed,
+    load_tensors,
+    read_edits,
+    read_tensors,
+    write_module,
+)
 
 
 def mlp() -> nn.Module:
@@ -87,6 +97,36 @@ def test_what_is_written_is_made_again(changed: Bundle):
     torch.testing.assert_close(again(x), wanted(x))
     structure = edited({"main": mlp()}, changed, weights=False)["main"]
     assert structure[0].out_features == 2
+
+
+def test_a_tied_weight_is_stored_once_and_given_to_all_of_its_names(tmp_path: Path):
+    def tied() -> nn.Sequential:
+        net = nn.Sequential(nn.Linear(6, 6), nn.ReLU(), nn.Linear(6, 6))
+        net[2].weight = net[0].weight
+        return net
+
+    whole, again = tied(), tied()
+    write_module(tmp_path, (), {"main": whole})
+    tensors = read_tensors(tmp_path / "module/main.safetensors")
+    assert sorted(tensors) == ["0.bias", "0.weight", "2.bias"]
+    load_tensors("main", again, tensors, "a file")
+    assert again[2].weight is again[0].weight
+    torch.testing.assert_close(again.state_dict(), whole.state_dict())
+    other = {**tensors, "2.weight": tensors.pop("0.weight")}
+    other.pop("0.weight")
+    load_tensors("main", tied(), other, "a file that has the other name")
+    with pytest.raises(SourceError, match=r"No tensor of a file is '0\.weight'"):
+        load_tensors("main", tied(), tensors, "a file")
+
+
+def test_views_of_one_memory_are_stored_apart(tmp_path: Path):
+    module, memory = nn.Linear(2, 3, bias=False), torch.randn(4, 2)
+    module.weight = nn.Parameter(memory[:3])
+    module.register_buffer("last", memory[3:])
+    write_module(tmp_path, (), {"main": module})
+    assert {name: tuple(value.shape) for name, value in read_tensors(tmp_path / "module/main.safetensors").items()} == {
+        "weight": (3, 2), "last": (1, 2),
+    }  # fmt: skip
 
 
 def test_a_bundle_without_changes_has_none(source_bundle: Bundle):

@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
+from vlatool.cli import main
 from vlatool.data import recorded_observations
 from vlatool.distill.policy import PolicyDistillation
-from vlatool.errors import BundleError, RecipeError
+from vlatool.errors import BundleError, FallsShort, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.graph.workload import workload
+from vlatool.module.axes import Walk
+from vlatool.module.cut import traced
 from vlatool.module.edits import read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
+from vlatool.prune._selection import Selection
+from vlatool.prune._units import groups_of
 from vlatool.prune.structured import Structured
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
 from vlatool.runtime.policy import relative_error
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
+from vlatool.stage.controls import removed_by
 from vlatool.stage.run import run_transform
 
 FINE = {"samples": 4, "multiple": 1}
@@ -104,12 +112,86 @@ def test_it_is_trained_further(pruned: Bundle, source_bundle: Bundle, tmp_path: 
 @pytest.mark.parametrize(("options", "says"), [
     ({"include": ("blok*",)}, r"No weight that can be pruned matches 'blok\*'"),
     ({"exclude": ("*",)}, "has no heads, neurons or channels that could go"),
-    ({"ratio": 0.95}, r"No more than \d+.\d% of the multiply-accumulates can go"),
 ])  # fmt: skip
 def test_wrong_options_are_told(source_bundle: Bundle, tmp_path: Path, options: dict[str, object], says: str):
     stage = build_stage("prune.structured", {"rank": "magnitude", **options})
     with pytest.raises(RecipeError, match=says):
         stage.change(load_modules(source_bundle), source_bundle, Context())
+
+
+def test_a_result_that_falls_short_is_refused_by_name(source_bundle: Bundle, tmp_path: Path):
+    stage = Structured(ratio=0.95, rank="magnitude", **FINE)
+    with pytest.raises(
+        FallsShort, match=r"Asked for 95.0% less work; no more than \d+.\d% .* aten.embedding \(\d"
+    ) as it:
+        run_transform(stage, source_bundle, tmp_path / "out", Context())
+    assert it.value.fix.startswith("ask for less: --ratio 0.")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_was_asked_and_reached_is_said_and_recorded(pruned: Bundle, source_bundle: Bundle, tmp_path: Path):
+    context = Context()
+    again = run_transform(Structured(ratio=0.1, rank="magnitude", **FINE), pruned, tmp_path / "again", context)
+    record = again.manifest.made_by["pruned"]
+    assert (record["asked"], record["without_rule"]) == (0.1, [])
+    assert 0.09 <= record["reached"] <= 0.15
+    assert record["reached"] == round(1 - record["macs"][1] / record["macs"][0], 4)
+    assert f"asked for 10.0% less work, reached {record['reached']:.1%} (" in context.said[0]
+    assert [line.split(",")[0] for line in removed_by(again)] == [
+        f"prune.structured: asked for {asked}% less work" for asked in ("30.0", "10.0")
+    ]
+
+
+@pytest.mark.parametrize(("ratio", "stays"), [(0.25, 12), (0.3, 8), (0.28, 8)])
+def test_a_step_that_is_too_much_is_put_back_where_nearly_enough_is_gone(ratio: float, stays: int):
+    """Each step takes a quarter of 96 in 100: 24 are nearly 25 enough, 48 are nearly twice of it."""
+    module = nn.Sequential(nn.Linear(3, 16, bias=False), nn.Linear(16, 3, bias=False), nn.Linear(3, 1), nn.Linear(1, 1))
+    walks = {"main": Walk(traced(module, [torch.randn(1, 3)]))}
+    groups = groups_of(walks, Selection(("0.weight",), ()), 4, "steps")
+    Structured(ratio=ratio, multiple=4).choose(walks, groups, {"main": 1}, Context())
+    assert groups[0].stays == stays
+
+
+BLOCKED = """
+import torch
+from torch import nn
+
+
+class Blocked(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.one, self.two = nn.Linear(6, 32), nn.Linear(32, 2)
+
+    def forward(self, state):
+        return self.two(torch.cummax(self.one(state), -1)[0]).reshape(-1, 1, 2)
+
+
+make = Blocked
+"""
+BLOCKED_YAML = """
+schema: 1
+name: blocked
+version: 1.0.0
+source: policy.py:make
+spec:
+  inputs: [{name: state, shape: [1, 6], dtype: float32}]
+  outputs: [{name: action, shape: [1, 1, 2], dtype: float32}]
+  control_hz: 10
+  chunk: 1
+"""
+
+
+def test_the_command_line_ends_with_5_and_names_what_blocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "policy.py").write_text(BLOCKED)
+    (tmp_path / "policy.yaml").write_text(BLOCKED_YAML)
+    words = ["prune", "structured", str(tmp_path), "-o", str(tmp_path / "out"), "--rank", "magnitude", "--json"]
+    with pytest.raises(SystemExit) as left:
+        main(words)
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (left.value.code, error["type"], error["exit_code"]) == (5, "FallsShort", 5)
+    assert "no more than 0.0%" in error["message"]
+    assert "aten.cummax (100.0%)" in error["message"]
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_has_graphs_cannot_be_pruned(float_bundle: Bundle, tmp_path: Path):

@@ -27,7 +27,7 @@ from vlatool.machine.instruction_sets import ENGINE, board_set
 from vlatool.report import Report
 from vlatool.stage.base import Context, Measure, Stage, Transform
 from vlatool.stage.build import build_stage
-from vlatool.stage.controls import controls
+from vlatool.stage.controls import PRUNED, controls
 from vlatool.stage.finish import read_difference
 from vlatool.stage.run import cache_directory, cached_transform, first_steps, measured, measured_with, run_transform
 
@@ -127,7 +127,8 @@ def transform(
     if as_json:
         document({
             "bundle": str(out), "hash": result.hash, "bytes": result.size_bytes, "precision": precision,
-            "findings": result.manifest.findings, "board": on_board.values() if on_board else None,
+            "findings": result.manifest.findings, "pruned": result.manifest.made_by.get(PRUNED),
+            "board": on_board.values() if on_board else None,
             "difference": asdict(difference) if (difference := read_difference(result)) else None,
         })  # fmt: skip
         _refuse(result, baseline)

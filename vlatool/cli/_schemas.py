@@ -120,8 +120,12 @@ def _documents() -> dict[str, Schema]:
     return {
         "plan": document("What optimize would do.", plan=PLAN),
         "made": document(
-            "A bundle that was written; precision: graph -> dtype -> share of its multiply-accumulates.",
+            "A bundle that was written; precision: graph -> dtype -> share of its multiply-accumulates; pruned: shares "
+            "of the work asked for and reached, and who keeps the rest.",
             bundle=TEXT, hash=TEXT, bytes=INTEGER, precision=by_name(by_name(NUMBER)), findings=many(ANYTHING),
+            pruned={"anyOf": [record(
+                asked=NUMBER, reached=NUMBER, macs=many(INTEGER), keeps=by_name(NUMBER), without_rule=many(TEXT),
+            ), {"type": "null"}]},
             board={"anyOf": [record(
                 board=TEXT, graphs_before={"type": ["integer", "null"]}, graphs_after=INTEGER,
                 predictions=by_name(record(value=NUMBER, low=NUMBER, high=NUMBER, unit=TEXT, note=TEXT)),

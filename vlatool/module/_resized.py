@@ -7,10 +7,13 @@ import operator
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from vlatool.module._axis_values import argument, size_of
 from vlatool.module.axes import Walk
-from vlatool.module.axis_rules import size_of
 
-SIZED = {"reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "unflatten": 2}
+SIZED = {
+    "reshape": 1, "view": 1, "_unsafe_view": 1, "expand": 1, "broadcast_to": 1, "unflatten": 2,
+    "zeros": 0, "ones": 0, "full": 0, "empty": 0, "new_zeros": 1, "new_ones": 1, "new_full": 1, "new_empty": 1,
+}  # fmt: skip
 """Operator -> which of its arguments lists sizes of what it gives."""
 
 
@@ -37,7 +40,7 @@ class Resizer:
         try:
             if name in SIZED and self._walk.shape(node) is not None:
                 self._stated(node, SIZED[name])
-            elif name.startswith("conv"):
+            elif node in self._walk.counts:
                 self._grouped(node)
             elif name in ("split", "split_with_sizes"):
                 self._split(node, name)
@@ -57,8 +60,7 @@ class Resizer:
         if not isinstance(node.args[place], list | tuple):  # of another kind, such as view(dtype)
             return
         shape, stated = self._walk.needed(node), list(node.args[place])
-        apart = len(shape) - len(stated)
-        first = apart if len(node.args) <= place or place == 1 else node.args[1] % (apart + 1)
+        first = node.args[1] % (len(shape) - len(stated) + 1) if place == 2 else 0
         for number, size in enumerate(stated):
             axis = shape[number + first]
             if hasattr(size, "op"):
@@ -85,13 +87,17 @@ class Resizer:
         return less
 
     def _grouped(self, node: Any) -> None:
-        shape = self._walk.shape(node)
-        if len(node.args) > 6 and node.args[6] > 1 and shape is not None:
-            node.args = (*node.args[:6], self.size(shape[1]))
+        """Change the number of groups of a convolution or a normalisation, wherever it stands."""
+        name, groups = self._walk.counts[node]
+        place = [stated.name for stated in node.target._schema.arguments].index(name)
+        if place < len(node.args):
+            node.args = (*node.args[:place], self.size(groups), *node.args[place + 1 :])
+        else:
+            node.kwargs = {**node.kwargs, name: self.size(groups)}
 
     def _split(self, node: Any, name: str) -> None:
         shapes = self._walk.parts(node)
-        along = (node.args[2] if len(node.args) > 2 else node.kwargs.get("dim", 0)) % len(shapes[0])
+        along = argument(node, "dim", 0) % len(shapes[0])
         sizes = [self.size(part[along]) for part in shapes]
         node.args = (node.args[0], sizes if name == "split_with_sizes" else sizes[0], *node.args[2:])
 

@@ -12,12 +12,20 @@ The idea of coupled parameters is that of DepGraph (Fang et al., arXiv 2301.1290
 
 from __future__ import annotations
 
+import contextlib
 import operator
 from dataclasses import dataclass
 from typing import Any
 
-from vlatool.module.axis_rules import RULES, Values, sizes_of
+from vlatool.errors import require
+from vlatool.module._axis_values import Values, sizes_of
+from vlatool.module.axis_rules import TRANSPOSED, rule_for
 from vlatool.module.factors import Shape
+
+REORDERING = (*TRANSPOSED, "permute", "movedim", "detach", "to", "_to_copy", "contiguous", "clone")
+"""Operators after which a weight is still one."""
+INPUT, OUTPUT = "the policy's inputs", "the policy's outputs"
+"""What keeps axes, beside operators."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +37,14 @@ class Member:
         axis: Number of the axis.
         place: Number of the factor in the axis.
         sizes: Sizes of all factors of the axis.
+        reads: Whether a product sums over the axis: the weight reads the units, which others write.
     """
 
     weight: str
     axis: int
     place: int
     sizes: tuple[int, ...]
+    reads: bool = False
 
 
 class Walk(Values):
@@ -42,18 +52,25 @@ class Walk(Values):
 
     Args:
         program: An ``ExportedProgram``.
+
+    Attributes:
+        unknown: Operators without a rule, or of a form that theirs does not know; all axes that touch them stay.
     """
 
     def __init__(self, program: Any) -> None:
         super().__init__()
         self.weights: dict[str, Shape] = {}
+        self.unknown: set[str] = set()
         signature = program.graph_signature
         named = {**signature.inputs_to_parameters, **signature.inputs_to_buffers,
                  **signature.inputs_to_lifted_tensor_constants}  # fmt: skip
+        tensors: dict[int, Shape] = {}
         for node in program.graph.nodes:
             if node.op == "placeholder":
-                self._placeholder(node, named.get(node.name, ""))
+                weight = named.get(node.name, "")
+                self._placeholder(node, weight, tensors, id(program.state_dict.get(weight, node)))
             elif node.op == "output":
+                self.factors.operator = OUTPUT
                 self._freeze_all(node.args)
             elif "val" in node.meta:
                 self._visit(node)
@@ -71,34 +88,56 @@ class Walk(Values):
                 sizes = tuple(self.factors.sizes[leaf] for leaf in leaves)
                 for place, leaf in enumerate(leaves):
                     if not self.factors.is_frozen(leaf):
-                        found.setdefault(leaf, []).append(Member(weight, number, place, sizes))
+                        reads = not self.reads.isdisjoint(axis)
+                        found.setdefault(leaf, []).append(Member(weight, number, place, sizes, reads))
         return found
 
-    def _placeholder(self, node: Any, weight: str) -> None:
+    def keeps(self, product: int) -> set[str]:
+        """Return the operators that keep a whole width of a product's weights."""
+        widths = [self.factors.leaves(axis) for axis in self.widths[product]]
+        whole = [leaves for leaves in widths if all(self.factors.is_frozen(leaf) for leaf in leaves)]
+        return {self.factors.reason(leaf) for leaves in whole for leaf in leaves}
+
+    def _placeholder(self, node: Any, weight: str, tensors: dict[int, Shape], tensor: int) -> None:
+        """Note the axes of an input or a weight; a weight with several names has the same axes under each."""
         value = node.meta.get("val")
         if not hasattr(value, "shape"):
             return
-        shape = [self.factors.new(size, frozen=not weight) for size in sizes_of(value)]
-        self.shapes[node] = shape
+        self.factors.operator = INPUT
+        shape = tensors.get(tensor) or [self.factors.new(size, frozen=not weight) for size in sizes_of(value)]
+        self.shapes[node] = tensors[tensor] = shape
         if weight:
             self.weights[weight] = shape
+            self.stored.add(node)
 
     def _visit(self, node: Any) -> None:
         if node.target is operator.getitem:
             whole = self.shapes.get(node.args[0])
             self.shapes[node] = whole[node.args[1]] if isinstance(whole, list) and whole else self._fresh(node)
             return
-        rule = RULES.get(getattr(node.target, "_opname", ""))  # what computes a size has no name of an operator
-        counted = len(self.products)
+        if not hasattr(node.meta["val"], "shape") and not isinstance(node.meta["val"], list | tuple):
+            return  # a size
+        self.factors.operator = _name_of(node)
+        self.shapes[node] = self._given(node)
+
+    def _given(self, node: Any) -> Any:
+        """Return the axes of what an operator gives; frozen, as those of what it is given, where no rule says them."""
+        rule, counted = rule_for(node.target), len(self.products)
         try:
             given = rule(self, node) if rule is not None else None
-        except (IndexError, KeyError, TypeError, ValueError):  # a form of the operator that the rule does not know
+        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError):  # a form that the rule does not know
             given = None
-        if given is None or not self._fits(node, given):
-            self._freeze_all((node.args, node.kwargs))
-            del self.products[counted:]
-            given = self._fresh(node)
-        self.shapes[node] = given
+        if given is not None and self._fits(node, given):
+            if node.target._opname in REORDERING and node.args[0] in self.stored:
+                self.stored.add(node)
+            return given
+        self.unknown.add(self.factors.operator)
+        self._freeze_all((node.args, node.kwargs))
+        del self.products[counted:], self.widths[counted:]
+        if macs := macs_of(node):
+            widths = [axis for each in node.all_input_nodes if each in self.stored for axis in self.needed(each)]
+            self.multiply(self.frozen([macs]), widths)
+        return self._fresh(node)
 
     def _fits(self, node: Any, given: Any) -> bool:
         """Check what a rule says against the sizes that torch.export noted."""
@@ -128,3 +167,27 @@ class Walk(Values):
         elif hasattr(arguments, "op"):
             for axis in self.shape(arguments) or ():
                 self.factors.freeze(axis)
+
+
+def _name_of(node: Any) -> str:
+    """Return the name of an operator without that of its overload."""
+    return str(node.target).rpartition(".")[0] if hasattr(node.target, "_opname") else str(node.target)
+
+
+def macs_of(node: Any) -> int:
+    """Return how many multiply-accumulates torch counts in an operator that has no rule here; 0 where it cannot."""
+    require("torch", "build")
+    from torch._subclasses.fake_tensor import FakeTensorMode
+    from torch.utils._pytree import tree_map
+    from torch.utils.flop_counter import FlopCounterMode
+
+    def example(value: Any) -> Any:
+        held = value.meta.get("val") if hasattr(value, "op") else value
+        return held.new_empty(sizes_of(held)) if hasattr(held, "shape") else held
+
+    with contextlib.suppress(Exception), FlopCounterMode(display=False) as counter:  # the seam: any operator
+        with FakeTensorMode(allow_non_fake_inputs=True):
+            arguments = tree_map(example, (tuple(node.args), dict(node.kwargs)))
+            node.target(*arguments[0], **arguments[1])
+        return int(counter.get_total_flops()) // 2
+    return 0

@@ -2,63 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-from vlatool.module.factors import Factors, Shape
+from vlatool.module._axis_values import Values as Values
+from vlatool.module._axis_values import argument, sizes_of
+from vlatool.module._axis_values import size_of as size_of
+from vlatool.module._layer_rules import LAYERS
+from vlatool.module._product_rules import PRODUCTS
+from vlatool.module.factors import Shape
 
-
-class Values:
-    """The axes of the values of a graph, and the products that it computes.
-
-    Attributes:
-        factors: What axes are made of.
-        products: Axes over which each multiply-accumulate runs.
-        shapes: Node -> axes of its value, of several values, or None where it is no tensor.
-    """
-
-    def __init__(self) -> None:
-        self.factors = Factors()
-        self.products: list[Shape] = []
-        self.shapes: dict[Any, Any] = {}
-
-    def shape(self, node: Any) -> Shape | None:
-        """Return the axes of a node's value, None where it is no tensor."""
-        found = self.shapes.get(node)
-        return found if isinstance(found, list) and (not found or isinstance(found[0], tuple)) else None
-
-    def needed(self, node: Any) -> Shape:
-        """Return the axes of an argument.
-
-        Raises:
-            TypeError: when it is no tensor.
-        """
-        shape = self.shape(node) if hasattr(node, "op") else None
-        if shape is None:
-            raise TypeError("no tensor")
-        return shape
-
-    def broadcast(self, shapes: Sequence[Shape]) -> Shape:
-        """Unite axes as elementwise operators do, and return those of the result."""
-        rank = max(map(len, shapes), default=0)
-        result: Shape = []
-        for number in range(rank):
-            axes = [shape[number - rank + len(shape)] for shape in shapes if number - rank + len(shape) >= 0]
-            full = [axis for axis in axes if self.factors.size(axis) > 1]
-            for axis in full[1:]:
-                self.factors.unite(full[0], axis)
-            result.append(full[0] if full else ())
-        return result
-
-
-def sizes_of(value: Any) -> list[int]:
-    """Return the sizes of a value; a free one by the example that was traced."""
-    return [size_of(size) for size in value.shape]
-
-
-def size_of(size: Any) -> int:
-    """Return a size, a free one by the example that was traced."""
-    return size if isinstance(size, int) else int(size.node.hint)
+Rule = Callable[[Values, Any], Any]
 
 
 def _same(walk: Values, node: Any) -> Shape:
@@ -70,84 +24,50 @@ def _elementwise(walk: Values, node: Any) -> Shape:
     return walk.broadcast([shape for shape in shapes if shape is not None])
 
 
-def _linear(walk: Values, node: Any) -> Shape:
-    given, weight = walk.needed(node.args[0]), walk.needed(node.args[1])
-    walk.factors.unite(given[-1], weight[1])
-    if len(node.args) > 2 and node.args[2] is not None:
-        walk.factors.unite(weight[0], walk.needed(node.args[2])[0])
-    walk.products.append([*given, weight[0]])
-    return [*given[:-1], weight[0]]
+def _uniform(walk: Values, node: Any) -> Shape:
+    """Give the same number everywhere: as many of them as are needed."""
+    return [walk.factors.new(size) for size in sizes_of(node.meta["val"])]
 
 
-def _matmul(walk: Values, node: Any) -> Shape:
-    one, other = walk.needed(node.args[0]), walk.needed(node.args[1])
-    if len(one) < 2 or len(other) < 2:
-        raise ValueError("vectors")
-    walk.factors.unite(one[-1], other[-2])
-    batch = walk.broadcast([one[:-2], other[:-2]])
-    walk.products.append([*batch, *one[-2:], other[-1]])
-    return [*batch, one[-2], other[-1]]
+def _along(walk: Values, node: Any) -> Any:
+    """Compute along an axis, all of whose elements count: sums so far, sorting, softmax."""
+    given, dims = walk.needed(node.args[0]), argument(node, "dims", argument(node, "dim", -1))
+    listed = dims if isinstance(dims, list | tuple) else [dims]
+    if not listed:  # of the flattened value
+        raise ValueError("no axis")
+    along = {dim % len(given) for dim in listed}
+    for axis in along:
+        walk.factors.freeze(given[axis])
+    value = node.meta["val"]
+    values = value if isinstance(value, list | tuple) else [value]
+    shapes = [_resized(walk, given, sizes_of(each)) for each in values]
+    return shapes if isinstance(value, list | tuple) else shapes[0]
 
 
-def _addmm(walk: Values, node: Any) -> Shape:
-    bias, one, other = (walk.needed(argument) for argument in node.args[:3])
-    walk.factors.unite(one[-1], other[-2])
-    walk.products.append([*one, other[1]])
-    return walk.broadcast([[one[0], other[1]], bias])
+def _resized(walk: Values, given: Shape, sizes: list[int]) -> Shape:
+    """Return axes; new ones, whose elements stay, where a size is another one."""
+    return [axis if walk.factors.size(axis) == size else walk.factors.new(size, frozen=True)
+            for axis, size in zip(given, sizes, strict=True)]  # fmt: skip
 
 
-def _convolution(walk: Values, node: Any) -> Shape:
-    given, weight = walk.needed(node.args[0]), walk.needed(node.args[1])
-    groups = node.args[6] if len(node.args) > 6 else node.kwargs.get("groups", 1)
-    if groups == 1:
-        walk.factors.unite(given[1], weight[1])
-    elif groups == walk.factors.size(given[1]) == walk.factors.size(weight[0]):
-        walk.factors.unite(given[1], weight[0])
-    else:
-        raise ValueError("grouped")
-    if len(node.args) > 2 and node.args[2] is not None:
-        walk.factors.unite(weight[0], walk.needed(node.args[2])[0])
-    for axis in (*given[2:], *weight[2:]):
-        walk.factors.freeze(axis)
-    space = [walk.factors.new(size, frozen=True) for size in sizes_of(node.meta["val"])[2:]]
-    walk.products.append([given[0], *weight, *space])
-    return [given[0], weight[0], *space]
-
-
-def _channels(walk: Values, node: Any) -> Shape:
-    """Normalise every channel by itself."""
+def _triangle(walk: Values, node: Any) -> Shape:
     given = walk.needed(node.args[0])
-    for argument in node.args[1:5]:
-        if hasattr(argument, "op"):
-            walk.factors.unite(given[1], walk.needed(argument)[0])
-    return given
-
-
-def _over_last(walk: Values, node: Any) -> Shape:
-    """Normalise over the last axes: all of their elements count."""
-    given = walk.needed(node.args[0])
-    for axis, argument in [(given[-1], each) for each in node.args[2:4] if hasattr(each, "op")]:
-        walk.factors.unite(axis, walk.needed(argument)[-1])
-    for axis in given[-len(node.args[1]) :]:
+    for axis in given[-2:]:
         walk.factors.freeze(axis)
     return given
 
 
-def _softmax(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
-    walk.factors.freeze(given[node.args[1]])
-    return given
-
-
-def _reduce(walk: Values, node: Any) -> Shape:
-    given = walk.needed(node.args[0])
-    which = node.args[1] if len(node.args) > 1 else node.kwargs.get("dim")
-    axes = range(len(given)) if which is None else ([which] if isinstance(which, int) else which)
-    gone = {axis % len(given) for axis in axes}
-    keep = node.args[2] if len(node.args) > 2 else node.kwargs.get("keepdim", False)
+def _reduce(walk: Values, node: Any) -> Any:
+    given, which = walk.needed(node.args[0]), argument(node, "dim")
+    if node.target._opname in ("max", "min") and argument(node, "other") is not None:
+        return _elementwise(walk, node)
+    axes = range(len(given)) if which is None or which == [] else ([which] if isinstance(which, int) else which)
+    gone, keep = {axis % len(given) for axis in axes}, argument(node, "keepdim", False)
     for axis in gone:
         walk.factors.freeze(given[axis])
-    return [() if number in gone else axis for number, axis in enumerate(given) if keep or number not in gone]
+    shape = [() if number in gone else axis for number, axis in enumerate(given) if keep or number not in gone]
+    value = node.meta["val"]
+    return [shape for _ in value] if isinstance(value, list | tuple) else shape
 
 
 def _reshape(walk: Values, node: Any) -> Shape | None:
@@ -169,22 +89,50 @@ def _permute(walk: Values, node: Any) -> Shape:
 
 def _transpose(walk: Values, node: Any) -> Shape:
     given = list(walk.needed(node.args[0]))
+    if node.target._opname == "numpy_T" and len(given) > 2:
+        raise ValueError("all axes the other way round")
     one, other = node.args[1:3] if len(node.args) > 2 else (-1, -2)
     if len(given) > 1:
         given[one], given[other] = given[other], given[one]
     return given
 
 
+def _moved(walk: Values, node: Any) -> Shape:
+    given = walk.needed(node.args[0])
+    froms, tos = ([each] if isinstance(each, int) else list(each) for each in node.args[1:3])
+    placed = {to % len(given): given[one % len(given)] for one, to in zip(froms, tos, strict=True)}
+    gone = {one % len(given) for one in froms}
+    others = iter([axis for number, axis in enumerate(given) if number not in gone])
+    return [placed[number] if number in placed else next(others) for number in range(len(given))]
+
+
 def _expand(walk: Values, node: Any) -> Shape:
+    """Repeat what has the size 1: its copies are alike, so that some may go."""
     given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
     padded = [()] * (len(sizes) - len(given)) + given
-    return [axis if walk.factors.size(axis) == size else walk.factors.new(size, frozen=True)
+    return [axis if walk.factors.size(axis) == size else walk.factors.new(size)
             for axis, size in zip(padded, sizes, strict=True)]  # fmt: skip
+
+
+def _repeat(walk: Values, node: Any) -> Shape:
+    given = walk.needed(node.args[0])
+    padded = [()] * (len(node.args[1]) - len(given)) + given
+    times = [walk.frozen([1 if isinstance(count, int) and count == 1 else size // walk.factors.size(axis)])[0]
+             for count, size, axis in zip(node.args[1], sizes_of(node.meta["val"]), padded, strict=True)]  # fmt: skip
+    return [(*copies, *axis) for copies, axis in zip(times, padded, strict=True)]
+
+
+def _repeat_each(walk: Values, node: Any) -> Shape:
+    given, along = list(walk.needed(node.args[0])), argument(node, "dim")
+    if not isinstance(node.args[1], int) or along is None:
+        raise ValueError("not as often each")
+    given[along] = (*given[along], *walk.frozen([node.args[1]])[0])
+    return given
 
 
 def _concatenate(walk: Values, node: Any) -> Shape:
     shapes = [walk.needed(part) for part in node.args[0]]
-    along = (node.args[1] if len(node.args) > 1 else node.kwargs.get("dim", 0)) % len(shapes[0])
+    along = argument(node, "dim", 0) % len(shapes[0])
     result: Shape = []
     for number, size in enumerate(sizes_of(node.meta["val"])):
         if number == along:
@@ -192,36 +140,51 @@ def _concatenate(walk: Values, node: Any) -> Shape:
                 walk.factors.freeze(shape[number])
             result.append(walk.factors.new(size, frozen=True))
             continue
-        for shape in shapes[1:]:
-            walk.factors.unite(shapes[0][number], shape[number])
-        result.append(shapes[0][number])
+        result.append(walk.broadcast([[shape[number]] for shape in shapes])[0])
     return result
+
+
+def _stack(walk: Values, node: Any) -> Shape:
+    result = walk.broadcast([walk.needed(part) for part in node.args[0]])
+    along = argument(node, "dim", 0) % (len(result) + 1)
+    return [*result[:along], *walk.frozen([len(node.args[0])]), *result[along:]]
+
+
+def _unbind(walk: Values, node: Any) -> list[Shape]:
+    given, along = walk.needed(node.args[0]), argument(node, "dim", 0)
+    walk.factors.freeze(given[along])
+    rest = [axis for number, axis in enumerate(given) if number != along % len(given)]
+    return [rest for _ in node.meta["val"]]
 
 
 def _parts(walk: Values, node: Any) -> list[Shape] | None:
     """Cut an axis into equal parts: which part it is is a factor of its own."""
     given = walk.needed(node.args[0])
-    along = (node.args[2] if len(node.args) > 2 else node.kwargs.get("dim", 0)) % len(given)
+    along = argument(node, "dim", 0) % len(given)
     values = [sizes_of(value)[along] for value in node.meta["val"]]
     if len(set(values)) > 1:
-        return None
-    leaves = list(walk.factors.leaves(given[along]))
-    which = walk.factors.taken(leaves, len(values))
-    if which is None:
-        return None
+        walk.factors.freeze(given[along])
+        return [[*given[:along], *walk.frozen([size]), *given[along + 1 :]] for size in values]
+    which, inside = walk.factors.parted(given[along], len(values))
     walk.factors.freeze(which)
-    part: Shape = [*given[:along], tuple(leaves), *given[along + 1 :]]
+    part: Shape = [*given[:along], inside, *given[along + 1 :]]
     return [part for _ in values]
+
+
+def _gated(walk: Values, node: Any) -> Shape:
+    """Multiply the first half of an axis by a sigmoid of the second one."""
+    given, along = list(walk.needed(node.args[0])), argument(node, "dim", -1)
+    half, given[along] = walk.factors.parted(given[along], 2)
+    walk.factors.freeze(half)
+    return given
 
 
 def _slice(walk: Values, node: Any) -> Shape:
     given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    result = list(given)
-    for number, (axis, size) in enumerate(zip(given, sizes, strict=True)):
+    for axis, size in zip(given, sizes, strict=True):
         if walk.factors.size(axis) != size:
             walk.factors.freeze(axis)
-            result[number] = walk.factors.new(size, frozen=True)
-    return result
+    return _resized(walk, given, sizes)
 
 
 def _select(walk: Values, node: Any) -> Shape:
@@ -231,6 +194,29 @@ def _select(walk: Values, node: Any) -> Shape:
     return [axis for number, axis in enumerate(given) if number != along]
 
 
+def _index(walk: Values, node: Any) -> Shape:
+    """Take elements of one axis by their numbers."""
+    given, listed = walk.needed(node.args[0]), node.args[1]
+    by_name = not isinstance(listed, list | tuple)
+    numbers = [node.args[2]] if by_name else [each for each in listed if each is not None]
+    if len(numbers) != 1:
+        raise ValueError("several axes")
+    along = listed % len(given) if by_name else next(at for at, each in enumerate(listed) if each is not None)
+    walk.factors.freeze(given[along])
+    taken = sizes_of(node.meta["val"])[along : along + len(walk.needed(numbers[0]))]
+    return [*given[:along], *walk.frozen(taken), *given[along + 1 :]]
+
+
+def _by_numbers(walk: Values, node: Any) -> Shape:
+    """Take or put elements along one axis, each by a number of its own: the other axes go together."""
+    values = [walk.needed(each) for each in node.all_input_nodes]
+    along = node.args[1] % len(values[0])
+    for shape in values:
+        walk.factors.freeze(shape[along])
+    others = walk.broadcast([[*shape[:along], (), *shape[along + 1 :]] for shape in values])
+    return [*others[:along], *walk.frozen([sizes_of(node.meta["val"])[along]]), *others[along + 1 :]]
+
+
 def _embedding(walk: Values, node: Any) -> Shape:
     weight, ids = walk.needed(node.args[0]), walk.needed(node.args[1])
     for axis in weight:
@@ -238,40 +224,45 @@ def _embedding(walk: Values, node: Any) -> Shape:
     return [*ids, weight[1]]
 
 
-def _attention(walk: Values, node: Any) -> Shape:
-    query, key, value = (walk.needed(argument) for argument in node.args[:3])
-    walk.factors.unite(query[-1], key[-1])
-    walk.factors.unite(key[-2], value[-2])
-    walk.factors.freeze(key[-2])
-    if node.kwargs.get("scale") is None:  # the root of the size, which would change
-        walk.factors.freeze(query[-1])
-    if len(node.args) > 3 and hasattr(node.args[3], "op"):
-        walk.broadcast([[*query[:-1], key[-2]], walk.needed(node.args[3])])
-    batch = walk.broadcast([query[:-2], key[:-2], value[:-2]])
-    walk.products += [[*batch, *query[-2:], key[-2]], [*batch, query[-2], key[-2], value[-1]]]
-    return [*batch, query[-2], value[-1]]
-
-
-Rule = Callable[[Values, Any], Any]
-SAME = (
-    "abs", "alias", "celu", "clamp", "clone", "contiguous", "cos", "detach", "dropout", "elu", "exp", "gelu",
-    "hardsigmoid", "hardswish", "hardtanh", "leaky_relu", "log", "mish", "neg", "reciprocal", "relu", "relu_",
-    "relu6", "rsqrt", "selu", "sigmoid", "silu", "silu_", "sin", "softplus", "sqrt", "tanh", "to", "_to_copy",
-    "type_as", "lift_fresh_copy", "round", "floor", "erf", "bitwise_not", "logical_not",
-)  # fmt: skip
-ELEMENTWISE = (
-    "add", "add_", "sub", "sub_", "mul", "mul_", "div", "div_", "pow", "maximum", "minimum", "where", "eq", "ne",
-    "lt", "le", "gt", "ge", "logical_and", "logical_or", "rsub",
-)  # fmt: skip
-RULES: dict[str, Rule] = {
+SAME = ("alias", "clone", "contiguous", "detach", "dropout", "alpha_dropout", "feature_dropout", "to", "_to_copy",
+        "type_as", "lift_fresh_copy")  # fmt: skip
+ELEMENTWISE = ("add", "copy", "expand_as", "hardswish", "hardsigmoid", "log_sigmoid", "rsub", "rrelu", "selu", "celu",
+               "square", "divide", "multiply", "subtract", "true_divide", "where")  # fmt: skip
+"""Those that torch does not tag as elementwise."""
+UNIFORM = ("zeros", "ones", "full", "empty", "new_zeros", "new_ones", "new_full", "new_empty",
+           "zeros_like", "ones_like", "full_like", "empty_like")  # fmt: skip
+REDUCED = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm", "norm",
+           "any", "all", "argmax", "argmin")  # fmt: skip
+ALONG = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
+         "argsort", "flip", "roll", "logcumsumexp")  # fmt: skip
+RESHAPED = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze")
+TRANSPOSED = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims")
+_RULES: dict[str, Rule] = {
+    **PRODUCTS, **LAYERS,
     **dict.fromkeys(SAME, _same), **dict.fromkeys(ELEMENTWISE, _elementwise),
-    "linear": _linear, "matmul": _matmul, "mm": _matmul, "bmm": _matmul, "addmm": _addmm,
-    **dict.fromkeys(("conv1d", "conv2d", "conv3d"), _convolution),
-    "batch_norm": _channels, "layer_norm": _over_last, "rms_norm": _over_last,
-    **dict.fromkeys(("softmax", "_softmax", "log_softmax"), _softmax),
-    **dict.fromkeys(("mean", "sum", "amax"), _reduce),
-    **dict.fromkeys(("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze"), _reshape),
-    "permute": _permute, "transpose": _transpose, "t": _transpose, "expand": _expand, "cat": _concatenate,
-    "chunk": _parts, "split": _parts, "split_with_sizes": _parts, "slice": _slice, "select": _select,
-    "embedding": _embedding, "scaled_dot_product_attention": _attention,
+    **dict.fromkeys(UNIFORM[:8], _uniform), **dict.fromkeys(UNIFORM[8:], _same),
+    **dict.fromkeys(ALONG, _along), **dict.fromkeys(REDUCED, _reduce), **dict.fromkeys(RESHAPED, _reshape),
+    **dict.fromkeys(("tril", "triu"), _triangle),
+    "permute": _permute, **dict.fromkeys(TRANSPOSED, _transpose), **dict.fromkeys(("movedim", "moveaxis"), _moved),
+    **dict.fromkeys(("expand", "broadcast_to"), _expand), "repeat": _repeat, "repeat_interleave": _repeat_each,
+    "cat": _concatenate, "stack": _stack, "unbind": _unbind, "glu": _gated, "slice": _slice, "select": _select,
+    **dict.fromkeys(("chunk", "split", "split_with_sizes"), _parts), "embedding": _embedding,
+    **dict.fromkeys(("index", "index_select"), _index),
+    **dict.fromkeys(("gather", "scatter", "scatter_add"), _by_numbers),
 }  # fmt: skip
+
+
+def rule_for(target: Any) -> Rule | None:
+    """Return what an operator of torch does to axes; None where that is not known here.
+
+    An operator that torch tags as elementwise is one, and one that changes its input gives what its plain form gives.
+    """
+    name = getattr(target, "_opname", "")  # what computes a size has no name of an operator
+    if getattr(target, "namespace", "") != "aten":
+        return None
+    found = _RULES.get(name) or _RULES.get(name.removesuffix("_"))
+    return found or (_elementwise if _is_pointwise(target.tags) else None)
+
+
+def _is_pointwise(tags: Any) -> bool:
+    return {"pointwise"} <= {tag.name for tag in tags} and not any("nondeterministic" in tag.name for tag in tags)

@@ -68,6 +68,7 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
     if free is not None:
         return free
     kept = _cut(module, feeds, wanted)
+    _run(kept, feeds)
 
     def retrace(size: int) -> nn.Module:
         other = _cut(module, _repeated(feeds, size), wanted)
@@ -91,6 +92,21 @@ def _for_any_batch(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[E
     return None
 
 
+def _run(module: nn.Module, feeds: Sequence[Tensor]) -> None:
+    """Run what is left of a module.
+
+    Raises:
+        RuntimeError: when it fails, which is a fault of the cut and not of the policy.
+    """
+    torch = require("torch", "build")
+    try:
+        with torch.no_grad():
+            module(*feeds)
+    except Exception as error:  # the seam: any operator of torch
+        reason = (message_of(error).splitlines() or [""])[0]
+        raise RuntimeError(f"what pruning left of the module cannot run: {type(error).__name__}: {reason}") from error
+
+
 def _repeated(feeds: Sequence[Tensor], size: int) -> list[Tensor]:
     return [feed.expand(size, *feed.shape[1:]).contiguous() if feed.dim() else feed for feed in feeds]
 
@@ -103,13 +119,13 @@ def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> n
     resizer = Resizer(walk, keep)
     for node in list(program.graph.nodes):
         resizer.resize(node)
-    state = program.state_dict
+    state, cut_once = program.state_dict, dict[int, Any]()
     for name, shape in walk.weights.items():
-        value = state[name] if name in state else program.constants[name]
-        smaller = _indexed(walk, value, shape, keep)
         holder = state if name in state else program.constants
-        holder[name] = torch.nn.Parameter(smaller, value.requires_grad) if isinstance(
-            value, torch.nn.Parameter) else smaller  # fmt: skip
+        value = holder[name]
+        if id(value) not in cut_once:  # a tensor with several names stays one
+            cut_once[id(value)] = _indexed(walk, value, shape, keep)
+        holder[name] = cut_once[id(value)]
     with quiet_exporter():
         made: nn.Module = torch.export.unflatten(program)
     return made
@@ -136,6 +152,7 @@ def _leaf(walk: Walk, edit: Edit) -> int:
 def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[int]]) -> Any:
     """Return a weight without what goes."""
     torch = require("torch", "build")
+    smaller = value.detach()
     for number, axis in enumerate(shape):
         leaves = walk.factors.leaves(axis)
         if not any(leaf in keep for leaf in leaves):
@@ -145,8 +162,9 @@ def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[i
             size = walk.factors.sizes[leaf]
             chosen = torch.tensor(keep[leaf]) if leaf in keep else torch.arange(size)
             rows = (rows[:, None] * size + chosen[None]).reshape(-1)
-        value = value.detach().index_select(number, rows.to(value.device)).contiguous()
-    return value
+        smaller = smaller.index_select(number, rows.to(value.device)).contiguous()
+    whole = isinstance(value, torch.nn.Parameter)
+    return torch.nn.Parameter(smaller, value.requires_grad) if whole else smaller
 
 
 def _share(source: nn.Module, target: nn.Module) -> None:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
 CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
-AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d")
+AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d+")
 FORM = (
     "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with digits) and keep (different whole "
     "numbers from 0)"
@@ -245,18 +245,22 @@ def read_tensors(path: Path) -> dict[str, Any]:
 def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where: str) -> None:
     """Fill a module from tensors that are named as in ``state_dict()``, or ``GRAPH.`` before that.
 
+    A tensor with several names in the module is taken from the first of them that is stored.
+
     Raises:
         SourceError: when a tensor is missing or has another shape.
     """
-    tensors = {}
-    for name, value in module.state_dict().items():
-        tensor = stored.get(f"{graph}.{name}", stored.get(name))
+    tensors: dict[str, Tensor] = {}
+    held = module.state_dict(keep_vars=True)
+    for first, names in names_of_each(held):
+        value, found = held[first], (stored.get(f"{graph}.{each}", stored.get(each)) for each in names)
+        tensor = next((each for each in found if each is not None), None)
         if tensor is None:
-            raise SourceError(f"No tensor of {where} is '{name}' of '{graph}'; {nearest(name, stored)}.")
+            raise SourceError(f"No tensor of {where} is '{first}' of '{graph}'; {nearest(first, stored)}.")
         if tensor.shape != value.shape:
             got, want = list(tensor.shape), list(value.shape)
-            raise SourceError(f"'{name}' has the shape {got} in {where}; the module's is {want}.")
-        tensors[name] = tensor.to(value.dtype)
+            raise SourceError(f"'{first}' has the shape {got} in {where}; the module's is {want}.")
+        tensors |= dict.fromkeys(names, tensor.to(value.dtype))
     module.load_state_dict(tensors)
 
 
@@ -309,12 +313,21 @@ def stream_tensors(
             stream.write(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
 
 
+def names_of_each(state: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """Return the first name and all names of each tensor of a module: tied weights have several."""
+    names: dict[int, list[str]] = {}
+    for name, value in state.items():
+        names.setdefault(id(value), []).append(name)
+    return [(listed[0], listed) for listed in names.values()]
+
+
 def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Module]) -> None:
     """Write the edits and the weights of the modules to a new bundle; no modules where the weights stay in shards."""
     (out / FOLDER).mkdir()
     (out / EDITS).write_text(json.dumps([asdict(edit) for edit in edits]) + "\n", encoding="utf-8")
     for graph, module in modules.items():
-        tensors = _apart(module.state_dict())
+        held = module.state_dict(keep_vars=True)
+        tensors = _apart({first: held[first] for first, _ in names_of_each(held)})
         path = out / FOLDER / f"{graph}.safetensors"
         save_tensors(path, tensors)
         path.chmod((out / EDITS).stat().st_mode & 0o777)  # safetensors lets nobody else read it

@@ -11,13 +11,19 @@ Shape = list[Axis]
 
 
 class Factors:
-    """Factors of axes, in classes of equal ones."""
+    """Factors of axes, in classes of equal ones.
+
+    Attributes:
+        sizes: Of each factor.
+        operator: What is being looked at; it is noted as the reason for what it freezes.
+    """
 
     def __init__(self) -> None:
         self._above: list[int] = []
         self._parts: dict[int, Axis] = {}
         self.sizes: list[int] = []
-        self._frozen: set[int] = set()
+        self._frozen: dict[int, str] = {}
+        self.operator = ""
 
     def new(self, size: int, frozen: bool = False) -> Axis:
         """Return an axis of one factor, none for size 1."""
@@ -26,7 +32,7 @@ class Factors:
         self._above.append(len(self._above))
         self.sizes.append(size)
         if frozen:
-            self._frozen.add(len(self._above) - 1)
+            self._frozen[len(self._above) - 1] = self.operator
         return (len(self._above) - 1,)
 
     def root(self, factor: int) -> int:
@@ -52,15 +58,36 @@ class Factors:
         """Say whether elements of a leaf must stay."""
         return self.root(factor) in self._frozen
 
+    def reason(self, factor: int) -> str:
+        """Return the operator that a leaf was frozen by first; empty for one whose elements may go."""
+        return self._frozen.get(self.root(factor), "")
+
     def freeze(self, axis: Iterable[int]) -> None:
         """Let all elements of an axis stay."""
-        self._frozen |= set(self.leaves(axis))
+        for leaf in self.leaves(axis):
+            self._frozen.setdefault(leaf, self.operator)
 
     def divide(self, leaf: int, slow: int) -> None:
         """Divide a leaf into a factor of size ``slow`` and the rest, which turns faster."""
-        frozen = leaf in self._frozen
-        parts = self.new(slow, frozen) + self.new(self.sizes[leaf] // slow, frozen)
+        parts = self.new(slow) + self.new(self.sizes[leaf] // slow)
+        if leaf in self._frozen:
+            self._frozen |= dict.fromkeys(parts, self._frozen[leaf])
         self._parts[leaf] = parts
+
+    def parted(self, axis: Iterable[int], slow: int) -> tuple[Axis, Axis]:
+        """Return a part of size ``slow`` and the rest, which turns faster; frozen where an axis is divided otherwise.
+
+        Raises:
+            ValueError: when its size is no multiple of that.
+        """
+        size, leaves = self.size(axis), list(self.leaves(axis))
+        if size % slow:
+            raise ValueError(f"{size} elements are no multiple of {slow}")
+        first = self.taken(leaves, slow)
+        if first is not None:
+            return first, tuple(leaves)
+        self.freeze(axis)
+        return self.new(slow, frozen=True), self.new(size // slow, frozen=True)
 
     def unite(self, one: Axis, other: Axis) -> None:
         """Let two axes of equal size be the same; where they are divided otherwise, as far as can be, else freeze."""
@@ -83,7 +110,7 @@ class Factors:
     def _join(self, one: int, other: int) -> None:
         self._above[other] = one
         if other in self._frozen:
-            self._frozen.add(one)
+            self._frozen.setdefault(one, self._frozen[other])
 
     def taken(self, leaves: list[int], size: int) -> Axis | None:
         """Take factors from the front of a list until they have a size; divide the last one; None where none fits."""

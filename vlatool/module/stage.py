@@ -48,6 +48,7 @@ class Changed:
         played: Observations that they were trained on, for the ranges of activations, name -> (N, ...); none when None.
         options: What the stage found out on this machine, under names of options of its own, so that it is made again
             in the same way wherever that is done.
+        record: What it came to, for the record of the bundle, as JSON values.
     """
 
     edits: tuple[Edit, ...] = ()
@@ -55,6 +56,7 @@ class Changed:
     program: tuple[ProgramStep, ...] | None = None
     played: Mapping[str, Any] | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)
 
 
 class ModuleStage(Transform):
@@ -137,7 +139,7 @@ class ModuleStage(Transform):
     ) -> Bundle:
         """Write what was changed, with the modules; without them, where the weights stay in shards."""
         made_by = self.made_by()
-        made_by["options"] = {**made_by["options"], **done.options}
+        made_by |= {"options": {**made_by["options"], **done.options}, **done.record}
         edits = joined_edits(read_edits(bundle), done.edits)
         changed = write_changed(bundle, out, edits, modules, made_by, done.training, done.program, done.played)
         context.tell("running the changed policy", None)

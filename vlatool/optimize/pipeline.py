@@ -16,7 +16,7 @@ from typing import Any
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.moved import with_task_speedup
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, RecipeError, VlatoolError
+from vlatool.errors import NOT_MADE, DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.explain.apart import explanation_apart
 from vlatool.files.messages import from_json, to_json
@@ -40,7 +40,7 @@ from vlatool.render import write_reports
 from vlatool.report import Report, Row, read_report
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_names
 from vlatool.stage.base import Context, Tell
-from vlatool.stage.controls import controls, predicted_for
+from vlatool.stage.controls import controls, predicted_for, removed_by
 from vlatool.stage.finish import reseal
 from vlatool.stage.run import cached_measure, cached_transform
 from vlatool.user_code import children
@@ -130,7 +130,9 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     judged, trust = judged_rows(plan, rows, {name: engine_of(bundle) for name, bundle in bundles.items()})
     tables = {**trials, **tried, **_explained(judged, bundles, baseline, context)}
     judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
-    told = ((name, (*controls(bundle), *predicted_for(bundle))) for name, bundle in bundles.items())
+    told = (
+        (name, (*controls(bundle), *predicted_for(bundle), *removed_by(bundle))) for name, bundle in bundles.items()
+    )
     notes = (*notes, *(f"{name}: {line}" for name, lines in told for line in lines))
     report = report_of(plan, baseline, bundles, judged, failures, notes, trust, context.command)
     chosen = chosen_of(judged).row
@@ -186,7 +188,7 @@ def _candidates(
             made = candidate(stages, source, baseline, plan, context)
             bundles[name], trained[name] = made[-1], trainings(made)
         except VlatoolError as error:
-            if error.exit_code not in (3, 4):
+            if error.exit_code not in NOT_MADE:
                 raise
             failures.append(Row(name, "failed", error.message))
     if not bundles:

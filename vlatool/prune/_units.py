@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -59,6 +60,10 @@ class Group:
         gone = set(units)
         self.keep = [unit for unit in self.keep if unit not in gone]
 
+    def put_back(self, units: Sequence[int]) -> None:
+        """Let units stay that were removed."""
+        self.keep = sorted([*self.keep, *units])
+
     def cheapest(self, least: float) -> tuple[float, list[int]]:
         """Return what the next units that would go are worth together, and which they are; none when all must stay.
 
@@ -93,7 +98,7 @@ def walks_of(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk
 
 
 def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, name: str) -> list[Group]:
-    """Return all units that can go.
+    """Return all units that can go; none where operators keep all of them.
 
     Args:
         walks: Graph name -> axes.
@@ -102,7 +107,7 @@ def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, na
         name: Of the policy.
 
     Raises:
-        RecipeError: when there are none, or a pattern matches no weight.
+        RecipeError: when a pattern matches no weight, or all that could go is left out.
     """
     groups = []
     names: list[str] = []
@@ -115,13 +120,19 @@ def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, na
             heads = any(member.place < len(member.sizes) - 1 for member in members)
             step = 1 if heads or size <= multiple else multiple
             groups.append(Group(graph, leaf, size, members, step, np.zeros(size), list(range(size))))
-    selection.check(names, "weight that can be pruned")
-    if not groups:
-        raise RecipeError(
-            f"{name} has no heads, neurons or channels that could go.",
-            "look at --include and --exclude; whole blocks: vlatool prune depth",
-        )
+    if names:
+        selection.check(names, "weight that can be pruned")
+    if names and not groups:
+        raise nothing(name)
     return groups
+
+
+def nothing(name: str) -> RecipeError:
+    """Return the error for a policy that can lose no unit."""
+    return RecipeError(
+        f"{name} has no heads, neurons or channels that could go.",
+        "look at --include and --exclude; whole blocks: vlatool prune depth",
+    )
 
 
 def rank_units(
@@ -178,12 +189,14 @@ class Work:
         numbers = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
         self._sizes = [group.size for group in groups]
         self._terms: list[tuple[int, list[int]]] = []
+        self._keepers: list[set[str]] = []
         for graph, walk in walks.items():
-            for product in walk.products:
+            for number, product in enumerate(walk.products):
                 leaves = [leaf for axis in product for leaf in walk.factors.leaves(axis)]
                 loses = [numbers[graph, leaf] for leaf in leaves if (graph, leaf) in numbers]
                 fixed = [walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in numbers]
                 self._terms.append((runs[graph] * math.prod(fixed), loses))
+                self._keepers.append(walk.keeps(number))
 
     def without(self, number: int, size: int) -> int:
         """Return what is saved when one group has so many units, and all others are whole."""
@@ -195,7 +208,18 @@ class Work:
 
     def macs(self, sizes: Sequence[int]) -> int:
         """Return the work with so many units of each group."""
-        return sum(fixed * math.prod(sizes[number] for number in loses) for fixed, loses in self._terms)
+        return sum(self._each(sizes))
+
+    def keepers(self, sizes: Sequence[int]) -> dict[str, float]:
+        """Return who keeps a whole width of layers -> share of the work in these layers, with so many units."""
+        each = self._each(sizes)
+        kept: Counter[str] = Counter()
+        for macs, keepers in zip(each, self._keepers, strict=True):
+            kept.update(dict.fromkeys(keepers, macs))
+        return {keeper: macs / max(sum(each), 1) for keeper, macs in kept.most_common()}
+
+    def _each(self, sizes: Sequence[int]) -> list[int]:
+        return [fixed * math.prod(sizes[number] for number in loses) for fixed, loses in self._terms]
 
 
 def _is_slowest(walk: Walk, members: Sequence[Member]) -> bool:
@@ -211,11 +235,11 @@ def _is_slowest(walk: Walk, members: Sequence[Member]) -> bool:
 def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
     """Return the product of the L2 norms of what writes and what reads each unit."""
     product = np.ones(group.size)
-    for axis in (0, 1):
+    for reads in (False, True):
         squares = [
             _by_unit(weights[member.weight].detach() ** 2, member).numpy()
             for member in group.members
-            if member.axis == axis and member.weight in weights and weights[member.weight].dim() > 1
+            if member.reads == reads and member.weight in weights and weights[member.weight].dim() > 1
         ]
         product = product * np.sqrt(np.sum(squares, axis=0)) if squares else product
     return product
@@ -223,7 +247,7 @@ def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
 
 def _readers(group: Group) -> list[Member]:
     """Return the weights that read the units; those that write them where nothing reads them."""
-    return [member for member in group.members if member.axis == 1] or group.members
+    return [member for member in group.members if member.reads] or group.members
 
 
 def _by_unit(values: Tensor, member: Member) -> Tensor:

@@ -35,7 +35,7 @@ from vlatool.prune._prices import (
 from vlatool.prune._ranking import Ranking
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.prune._trials import Trials
-from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
+from vlatool.prune._units import Group, Rank, Work, groups_of, nothing, rank_units, walks_of
 from vlatool.prune.depth import PROTECTED
 from vlatool.stage.base import Context
 
@@ -145,6 +145,8 @@ class LatencyPruning(ModuleStage):
         context.tell("tracing the policy", None)
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
+        if not groups:
+            raise nothing(source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
         context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)

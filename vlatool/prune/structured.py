@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError
+from vlatool.module.axes import Walk
 from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
+from vlatool.prune._reached import SHORT, recorded, refuse_short, sentences
 from vlatool.prune._selection import Selection
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
 from vlatool.stage.base import Context
+from vlatool.stage.controls import PRUNED
 
 if TYPE_CHECKING:
     from torch import nn
@@ -41,25 +43,51 @@ class Structured(ModuleStage):
         """Choose the units that stay.
 
         Raises:
-            RecipeError: when nothing can be pruned, a pattern matches nothing, or so much cannot go.
+            RecipeError: when all that could go is left out, or a pattern matches nothing.
             SourceError: when torch.export cannot trace a module.
         """
         context.tell("tracing the policy", None)
         walks = walks_of(modules, source)
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
-        context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
-        rank_units(groups, self.rank, modules, source, self.samples)
-        self._remove(
-            groups, Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups), context
-        )
-        return Changed(tuple(group.edit() for group in groups if group.stays < group.size))
+        if groups:
+            context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
+            rank_units(groups, self.rank, modules, source, self.samples)
+        return self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
+
+    def choose(
+        self, walks: Mapping[str, Walk], groups: Sequence[Group], runs: Mapping[str, int], context: Context
+    ) -> Changed:
+        """Take units from ranked groups.
+
+        Args:
+            walks: Graph name -> its axes.
+            groups: Of units, ranked.
+            runs: Graph name -> how often it runs in an inference.
+            context: For progress.
+        """
+        work = Work(walks, runs, groups)
+        self._remove(groups, work, context)
+        whole, left = [group.size for group in groups], [group.stays for group in groups]
+        record = recorded(self.ratio, work, whole, left, walks.values())
+        context.said.extend(sentences(record))
+        edits = tuple(group.edit() for group in groups if group.stays < group.size)
+        return Changed(edits, record={PRUNED: record})
+
+    def accept(self, bundle: Bundle) -> None:
+        """Refuse what falls short of the ratio.
+
+        Raises:
+            FallsShort: by more than a tenth.
+        """
+        refuse_short(bundle)
 
     def _remove(self, groups: Sequence[Group], work: Work, context: Context) -> None:
-        """Take away units, those first that cost least for the work that they save."""
+        """Take away units, those first that cost least for the work that they save, as long as there are any."""
         sizes = [group.size for group in groups]
         whole = left = work.macs(sizes)
         goal = whole * (1 - self.ratio)
+        before, last = left, list[int]()
         while left > goal:
             context.tell("choosing what goes", min(1.0, (whole - left) / (whole - goal)))
             prices = []
@@ -68,11 +96,10 @@ class Structured(ModuleStage):
                 saved = left - work.macs([*sizes[:number], sizes[number] - len(loses), *sizes[number + 1 :]])
                 prices += [(cost / saved, number, loses)] if saved > 0 else []
             if not prices:
-                raise RecipeError(
-                    f"No more than {1 - left / whole:.1%} of the multiply-accumulates can go.",
-                    f"ask for less: --ratio {1 - left / whole:.2f}; let less stay: --least; or vlatool prune depth",
-                )
-            _, number, loses = min(prices)
-            groups[number].without(loses)
+                return
+            _, number, last = min(prices)
+            groups[number].without(last)
             sizes[number] = groups[number].stays
-            left = work.macs(sizes)
+            before, left = left, work.macs(sizes)
+        if last and whole - left > (2 - SHORT) * self.ratio * whole and whole - before >= SHORT * self.ratio * whole:
+            groups[number].put_back(last)  # one step was too much, and nearly enough was gone before it

@@ -223,6 +223,9 @@ class Transform(Stage):
         """Return what else a person wants to know about the new bundle, a sentence for each line."""
         return ()
 
+    def accept(self, bundle: Bundle) -> None:
+        """Raise when what was made is not what was asked for: its output does not appear then."""
+
     def run(self, source: Bundle | None, out: Path, context: Context) -> Bundle:
         """Write the new bundle into the empty directory ``out`` and return it."""
         raise PluginError(f"The stage {self.name()} has no method run().", UNFINISHED)

@@ -19,6 +19,18 @@ def controls(bundle: Bundle) -> tuple[str, ...]:
     )
 
 
+PRUNED = "pruned"
+"""Key of what a stage that removes parts of a policy records: the shares of the work ``asked`` for and ``reached``."""
+
+
+def removed_by(bundle: Bundle) -> tuple[str, ...]:
+    """Return a sentence for each stage of a bundle's build record that was to remove a share of the work."""
+    recorded = ((entry["stage"], entry[PRUNED]) for entry in history(bundle) if PRUNED in entry)
+    return tuple(
+        f"{stage}: asked for {work['asked']:.1%} less work, reached {work['reached']:.1%}" for stage, work in recorded
+    )
+
+
 def predicted_for(bundle: Bundle) -> tuple[str, ...]:
     """Return a sentence for each stage of a bundle's build record that chose by what is predicted for a board."""
     named = ((entry["stage"], entry.get("options", {})) for entry in history(bundle))

@@ -59,10 +59,7 @@ def run_transform(
         children.prepare(needed(stage))  # while this process checks
     stage.check(source, None)
     with writing(out, force=force, damaged=damaged) as draft:
-        if apart:
-            run_apart(stage, source, draft, context)
-        else:
-            stage.run(source, draft, context)
+        stage.accept(run_apart(stage, source, draft, context) if apart else stage.run(source, draft, context))
         if reports is not None and reports.is_dir() and not (draft / REPORTS).exists():
             shutil.copytree(reports, draft / REPORTS)
     made = Bundle.open(out, verify=False)

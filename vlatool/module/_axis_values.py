@@ -1,0 +1,98 @@
+"""The axes of the values of a traced graph, and the arguments of its operators."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from vlatool.module.factors import Axis, Factors, Shape
+
+
+class Values:
+    """The axes of the values of a graph, and the products that it computes.
+
+    Attributes:
+        factors: What axes are made of.
+        products: Axes over which each multiply-accumulate runs.
+        widths: Of each product, axes of the weights that it takes, without those of a kernel.
+        reads: Factors of axes of weights over which a product sums: what reads units, where others write them.
+        counts: Node -> argument that states a number of groups, and the axis that has so many elements.
+        shapes: Node -> axes of its value, of several values, or None where it is no tensor.
+        stored: Nodes whose values are weights, or weights with their axes in another order.
+    """
+
+    def __init__(self) -> None:
+        self.factors = Factors()
+        self.products: list[Shape] = []
+        self.widths: list[Shape] = []
+        self.reads: set[int] = set()
+        self.counts: dict[Any, tuple[str, Axis]] = {}
+        self.shapes: dict[Any, Any] = {}
+        self.stored: set[Any] = set()
+
+    def shape(self, node: Any) -> Shape | None:
+        """Return the axes of a node's value, None where it is no tensor."""
+        found = self.shapes.get(node)
+        return found if isinstance(found, list) and (not found or isinstance(found[0], tuple)) else None
+
+    def needed(self, node: Any) -> Shape:
+        """Return the axes of an argument.
+
+        Raises:
+            TypeError: when it is no tensor.
+        """
+        shape = self.shape(node) if hasattr(node, "op") else None
+        if shape is None:
+            raise TypeError("no tensor")
+        return shape
+
+    def broadcast(self, shapes: Sequence[Shape]) -> Shape:
+        """Unite axes as elementwise operators do, and return those of the result."""
+        rank = max(map(len, shapes), default=0)
+        result: Shape = []
+        for number in range(rank):
+            axes = [shape[number - rank + len(shape)] for shape in shapes if number - rank + len(shape) >= 0]
+            full = [axis for axis in axes if self.factors.size(axis) > 1]
+            for axis in full[1:]:
+                self.factors.unite(full[0], axis)
+            result.append(full[0] if full else ())
+        return result
+
+    def contract(self, one: Any, axis: Axis, other: Any, with_axis: Axis) -> None:
+        """Unite two axes over which a product sums, and note of those of weights that they read."""
+        for node, summed in ((one, axis), (other, with_axis)):
+            self.reads |= set(summed) if node in self.stored else set()
+        self.factors.unite(axis, with_axis)
+
+    def multiply(self, axes: Shape, widths: Sequence[Axis] = ()) -> None:
+        """Note a product.
+
+        Args:
+            axes: Over which it runs.
+            widths: Those of its weights, without those of a kernel.
+        """
+        self.products.append(axes)
+        self.widths.append(list(widths))
+
+    def frozen(self, sizes: Sequence[int]) -> Shape:
+        """Return new axes whose elements stay."""
+        return [self.factors.new(size, frozen=True) for size in sizes]
+
+
+def argument(node: Any, name: str, otherwise: Any = None) -> Any:
+    """Return an argument of an operator by the name that it has in the operator's schema, wherever it stands."""
+    for number, stated in enumerate(node.target._schema.arguments):
+        if stated.name == name:
+            default = stated.default_value if stated.has_default_value() else otherwise
+            return node.args[number] if number < len(node.args) else node.kwargs.get(name, default)
+    return otherwise
+
+
+def sizes_of(value: Any) -> list[int]:
+    """Return the sizes of a value; a free one by the example that was traced."""
+    return [size_of(size) for size in value.shape]
+
+
+def size_of(size: Any) -> int:
+    """Return a size, a free one by the example that was traced."""
+    return size if isinstance(size, int) else int(size.node.hint)

@@ -1,0 +1,111 @@
+"""What normalisations, pooling, interpolation and activations with weights do to the axes of their values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from vlatool.module._axis_values import Values, argument, sizes_of
+from vlatool.module.factors import Shape
+
+Rule = Callable[[Values, Any], Any]
+
+
+def _channels(walk: Values, node: Any) -> Shape:
+    """Treat every channel by itself: batch and instance normalisation, PReLU."""
+    given = walk.needed(node.args[0])
+    for each in node.args[1:5]:
+        if hasattr(each, "op"):
+            walk.broadcast([[given[1]], walk.needed(each)])
+    return given
+
+
+def _in_groups(walk: Values, node: Any) -> Shape:
+    """Normalise over groups of channels: a group may go, a part of one may not."""
+    given = walk.needed(node.args[0])
+    groups, inside = walk.factors.parted(given[1], node.args[1])
+    for axis in (inside, *given[2:]):
+        walk.factors.freeze(axis)
+    for name in ("weight", "bias"):
+        if argument(node, name) is not None:
+            walk.factors.unite(given[1], walk.needed(argument(node, name))[0])
+    walk.counts[node] = "num_groups", groups
+    return given
+
+
+def _over_last(walk: Values, node: Any) -> Shape:
+    """Normalise over the last axes: all of their elements count."""
+    given = walk.needed(node.args[0])
+    for each in node.args[2:4]:
+        if hasattr(each, "op"):
+            walk.broadcast([given, walk.needed(each)])
+    for axis in given[-len(node.args[1]) :]:
+        walk.factors.freeze(axis)
+    return given
+
+
+def _weight_norm(walk: Values, node: Any) -> Shape:
+    """Scale the rows of a weight, each of which is normalised."""
+    given, along = walk.needed(node.args[0]), argument(node, "dim", 0) % len(walk.needed(node.args[0]))
+    for number, axis in enumerate(given):
+        if number != along:
+            walk.factors.freeze(axis)
+    return walk.broadcast([given, walk.needed(node.args[1])])
+
+
+def _over_places(walk: Values, node: Any) -> Any:
+    """Pool or interpolate: batch and channels stay as they are, places become others."""
+    given, rank = walk.needed(node.args[0]), _rank(node)
+    for axis in given[-rank:]:
+        walk.factors.freeze(axis)
+    value = node.meta["val"]
+    values = value if isinstance(value, list | tuple) else [value]
+    shapes = [[*given[:-rank], *walk.frozen(sizes_of(each)[-rank:])] for each in values]
+    return shapes if isinstance(value, list | tuple) else shapes[0]
+
+
+def _rank(node: Any) -> int:
+    """Return over how many axes an operator pools: the number before the 'd' in its name."""
+    return next(rank for rank in (1, 2, 3) if f"{rank}d" in node.target._opname)
+
+
+def _grid_sample(walk: Values, node: Any) -> Shape:
+    given = walk.needed(node.args[0])
+    for axis in (*given[2:], *walk.needed(node.args[1])[1:]):
+        walk.factors.freeze(axis)
+    return [*given[:2], *walk.frozen(sizes_of(node.meta["val"])[2:])]
+
+
+def _pixel_shuffle(walk: Values, node: Any) -> Shape:
+    """Turn the faster part of the channels into places."""
+    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
+    channels, places = walk.factors.parted(given[-3], sizes[-3])
+    for axis in (places, *given[-2:]):
+        walk.factors.freeze(axis)
+    return [*given[:-3], channels, *walk.frozen(sizes[-2:])]
+
+
+def _pad(walk: Values, node: Any) -> Shape:
+    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
+    padded = len(node.args[1]) // 2
+    result = list(given)
+    for number in range(len(given) - padded, len(given)):
+        before = 2 * (len(given) - 1 - number)
+        if any(node.args[1][before : before + 2]):
+            walk.factors.freeze(given[number])
+            (result[number],) = walk.frozen(sizes[number : number + 1])
+    return result
+
+
+_POOLS = ("max_pool{}d", "avg_pool{}d", "adaptive_avg_pool{}d", "adaptive_max_pool{}d", "max_pool{}d_with_indices")
+_UPSAMPLED = ("nearest1d", "nearest2d", "nearest3d", "linear1d", "bilinear2d", "trilinear3d", "bicubic2d")
+LAYERS: dict[str, Rule] = {
+    **dict.fromkeys(("batch_norm", "instance_norm", "prelu"), _channels), "group_norm": _in_groups,
+    **dict.fromkeys(("layer_norm", "rms_norm"), _over_last), "_weight_norm": _weight_norm,
+    **{pool.format(rank): _over_places for pool in _POOLS for rank in (1, 2, 3)},
+    **{f"upsample_{kind}": _over_places for kind in _UPSAMPLED},
+    **{f"_upsample_{kind}": _over_places for kind in ("bilinear2d_aa", "bicubic2d_aa")},
+    **{f"_upsample_nearest_exact{rank}d": _over_places for rank in (1, 2, 3)},
+    "grid_sampler": _grid_sample, "pixel_shuffle": _pixel_shuffle,
+    **dict.fromkeys(("pad", "constant_pad_nd"), _pad),
+}  # fmt: skip
