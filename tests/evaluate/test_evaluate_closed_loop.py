@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
@@ -115,6 +117,27 @@ def test_an_environment_that_never_tells_success_is_an_error(int8_bundle, world)
     stage = ClosedLoop(environment=world(ends), tasks=("reach",), episodes=2, first_seed=3)
     with pytest.raises(DataError, match="never told whether the episode of seed 3 succeeded"):
         stage.run(int8_bundle, Context())
+
+
+def naming(bundle, **environment):
+    return replace(bundle, manifest=replace(bundle.manifest, environment=environment))
+
+
+def test_the_baseline_says_what_is_played(float_bundle, policy_template, monkeypatch, tmp_path):
+    """A variant that lists the easy task alone, or another environment, is not judged by its own choice."""
+    monkeypatch.chdir(policy_template)
+    make = "environment.py:make"
+    for environment, says in (
+        ({"make": make, "tasks": ["reach"]}, r"tasks \['reach'\], the baseline \['reach', 'push'\]"),
+        ({"make": "easy.py:make", "tasks": ["reach", "push"]}, f"make 'easy.py:make', the baseline '{make}'"),
+    ):
+        stage = ClosedLoop(baseline=float_bundle.path, episodes=4)
+        with pytest.raises(DataError, match=f"names another environment than its baseline: {says}"):
+            stage._jobs(naming(float_bundle, **environment))
+        named = ClosedLoop(policy=policy_template, baseline=float_bundle.path, episodes=4)
+        assert [job.task for job in named._jobs(naming(float_bundle, **environment))] == ["reach", "push"]
+    jobs = ClosedLoop(baseline=float_bundle.path, episodes=4)._jobs(naming(float_bundle))
+    assert [(job.environment, job.task) for job in jobs] == [(make, "reach"), (make, "push")]
 
 
 def test_two_workers_give_what_one_gives(paired, float_bundle, int8_bundle, policy_template):

@@ -289,9 +289,27 @@ class ClosedLoop(Measure):
             )
         trust.require(file.parent, f"{function}() of {file.name}")
 
+    def _scene(self, source: Bundle | None) -> dict[str, Any]:
+        """Return the environment that the baseline names, or the bundle where there is none, or it names nothing.
+
+        Raises:
+            DataError: when both name one, and what would be played differs: a variant cannot choose its own.
+        """
+        own = source.manifest.environment if source else {}
+        base = Bundle.described(self.baseline).manifest.environment if self.baseline else {}
+        asked = {"make": self.environment, "tasks": self.tasks}
+        other = [key for key, value in asked.items() if own and base and not value and own.get(key) != base.get(key)]
+        if other:
+            words = "; ".join(f"{key} {own.get(key)!r}, the baseline {base.get(key)!r}" for key in other)
+            raise DataError(
+                f"The bundle names another environment than its baseline: {words}.",
+                "say which one is played: --policy DIR, or --environment FILE.py:make --tasks NAME",
+            )
+        return base or own
+
     def _jobs(self, source: Bundle | None) -> list[EpisodesJob]:
         described = read_description(self.policy) if self.policy else None
-        named = described.environment if described else (source.manifest.environment if source else {})
+        named = described.environment if described else self._scene(source)
         known = tuple(named.get("tasks", ()))
         tasks = self.tasks or known
         where = self.environment or str(named.get("make", ""))

@@ -158,6 +158,32 @@ def outside(place: str, listed: bool, added: int = 4_000_000) -> Make:
     return make
 
 
+def hidden(name: str, folder: str = "graphs") -> Make:
+    """Weights that lie beside the graph in a file which the size of another bundle leaves out.
+
+    Args:
+        name: Of that file, which becomes the golden one where it is called so.
+        folder: Where the graph lies.
+    """
+
+    def make(base: Bundle, out: Path) -> Bundle:
+        made = outside(name, listed=True)(base, out)
+        file = f"{folder}/main.onnx"
+        (out / folder).mkdir(exist_ok=True)
+        for moved in ("main.onnx", name):
+            (out / "graphs" / moved).replace(out / folder / moved)
+        graphs = {"main": replace(base.manifest.graphs["main"], file=file)}
+        fields: dict[str, Any] = {"graphs": graphs, "files": {file: FileRecord("", 0)}}
+        if name.startswith("golden"):  # an archive may begin with anything: the weights, and then the golden action
+            with (out / folder / name).open("ab") as stream:
+                stream.write((out / base.manifest.golden).read_bytes())
+            (out / base.manifest.golden).unlink()
+            fields["golden"] = f"{folder}/{name}"
+        return seal(out, replace(made.manifest, **fields))
+
+    return make
+
+
 def rewritten(bundle: Bundle, **fields: Any) -> Bundle:
     """Return the bundle with another manifest over the same files."""
     manifest = replace(bundle.manifest, **fields)
