@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
@@ -284,3 +285,27 @@ def test_other_seeds_are_not_paired():
     other: Row = success_row("b", "subject", outcomes(True, first=9))
     with pytest.raises(DataError, match="did not play the same episodes"):
         compare_success(one, other)
+
+
+def test_episodes_that_begin_alike_have_one_start(int8_bundle, policy_template, world):
+    """The world of a seed shows in its first observation, or it does not."""
+    ends = "return self.reset()[0], 0.0, True, False, {'success': True}"
+    alike = ClosedLoop(environment=world(ends), tasks=("reach",), episodes=12).run(int8_bundle, Context())
+    assert alike.rows[0].raw["start"] == [0.0] * 12
+    assert alike.rows[0].get("success").low < 0.3, "as of one episode"
+    assert any(
+        "the 12 episodes have 1 distinct first observations, so that they count as 1" in w for w in alike.warnings
+    )
+    apart = evaluated(int8_bundle, policy_template, episodes=12)
+    assert apart.rows[0].raw["start"] == [float(number) for number in range(12)]
+    assert [line["distinct starts"] for line in apart.rows[0].details["success by task"]] == [6, 6]
+    assert not any("distinct first" in warning for warning in apart.warnings)
+
+
+def test_a_start_is_what_the_policy_is_given(int8_bundle):
+    spec = int8_bundle.manifest.spec
+    first = {"image": np.zeros((8, 8, 3), np.uint8), "proprio": [0.0, 1.0, 2.0], "instruction": "go"}
+    same = {**first, "proprio": np.array([0.0, 1.0, 2.0]), "unseen": np.random.default_rng(1).random(3)}
+    assert play.start_of(first, spec) == play.start_of(same, spec)
+    others = ({"instruction": "stop"}, {"proprio": [0.0, 1.0, 2.5]}, {"image": np.ones((8, 8, 3), np.uint8)})
+    assert len({play.start_of({**first, **other}, spec) for other in ({}, *others)}) == 4
