@@ -85,7 +85,9 @@ class Row:
             of each call, seconds since the start of the run); ``telemetry.NAME`` and ``telemetry.NAME.at_s`` (a reading
             of the machine and its times); ``throttled_at_s`` (moments at which throttling was seen);
             ``training: STAGE`` (the loss of each step); of episodes ``success``, ``seed``, ``steps``, ``task`` and
-            ``instruction`` (places in the tables of details), ``motion.METRIC`` (NaN where it is not known).
+            ``instruction`` (places in the tables of details), ``start`` (the same number for equal first
+            observations), ``no clock`` (1 where the environment's clock went wrong), ``motion.METRIC`` (NaN where it
+            is not known).
         details: Tables that belong to the row: title -> list of {column: cell}.
     """
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
@@ -115,6 +118,27 @@ def test_an_environment_that_never_tells_success_is_an_error(int8_bundle, world)
     stage = ClosedLoop(environment=world(ends), tasks=("reach",), episodes=2, first_seed=3)
     with pytest.raises(DataError, match="never told whether the episode of seed 3 succeeded"):
         stage.run(int8_bundle, Context())
+
+
+def naming(bundle, **environment):
+    return replace(bundle, manifest=replace(bundle.manifest, environment=environment))
+
+
+def test_the_baseline_says_what_is_played(float_bundle, policy_template, monkeypatch, tmp_path):
+    """A variant that lists the easy task alone, or another environment, is not judged by its own choice."""
+    monkeypatch.chdir(policy_template)
+    make = "environment.py:make"
+    for environment, says in (
+        ({"make": make, "tasks": ["reach"]}, r"tasks \['reach'\], the baseline \['reach', 'push'\]"),
+        ({"make": "easy.py:make", "tasks": ["reach", "push"]}, f"make 'easy.py:make', the baseline '{make}'"),
+    ):
+        stage = ClosedLoop(baseline=float_bundle.path, episodes=4)
+        with pytest.raises(DataError, match=f"names another environment than its baseline: {says}"):
+            stage._jobs(naming(float_bundle, **environment))
+        named = ClosedLoop(policy=policy_template, baseline=float_bundle.path, episodes=4)
+        assert [job.task for job in named._jobs(naming(float_bundle, **environment))] == ["reach", "push"]
+    jobs = ClosedLoop(baseline=float_bundle.path, episodes=4)._jobs(naming(float_bundle))
+    assert [(job.environment, job.task) for job in jobs] == [(make, "reach"), (make, "push")]
 
 
 def test_two_workers_give_what_one_gives(paired, float_bundle, int8_bundle, policy_template):
@@ -261,3 +285,27 @@ def test_other_seeds_are_not_paired():
     other: Row = success_row("b", "subject", outcomes(True, first=9))
     with pytest.raises(DataError, match="did not play the same episodes"):
         compare_success(one, other)
+
+
+def test_episodes_that_begin_alike_have_one_start(int8_bundle, policy_template, world):
+    """The world of a seed shows in its first observation, or it does not."""
+    ends = "return self.reset()[0], 0.0, True, False, {'success': True}"
+    alike = ClosedLoop(environment=world(ends), tasks=("reach",), episodes=12).run(int8_bundle, Context())
+    assert alike.rows[0].raw["start"] == [0.0] * 12
+    assert alike.rows[0].get("success").low < 0.3, "as of one episode"
+    assert any(
+        "the 12 episodes have 1 distinct first observations, so that they count as 1" in w for w in alike.warnings
+    )
+    apart = evaluated(int8_bundle, policy_template, episodes=12)
+    assert apart.rows[0].raw["start"] == [float(number) for number in range(12)]
+    assert [line["distinct starts"] for line in apart.rows[0].details["success by task"]] == [6, 6]
+    assert not any("distinct first" in warning for warning in apart.warnings)
+
+
+def test_a_start_is_what_the_policy_is_given(int8_bundle):
+    spec = int8_bundle.manifest.spec
+    first = {"image": np.zeros((8, 8, 3), np.uint8), "proprio": [0.0, 1.0, 2.0], "instruction": "go"}
+    same = {**first, "proprio": np.array([0.0, 1.0, 2.0]), "unseen": np.random.default_rng(1).random(3)}
+    assert play.start_of(first, spec) == play.start_of(same, spec)
+    others = ({"instruction": "stop"}, {"proprio": [0.0, 1.0, 2.5]}, {"image": np.ones((8, 8, 3), np.uint8)})
+    assert len({play.start_of({**first, **other}, spec) for other in ({}, *others)}) == 4

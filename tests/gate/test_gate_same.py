@@ -10,7 +10,7 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import BundleError, GraphError
+from vlatool.errors import BundleError, DataError, GraphError
 from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.same import check
 
@@ -30,6 +30,19 @@ def test_statistics_vocabulary_and_cuts_of_the_program_may_differ(float_bundle: 
     )
     spec = replace(float_bundle.manifest.spec, inputs=inputs)
     check(changed(float_bundle, program=(first, step), spec=spec), float_bundle, GATE)
+
+
+def test_all_of_a_chunk_may_be_said_in_two_ways(float_bundle: Bundle) -> None:
+    all_of_it, as_many = (
+        changed(float_bundle, spec=replace(float_bundle.manifest.spec, execute=execute)) for execute in (0, 4)
+    )
+    check(all_of_it, as_many, GATE)
+    check(as_many, all_of_it, GATE)
+
+
+def test_steps_that_a_stage_left_out_need_a_claim_of_accuracy(float_bundle: Bundle) -> None:
+    with pytest.raises(DataError, match="runs fewer steps than the baseline, and no claim is made of its accuracy"):
+        check(repeated(float_bundle, FEWER, "prune.steps"), repeated(float_bundle, FOUR), Gate(accuracy=None))
 
 
 @pytest.mark.parametrize(

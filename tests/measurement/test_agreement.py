@@ -30,6 +30,17 @@ def test_the_correlation_is_that_of_variation_alone() -> None:
     assert correlation(one[:, :2], one) == 0, "another shape follows nothing"
 
 
+@pytest.mark.parametrize(
+    ("scale", "offset", "wanted"),
+    [(1, 0, 1), (0.1, 0, 0.198), (10, 0, 0.198), (1, 2, 1 / 3), (0.9, 0.1, 0.99), (-1, 0, -1)],
+)
+def test_where_scale_and_place_count_another_answer_does_not_follow(scale: float, offset: float, wanted: float):
+    one = random(2000)[:, None]
+    one = (one - one.mean()) / one.std()
+    assert correlation(scale * one + offset, one, concordant=True) == pytest.approx(wanted, abs=0.001)
+    assert correlation(np.zeros_like(one), one, concordant=True) == pytest.approx(0)
+
+
 def test_every_element_counts_alike() -> None:
     one = random(300, 2) * [100.0, 0.1]
     assert correlation(one * [1, -1], one) == pytest.approx(0, abs=1e-9), "a small element that is wrong is half of two"

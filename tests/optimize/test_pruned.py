@@ -13,11 +13,11 @@ from vlatool.cli import main
 from vlatool.hardware.profile import Profile, load_profile
 from vlatool.optimize.pipeline import _write_bundle
 from vlatool.optimize.plan import make_plan
-from vlatool.optimize.pruned import PrunedSearch, front_of
+from vlatool.optimize.pruned import PrunedSearch, front_of, with_measured
 from vlatool.optimize.recipe import read_recipe
 from vlatool.optimize.space import FLOAT32, Shape, Space
 from vlatool.optimize.study import Tried
-from vlatool.report import Report, Row, read_report
+from vlatool.report import Measurement, Report, Row, read_report
 from vlatool.stage.base import Context
 
 RECIPE = """\
@@ -207,3 +207,28 @@ def test_what_moves_well_is_judged_before_what_is_faster(
     assert search._finalists([*rough, calm], space) == [calm, *rough[:2]]
     (line,) = (line for line in search._table([*rough, calm], space) if line["speed-up"] == "8.00x")
     assert (line["within"], line["note"]) == ("no", "jerk is 2x")
+
+
+def test_claims_of_a_study_are_not_shown_as_measurements(
+    policy_template: Path, float_bundle: Bundle, recipe: Path, tmp_path: Path
+) -> None:
+    plan = make_plan(str(policy_template), None, read_recipe(recipe), tmp_path / "cache")
+    search = PrunedSearch(plan, float_bundle, float_bundle, Context())
+    space = Space((1.0, 0.7, 0.55), 4, 1, {FLOAT32: ()}, ())
+    here = Tried(Shape(0.7, 1, 1, FLOAT32), 2.0, 0.0)
+    claimed = Tried(Shape(0.55, 1, 1, FLOAT32), 99.0, 0.0, 60.0, elsewhere=True)
+    failed = Tried(Shape(0.55, 2, 1, FLOAT32), note="no weights", elsewhere=True)
+    table = search._table([claimed, here, failed], space)
+    assert [line["policy"] for line in table] == [space.name(each.shape) for each in (here, claimed, failed)]
+    assert [(line["speed-up"], line["on the front"], line["within"]) for line in table] == [
+        ("2.00x", "yes", "yes"), ("", "", ""), ("", "", ""),
+    ]  # fmt: skip
+    assert [line["the study says"] for line in table] == ["", "99.00x, drop 0.0 points", "no weights"]
+    assert [line["note"] for line in table] == ["", *["not measured in this run"] * 2]
+    name = space.name(claimed.shape)
+    again = with_measured(table, {name: Row(name, measurements=(Measurement("speedup", 1.25, "x"),))})
+    assert [(line["speed-up"], line["note"]) for line in again[:2]] == [
+        ("2.00x", ""), ("1.25x", "measured as a candidate"),
+    ]  # fmt: skip
+    assert again[0] == table[0]
+    assert again[2] == table[2]

@@ -256,3 +256,13 @@ def test_a_study_that_cannot_be_opened_is_named(tmp_path: Path, wrong: Any) -> N
     url = wrong(tmp_path / "trials")
     with pytest.raises((UsageError, DataError), match=r"The study .* cannot be used|is not a study"):
         opened(url)
+
+
+def test_what_a_study_says_is_nobodys_measurement(url: str) -> None:
+    """Whoever reaches a study can write into it: another speed-up, and the name of this process as the worker."""
+    here = opened(url)
+    (number, shape), (forged, other) = here.ask(9), here.ask(9)
+    here.tell(number, Tried(shape, 2.0, 0.01, note=""))
+    opened(url).tell(forged, Tried(other, 99.0, 0.0))
+    assert {tried.speedup: tried.elsewhere for tried in here.tried()} == {2.0: False, 99.0: True}
+    assert all(tried.elsewhere for tried in opened(url).tried()), "another run of the same command made none of them"

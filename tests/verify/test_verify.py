@@ -250,11 +250,28 @@ def test_the_first_observation_that_differs_is_that_of_the_recording(bundles, ag
     assert "the first is observation 3;" in report.summary[0]
 
 
-@pytest.mark.parametrize("part", ["[:2]", "[0]", "[None]", ".tolist()"])
-def test_leading_steps_a_batch_axis_and_lists_are_actions(bundles, against, part):
+@pytest.mark.parametrize(
+    ("part", "steps", "verdict"),
+    [
+        ("[:2]", 2, "pass"),
+        ("[:3]", 3, "pass"),
+        ("[None]", 4, "pass"),
+        (".tolist()", 4, "pass"),
+        ("[0]", 1, "inconclusive"),
+        ("[:1]", 1, "inconclusive"),
+        ("[:1 if observation['proprio'][0] > 0 else 4]", 1, "inconclusive"),
+        ("[:1] + 1.0", 1, "fail"),
+    ],
+)
+def test_what_is_executed_must_have_been_compared(bundles, against, part, steps, verdict):
+    """The tiny policy executes 2 of 4 steps; leading steps, a batch axis and lists are actions."""
     given = "    return answer(observation)" + part
     original = against(("def act(", "def answer("), more=f"\n\ndef act(observation):\n{given}\n")
-    assert found(bundles["source"], original).verdict == "pass"
+    report = found(bundles["source"], original)
+    assert report.verdict == verdict
+    assert report.summary[-1].startswith(f"Compared: {steps} of the 4 steps of a chunk, of which 2 are executed, on ")
+    assert report.rows[0].get("relative_error_max").note == f"action, in physical units, {steps} of 4 steps"
+    assert ("is not decided: 1 of the 2 steps that are executed" in report.summary[0]) == (verdict == "inconclusive")
 
 
 BAD = {

@@ -110,9 +110,14 @@ def _played(row: Row, name: str) -> Credibility:
 
 
 def above(own: Measurement, chance: Measurement) -> float:
-    """Return the lower bound, at 95 %, of the difference of two success rates (Newcombe 1998, method 10)."""
-    low, _ = wilson(round(own.value * own.samples), own.samples)
-    _, high = wilson(round(chance.value * chance.samples), chance.samples)
+    """Return the lower bound, at 95 %, of the difference of two success rates (Newcombe 1998, method 10).
+
+    Args:
+        own, chance: With their Wilson intervals, which allow for episodes that begin alike; those of ``samples``
+            independent episodes where there is none.
+    """
+    low = wilson(round(own.value * own.samples), own.samples)[0] if own.low is None else own.low
+    high = wilson(round(chance.value * chance.samples), chance.samples)[1] if chance.high is None else chance.high
     return own.value - chance.value - math.hypot(own.value - low, high - chance.value)
 
 

@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from vlatool.accuracy.moved import RATIO, STEPS
+from vlatool.accuracy.moved import RATIO, START, STEPS
 from vlatool.accuracy.paired import Outcome, compare_success, success_row
 from vlatool.report import Measurement, Row
 from vlatool.stats.intervals import wilson
+from vlatool.stats.starts import independent
 from vlatool.stats.success_sequential import exact_drop
 
 Played = Sequence[Outcome]
@@ -93,7 +94,8 @@ def drops_by_disturbance(row: Row, confidence: float = 0.95) -> dict[str, Measur
         kind = name.removeprefix(DISTURBED)
         pairs = list(zip(row.raw[f"{name}{OF_BASELINE}"], row.raw[name], strict=True))
         lost, won = sum(before > after for before, after in pairs), sum(before < after for before, after in pairs)
-        drop, low, high = exact_drop(lost, won, len(pairs), confidence)
+        size = independent(row.raw.get(START) or range(len(pairs)))
+        drop, low, high = exact_drop(lost, won, len(pairs), confidence, size)
         drops[kind] = Measurement("disturbed_drop", drop, "1", samples=len(pairs), low=low, high=high,
                                   confidence=confidence, note=kind)  # fmt: skip
     return drops

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from vlatool.motion.measure import FEWEST, metrics, ratio_of
 from vlatool.report import NO_INTERVAL, Measurement, Row
+from vlatool.stats.intervals import sign_test
+from vlatool.stats.starts import distinct, independent
 from vlatool.stats.success_sequential import exact_drop
 
 Array = NDArray[np.float64]
@@ -25,6 +28,15 @@ SPEEDUP = "task_speedup"
 BY_TASK, BY_INSTRUCTION = "success by task", "success by instruction"
 AGAINST = {"task": "against the baseline, by task", "instruction": "against the baseline, by instruction"}
 CONFIDENCE = 0.95
+NO_CLOCK = "no clock"
+"""The raw samples that say in which episodes the environment's clock could not be used."""
+START = "start"
+"""The raw samples that number the distinct first observations of episodes."""
+KNOWN = 0.9
+"""Share of the episodes in which both succeed that must tell a metric of both, or nothing is claimed of it."""
+DOUBT = 0.25
+"""Chance below which it is no accident that the variant's values are missing more often (an exact sign test): the doubt
+is not the baseline's, so that two episodes suffice."""
 LONGEST = 20
 """Tasks, or instructions, of a table: those that lose most."""
 
@@ -51,6 +63,24 @@ def ratios(baseline: Row, row: Row, names: Collection[str], confidence: float = 
     """
     found = _Pairs(baseline, row, confidence).ratios()
     return {item.name: item for item in found if item.name.removesuffix(RATIO) in names}
+
+
+def doubts(baseline: Row, row: Row, names: Collection[str]) -> dict[str, str]:
+    """Return metric -> why its missing values leave nothing to be claimed of it; those that are known are left out.
+
+    Args:
+        baseline, row: Of ``success_row``, of the same episodes.
+        names: Metrics; those that the baseline's episodes do not have are left out.
+    """
+    pairs, known = _Pairs(baseline, row), known_of(baseline)
+    return {name: why for name in names if name in known and (why := pairs.doubt(name))}
+
+
+def known_of(baseline: Row) -> list[str]:
+    """Return the metrics that episodes of the baseline have in which it succeeds, whatever a variant has."""
+    won = np.asarray(baseline.raw["success"]) > 0
+    values = {name.removeprefix(MOTION): values for name, values in baseline.raw.items() if name.startswith(MOTION)}
+    return sorted(name for name, own in values.items() if np.isfinite(np.asarray(own, np.float64)[won]).any())
 
 
 def pairs_above_none(baseline: Row, row: Row, names: Collection[str]) -> dict[str, tuple[int, int]]:
@@ -83,12 +113,14 @@ def with_task_speedup(row: Row) -> Row:
     return replace(row, measurements=(*row.measurements, task))
 
 
-def _ratio(name: str, ratio: tuple[float, float, float], count: int, note: str, confidence: float) -> Measurement:
+def _ratio(
+    name: str, ratio: tuple[float, float, float], count: int, note: str, confidence: float, doubt: str = ""
+) -> Measurement:
     value, low, high = ratio
-    if np.isfinite(high):
+    if np.isfinite(high) and not doubt:
         return Measurement(name, value, "x", samples=count, low=low, high=high, confidence=confidence, note=note)
     zeros = "too few pairs in which the baseline's is not 0"  # resamples have none of them, and no ratio
-    why = f"{count} pairs, and it takes {FEWEST}" if count < FEWEST else zeros
+    why = doubt or (f"{count} pairs, and it takes {FEWEST}" if count < FEWEST else zeros)
     first, _, rest = note.partition("; ")
     parts = (first, f"{NO_INTERVAL}{why}", *([rest] if rest else []))
     return Measurement(name, value, "x", samples=count, confidence=confidence, note="; ".join(parts))
@@ -101,6 +133,7 @@ class _Pairs:
         self._rows, self._confidence = (baseline, row), confidence
         self._wins = tuple(self._of(one, "success") > 0 for one in self._rows)
         self._both = self._wins[0] & self._wins[1]
+        self._starts = np.asarray(baseline.raw.get(START) or range(len(self._both)), np.float64)
         self._places = {key: self._of(row, key).astype(int) for key in AGAINST if key in row.raw}
         titles = {"task": BY_TASK, "instruction": BY_INSTRUCTION}
         self._names = {key: [str(record[key]) for record in row.details[titles[key]]] for key in self._places}
@@ -114,24 +147,54 @@ class _Pairs:
             own, base, known = self._values(name)
             if not known.any() or not (own[known].any() or base[known].any()):
                 continue
-            if (ratio := ratio_of(own[known], base[known], self._confidence)) is None:
+            if (ratio := self._ratio_of(own, base, known, self._confidence)) is None:
                 continue
-            note = f"of the means of {known.sum()} episodes in which both succeed{self._worst_of(own, base, known)}"
-            yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note, self._confidence)
+            note = f"of the means of {self._told(known)}{self._worst_of(own, base, known)}"
+            starts = distinct(self._starts[known].tolist())
+            why = f"{starts} distinct starts, and it takes {FEWEST}" if starts < min(FEWEST, known.sum()) else ""
+            doubt = self.doubt(name) or why
+            yield _ratio(f"{name}{RATIO}", ratio, int(known.sum()), note, self._confidence, doubt)
+
+    def doubt(self, name: str) -> str:
+        """Return why the values of a metric that are missing leave nothing to be claimed of it; empty where they do."""
+        own, base, _ = (np.isfinite(values) for values in self._values(name))
+        total = int(self._both.sum())
+        ours, theirs = (int((self._both & ~one & other).sum()) for one, other in ((own, base), (base, own)))
+        known = int((self._both & own & base).sum())
+        if total and known < KNOWN * total:
+            return f"known of both in {known} of {total} common successes, and it takes {KNOWN:.0%}"
+        if ours > theirs and sign_test(ours, ours + theirs) <= DOUBT:
+            return f"missing in {ours} common successes where the baseline has it, the other way round in {theirs}"
+        return ""
+
+    def _told(self, known: NDArray[np.bool_]) -> str:
+        some, total = int(known.sum()), int(self._both.sum())
+        return f"{some} episodes in which both succeed" if some == total else (
+            f"{some} of {total} episodes in which both succeed; unknown in {total - some} of them")  # fmt: skip
+
+    def _ratio_of(
+        self, own: Array, base: Array, known: NDArray[np.bool_], confidence: float = CONFIDENCE
+    ) -> tuple[float, float, float] | None:
+        """Return the ratio of means; episodes that begin alike are one of the things that are drawn again."""
+        places = np.unique(self._starts[known], return_inverse=True)[1]
+        ours, theirs = (np.bincount(places, values[known]).astype(np.float64) for values in (own, base))
+        return ratio_of(ours, theirs, confidence)
 
     def above_none(self) -> Iterator[tuple[str, tuple[int, int]]]:
         """Yield each metric that the baseline has nothing of where both succeed, and the pairs with some, and all."""
         for name in self._metrics:
             own, base, known = self._values(name)
             if known.any() and not base[known].any():
-                yield name, (int((own[known] > 0).sum()), int(known.sum()))
+                starts = self._starts[known]
+                yield name, (distinct(starts[own[known] > 0].tolist()), distinct(starts.tolist()))
 
     def added(self) -> Iterator[Measurement]:
         """Yield the mean of each of these metrics that the variant has something of."""
-        for name, (some, count) in self.above_none():
+        for name, (some, _) in self.above_none():
             if some:
                 own, _, known = self._values(name)
-                note = f"mean of {count} episodes in which both succeed: above 0 in {some} of them, and in none of the "
+                some, count = int((own[known] > 0).sum()), int(known.sum())
+                note = f"mean of {self._told(known)}: above 0 in {some} of them, and in none of the "
                 yield Measurement(f"{name}{ADDED}", float(own[known].mean()), metrics()[name].unit, samples=count,
                                   note=f"{note}baseline's")  # fmt: skip
 
@@ -145,7 +208,7 @@ class _Pairs:
             own = self._places["task"] == place
             longest[own] = max(one[own].max() for one in steps)
         base, own = (np.where(won, one, longest) for won, one in zip(self._wins, steps, strict=True))
-        if ratio := ratio_of(own, base):
+        if ratio := self._ratio_of(own, base, np.ones(len(own), bool)):
             yield _ratio(STEPS, ratio, len(own), "steps of all episodes, failures at full length", CONFIDENCE)
 
     def worst(self) -> Iterator[Measurement]:
@@ -190,7 +253,7 @@ class _Pairs:
             own, base, known = self._values(name)
             known = known & chosen
             enough = known.sum() >= FEWEST and (own[known].any() or base[known].any())
-            if enough and (ratio := ratio_of(own[known], base[known])):
+            if enough and (ratio := self._ratio_of(own, base, known)):
                 ratios[f"{name.replace('_', ' ')}, x"] = round(ratio[0], 3)
         return ratios
 
@@ -206,10 +269,19 @@ class _Pairs:
     def _drop(self, chosen: NDArray[np.bool_], confidence: float) -> tuple[tuple[float, float, float], int]:
         before, after = (won[chosen] for won in self._wins)
         lost, won = int((before & ~after).sum()), int((after & ~before).sum())
-        return exact_drop(lost, won, len(before), confidence), len(before)
+        size = independent(self._starts[chosen].tolist())
+        return exact_drop(lost, won, len(before), confidence, size), len(before)
 
     def _values(self, name: str) -> tuple[Array, Array, NDArray[np.bool_]]:
-        base, own = (self._of(one, f"{MOTION}{name}") for one in self._rows)
+        """Return a metric of the variant and of the baseline, NaN where one is missing, and where both are known.
+
+        A number that is by the rate of the spec, since the environment's clock went wrong in that episode, is missing
+        where the other one is by the clock.
+        """
+        missing = [math.nan] * len(self._both)
+        base, own = (np.array(one.raw.get(f"{MOTION}{name}", missing), np.float64) for one in self._rows)
+        clocks = [np.asarray(one.raw.get(NO_CLOCK) or np.zeros(len(self._both))) > 0 for one in self._rows]
+        base[clocks[0] & ~clocks[1]] = own[clocks[1] & ~clocks[0]] = math.nan
         return own, base, self._both & np.isfinite(own) & np.isfinite(base)
 
     @staticmethod

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from vlatool.accuracy.moved import BY_INSTRUCTION, BY_TASK, MOTION, compare_motion
+from vlatool.accuracy.moved import BY_INSTRUCTION, BY_TASK, MOTION, NO_CLOCK, START, compare_motion
 from vlatool.errors import DataError
 from vlatool.motion.measure import metrics
 from vlatool.report import Measurement, Row
-from vlatool.stats.intervals import mcnemar_exact, wilson
+from vlatool.stats.intervals import mcnemar_exact
+from vlatool.stats.starts import FEWEST, distinct, independent, too_few, wilson_of
 from vlatool.stats.success_sequential import exact_drop
 
 ABSENT = "unmeasured"
 """The table of a row that says what could not be had."""
+CLOCK = "time"
+"""Where an environment tells its clock in the info of a step."""
 MOST_INSTRUCTIONS = 64
 """Wordings up to which each has a line in a table."""
 
@@ -34,6 +37,7 @@ class Outcome:
         motion: Metric of motion -> its number.
         refused: What the environment told of the robot's body and could not be used -> why.
         series: What was asked for to be shown: ``position.x``, ``action.NAME``, ``fresh``, a number a step.
+        start: Of the first observation, a hash; empty where it is not known.
     """
 
     task: str
@@ -44,13 +48,20 @@ class Outcome:
     motion: Mapping[str, float] = field(default_factory=dict)
     refused: Mapping[str, str] = field(default_factory=dict)
     series: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    start: str = ""
+
+    @property
+    def begins(self) -> tuple[str, str | int]:
+        """What it shares with episodes that begin alike; one whose start is not known begins as no other."""
+        return self.task, self.start or self.seed
 
 
 def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
     """Return the success rate with its Wilson interval, how it moves, tables by task and instruction, all outcomes."""
     wins = sum(outcome.success for outcome in outcomes)
-    low, high = wilson(wins, len(outcomes))
-    note = "closed loop, Wilson interval"
+    starts = _numbered([outcome.begins for outcome in outcomes])
+    low, high = wilson_of(wins, starts)
+    note = f"closed loop, Wilson interval; {_starts(starts)}"
     rate = Measurement("success", wins / len(outcomes), "1", samples=len(outcomes), low=low, high=high, note=note)
     tasks = _table("task", outcomes, lambda outcome: outcome.task)
     told = sorted({outcome.instruction for outcome in outcomes})
@@ -59,9 +70,12 @@ def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
         "seed": [float(outcome.seed) for outcome in outcomes],
         "steps": [float(outcome.steps) for outcome in outcomes],
         "task": _places(tasks, "task", [outcome.task for outcome in outcomes]),
+        START: starts,
     }
     raw |= {f"{MOTION}{name}": [outcome.motion.get(name, math.nan) for outcome in outcomes]
             for name in metrics() if any(name in outcome.motion for outcome in outcomes)}  # fmt: skip
+    if any(CLOCK in outcome.refused for outcome in outcomes):
+        raw[NO_CLOCK] = [float(CLOCK in outcome.refused) for outcome in outcomes]
     details = {BY_TASK: tasks}
     if 1 < len(told) <= MOST_INSTRUCTIONS:
         details[BY_INSTRUCTION] = _table("instruction", outcomes, lambda outcome: outcome.instruction)
@@ -70,6 +84,44 @@ def success_row(name: str, role: str, outcomes: Sequence[Outcome]) -> Row:
     if refused := list(_refused(outcomes)):
         details[ABSENT] = refused
     return Row(name, role, measurements=(rate, *_moved(outcomes)), raw=raw, details=details)
+
+
+def _numbered(starts: Sequence[Hashable]) -> list[float]:
+    """Return a number for each start, the same for equal ones."""
+    numbers = {start: float(number) for number, start in enumerate(dict.fromkeys(starts))}
+    return [numbers[start] for start in starts]
+
+
+def _starts(starts: Sequence[Hashable]) -> str:
+    count, worth = distinct(starts), independent(starts)
+    return f"{count} distinct starts" + (f", worth {worth} episodes" if worth < len(starts) else "")
+
+
+def few_starts(row: Row) -> str:
+    """Return why episodes decide nothing: they repeat their first observations, and have too few; empty otherwise.
+
+    Args:
+        row: Of ``success_row``.
+    """
+    starts = row.raw.get(START, [])
+    if not too_few(starts):
+        return ""
+    return f"{len(starts)} episodes of {distinct(starts)} distinct starts decide nothing (from {FEWEST})"
+
+
+def repeated_starts(row: Row) -> tuple[str, ...]:
+    """Return a sentence where episodes begin alike, so that they say less than their number promises.
+
+    Args:
+        row: Of ``success_row``.
+    """
+    starts = row.raw.get(START, [])
+    if distinct(starts) == len(starts):
+        return ()
+    return (
+        f"the {len(starts)} episodes have {distinct(starts)} distinct first observations, so that they count as "
+        f"{independent(starts)}: let reset(seed=...) draw each episode anew, and show it in the first observation",
+    )
 
 
 def _moved(outcomes: Sequence[Outcome]) -> Iterator[Measurement]:
@@ -101,10 +153,12 @@ def _table(column: str, outcomes: Sequence[Outcome], key: Callable[[Outcome], st
     for value in dict.fromkeys(map(key, outcomes)):
         own = [outcome for outcome in outcomes if key(outcome) == value]
         wins = sum(outcome.success for outcome in own)
-        low, high = wilson(wins, len(own))
+        starts = [outcome.begins for outcome in own]
+        low, high = wilson_of(wins, starts)
         steps = sum(outcome.steps for outcome in own) / len(own)
         cells = {column: value, "success": round(wins / len(own), 4), "low": round(low, 4), "high": round(high, 4)}
-        table.append({**cells, "episodes": len(own), "mean steps": round(steps, 1)})
+        cells |= {"episodes": len(own), "distinct starts": distinct(starts), "mean steps": round(steps, 1)}
+        table.append(cells)
     return table
 
 
@@ -128,10 +182,12 @@ def compare_success(baseline: Row, row: Row) -> Row:
     pairs = list(zip(baseline.raw["success"], row.raw["success"], strict=True))
     lost = sum(before > after for before, after in pairs)
     won = sum(before < after for before, after in pairs)
-    drop, low, high = exact_drop(lost, won, len(pairs))
-    p = mcnemar_exact(lost, won)
+    starts = baseline.raw[START]
+    size = independent(starts)
+    drop, low, high = exact_drop(lost, won, len(pairs), size=size)
+    p = mcnemar_exact(*(count * size // len(pairs) for count in (lost, won)))
     test = Measurement("mcnemar_p", p, "1", samples=len(pairs), note="exact, two-sided")
-    note = f"paired: {lost} lost, {won} won of {len(pairs)} episodes"
+    note = f"paired: {lost} lost, {won} won of {len(pairs)} episodes; {_starts(starts)}"
     difference = Measurement("success_drop", drop, "1", samples=len(pairs), low=low, high=high, note=note)
     table = [{"episodes": len(pairs), "lost": lost, "won": won, "drop": round(drop, 4), "McNemar exact p": round(p, 4)}]
     details = {**row.details, "paired with the baseline": table}

@@ -7,6 +7,7 @@ changes the directory does that there (see ``vlatool.user_code.children``).
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -267,7 +268,7 @@ def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, see
         queue.reset(seed)
         success, body, seen = Success(), Body(spec), Seen(spec, job.disturb, job.strength, seed)
         body.look(info)
-        told = told_to(observation, spec)
+        told, start = told_to(observation, spec), start_of(observation, spec)
         for step in range(1, limit):
             action = _acted(queue, seen(observation), f"task '{task}' at seed {seed}, step {step},")
             observation, over, info = world.step(action.item() if action.ndim == 0 else action)
@@ -278,7 +279,7 @@ def _episode(world: World, queue: Actor, spec: PolicySpec, job: EpisodesJob, see
                 track = body.track()
                 series = series_of(track, spec.action) if job.show else {}
                 won = success.at_the_end(task, seed)
-                return Outcome(task, seed, won, step, told, measured(track), body.refused, series)
+                return Outcome(task, seed, won, step, told, measured(track), body.refused, series, start)
         raise DataError(f"The environment of task '{task}' did not end within {limit} steps at seed {seed}.",
                         "let step() return truncated=True after as many steps as an episode may take")  # fmt: skip
 
@@ -289,6 +290,16 @@ def told_to(observation: Mapping[str, Any], spec: PolicySpec) -> str:
     value = observation[texts[0]] if len(texts) == 1 and texts[0] in observation else ""
     value = value[0] if isinstance(value, list | tuple | np.ndarray) and len(value) == 1 else value
     return one_line(value, LONGEST) if isinstance(value, str) else ""
+
+
+def start_of(observation: Mapping[str, Any], spec: PolicySpec) -> str:
+    """Return a hash of what the policy is given of a first observation: the same for episodes that begin alike."""
+    digest = hashlib.sha256()
+    for name in (tensor.name for tensor in spec.inputs if tensor.name in observation):
+        value = np.asarray(observation[name])
+        content = value.tobytes() if value.dtype.kind in "biuf" else repr(value.tolist()).encode()
+        digest.update(f"{name} {value.shape} {value.dtype.kind} {len(content)} ".encode() + content)
+    return digest.hexdigest()[:16]
 
 
 def _acted(queue: Actor, observation: Mapping[str, Any], where: str) -> Array:

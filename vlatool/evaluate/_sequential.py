@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import Outcome
 from vlatool.episodes.play import EpisodesJob, jobs_for
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
-from vlatool.stats.success_sequential import Decision, plan
+from vlatool.stats.starts import distinct, independent, too_few
+from vlatool.stats.success_sequential import GO_ON, Decision, plan
 
 Play = Callable[[list[EpisodesJob]], list[Outcome]]
 
@@ -30,8 +32,7 @@ def played_until(
     """
     tasks = list(dict.fromkeys(job.task for job in jobs))
     first = min(seed for job in jobs for seed in job.seeds)
-    most = sum(len(job.seeds) for job in jobs)
-    comparison = plan(limit, most, tasks=len(tasks))
+    comparison = plan(limit, sum(len(job.seeds) for job in jobs), tasks=len(tasks))
     ours: list[Outcome] = []
     theirs: list[Outcome] = []
     done = 0
@@ -44,8 +45,11 @@ def played_until(
         pairs = list(zip(theirs, ours, strict=True))
         lost = sum(one.success and not two.success for one, two in pairs)
         won = sum(two.success and not one.success for one, two in pairs)
-        decision = comparison.judge(lost, won, after)
-        context.tell(f"{after} pairs: {told(decision)}", after / most)
+        starts = [outcome.begins for outcome in theirs]
+        decision = comparison.judge(lost, won, after, independent(starts))
+        if too_few(starts) and decision.verdict in ("pass", "fail"):
+            decision = replace(decision, verdict=GO_ON if after < comparison.most else "inconclusive")
+        context.tell(f"{after} pairs: {told(decision)}", after / comparison.most)
         if decision.over:
             break
     if decision is None:
@@ -65,16 +69,24 @@ def told(decision: Decision) -> str:
 def with_decision(row: Row, decision: Decision) -> Row:
     """Return the row with the interval of its drop that holds over all interim analyses."""
     note = f"paired: {decision.lost} lost, {decision.won} won of {decision.pairs} episodes, {decision.most} at most"
+    note += f"; {distinct(row.raw[START])} distinct starts"
     drop = Measurement("success_drop", decision.drop, "1", samples=decision.pairs, low=decision.low,
                        high=decision.high, note=note)  # fmt: skip
     return replace(row, measurements=tuple(drop if item.name == drop.name else item for item in row.measurements))
 
 
-def sentence(decision: Decision) -> str:
-    """Return what was decided, and after how many pairs."""
+def sentence(decision: Decision, starts: int | None = None) -> str:
+    """Return what was decided, and after how many pairs.
+
+    Args:
+        decision: Of the pairs.
+        starts: How many distinct ones there are; not told when None.
+    """
     allowed = f"{100 * decision.limit:.3g} points"
     what = {"pass": f"is at most {allowed}", "fail": f"is more than {allowed}"}.get(decision.verdict)
-    seen = f"{decision.pairs} of at most {decision.most} paired episodes: {told(decision)}"
+    seen = f"{decision.pairs} of at most {decision.most} paired episodes"
+    seen += f" ({starts} distinct starts): " if starts is not None else ": "
+    seen += told(decision)
     if what is None:
         return f"Whether the drop is more than {allowed} is not decided by {seen}."
     return f"The drop {what}, decided by {seen}, with an error of 2.5 % at most."

@@ -13,7 +13,8 @@ from pydantic_core import PydanticCustomError
 
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.disturbed import with_disturbed
-from vlatool.accuracy.paired import Outcome, compare_success, success_row, with_chance
+from vlatool.accuracy.moved import START
+from vlatool.accuracy.paired import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.accuracy.shown import with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
@@ -24,6 +25,7 @@ from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
 from vlatool.evaluate._names import BASELINE, names_of
 from vlatool.evaluate._player import Player
+from vlatool.evaluate._seen import FIX, seen_in_training
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
@@ -34,6 +36,7 @@ from vlatool.module.factory import factory_file, split_factory
 from vlatool.report import Report, Row
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.cache import STREAMS
+from vlatool.stats.starts import distinct
 from vlatool.user_code import trust
 
 if TYPE_CHECKING:
@@ -133,7 +136,13 @@ class ClosedLoop(Measure):
             raise UsageError("--board says whose latency counts, and none does.", "add --latency-in-the-loop")
         if "strength" in self.options() and not self.disturb:
             raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
-        self._may_run(self._jobs(source)[0])
+        jobs = self._jobs(source)
+        self._may_run(jobs[0])
+        if source is not None and self.limit is not None and (seen := seen_in_training(self._bundles(source), jobs)):
+            raise UsageError(f"Nothing can be decided: {seen[0]}.", FIX)
+
+    def _bundles(self, source: Bundle) -> list[Bundle]:
+        return [*([Bundle.described(self.baseline)] if self.baseline else []), source]
 
     def on(self, profile: Profile) -> ClosedLoop:
         """Return the evaluation with the latency that is predicted for a board, where latency counts."""
@@ -201,9 +210,10 @@ class ClosedLoop(Measure):
         how = f" with {self.control} actions in the place of the policy's" if self.control else how
         text = f"{row.value('success'):.1%} of {count} episodes succeed{how and ',' + how}."
         verdict = "inconclusive" if believed.fails else decision.verdict if decision else "info"
-        decided = (sentence(decision),) if decision else ()
+        decided = (sentence(decision, distinct(row.raw[START])),) if decision else ()
         summary = (*believed.sentences, *decided, text, *told(rows, self.board), *again.sentences)
-        warnings = (*believed.warnings, *found_wrong(source), *again.warnings, *dict.fromkeys(context.notes))
+        doubts = (*repeated_starts(row), *seen_in_training(bundles, jobs), *found_wrong(source))
+        warnings = (*believed.warnings, *doubts, *again.warnings, *dict.fromkeys(context.notes))
         return Report("evaluate", title, verdict, summary, tuple(rows), environment=fingerprint(), warnings=warnings)
 
     def _disturbances(self, source: Bundle, job: EpisodesJob, context: Context) -> tuple[str, ...]:
@@ -289,9 +299,27 @@ class ClosedLoop(Measure):
             )
         trust.require(file.parent, f"{function}() of {file.name}")
 
+    def _scene(self, source: Bundle | None) -> dict[str, Any]:
+        """Return the environment that the baseline names, or the bundle where there is none, or it names nothing.
+
+        Raises:
+            DataError: when both name one, and what would be played differs: a variant cannot choose its own.
+        """
+        own = source.manifest.environment if source else {}
+        base = Bundle.described(self.baseline).manifest.environment if self.baseline else {}
+        asked = {"make": self.environment, "tasks": self.tasks}
+        other = [key for key, value in asked.items() if own and base and not value and own.get(key) != base.get(key)]
+        if other:
+            words = "; ".join(f"{key} {own.get(key)!r}, the baseline {base.get(key)!r}" for key in other)
+            raise DataError(
+                f"The bundle names another environment than its baseline: {words}.",
+                "say which one is played: --policy DIR, or --environment FILE.py:make --tasks NAME",
+            )
+        return base or own
+
     def _jobs(self, source: Bundle | None) -> list[EpisodesJob]:
         described = read_description(self.policy) if self.policy else None
-        named = described.environment if described else (source.manifest.environment if source else {})
+        named = described.environment if described else self._scene(source)
         known = tuple(named.get("tasks", ()))
         tasks = self.tasks or known
         where = self.environment or str(named.get("make", ""))

@@ -9,16 +9,18 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
 from vlatool.bundle.unexported import no_graph
-from vlatool.errors import BundleError, GraphError, nearest, require
+from vlatool.errors import BundleError, DataError, GraphError, nearest, require
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
 from vlatool.graph.draws import drawing
 from vlatool.graph.files import read
 
-MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode")
+MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens")
 """What a robot relies on; files of statistics and tokenizers may differ."""
-RATE = ("control_hz", "chunk", "execute")
+RATE = ("control_hz", "chunk", "executed")
 FEWER_STEPS = "prune.steps"
+LARGEST_TOLERANCE = 1.0
+"""Of a golden action: with more, ``load`` would accept any."""
 
 
 def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
@@ -26,9 +28,10 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
 
     Raises:
         BundleError: when a bundle has no graph or lacks the baseline's golden action, or the two have other inputs or
-            outputs, another rate, or keep, draw or repeat something else.
+            outputs, another rate, or keep, draw or repeat something else, or are played in other environments.
         GraphError: when a graph draws random numbers of its own, or its weights cannot be read.
-        DataError: when accuracy is claimed and there is nothing to measure it on.
+        DataError: when accuracy is claimed and there is nothing to measure it on, or steps that a stage left out are
+            not covered by that claim.
     """
     for bundle in (candidate, baseline):
         if not bundle.manifest.graphs:
@@ -37,14 +40,49 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
         if engine and engine not in known:
             raise BundleError(f"{bundle.path} is made for the engine '{engine}'; {nearest(engine, known)}.")
     mine, theirs = candidate.manifest, baseline.manifest
-    if differs := _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs):
+    differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)
+    if differs := differs or (_scene(mine, theirs) if _plays_what_bundles_name(gate) else ""):
         raise BundleError(f"{candidate.path} and {baseline.path} are no versions of one policy: {differs}.")
-    if theirs.golden and not mine.golden:
-        raise BundleError(f"{candidate.path} has no golden action, which the baseline has.", "make the bundle again")
+    _check_golden(candidate, baseline)
+    if _has_fewer_steps(mine, theirs) and gate.accuracy is None:
+        raise DataError(
+            f"{candidate.path} runs fewer steps than the baseline, and no claim is made of its accuracy.",
+            "claim it in the gate (accuracy: {data: FILE} or {episodes: N}): it alone says what the steps are worth",
+        )
     for bundle in (candidate, baseline):
         _refuse_draws(bundle)
     if gate.accuracy:
         accuracy.data_of(baseline, gate.accuracy)
+
+
+def _plays_what_bundles_name(gate: Gate) -> bool:
+    """Return whether episodes are played in an environment that no file of the gate's names."""
+    return bool(gate.accuracy and gate.accuracy.episodes and gate.accuracy.policy is None)
+
+
+def _scene(mine: Manifest, theirs: Manifest) -> str:
+    """Return in words how the environment that the candidate names differs from the baseline's, which is played.
+
+    One that names none lets the baseline's stand.
+    """
+    if not mine.environment:
+        return ""
+    keys = dict.fromkeys((*theirs.environment, *mine.environment))
+    pairs = [(key, mine.environment.get(key), theirs.environment.get(key)) for key in keys]
+    return "; ".join(text for key, one, two in pairs if (text := _told(f"environment: {key}", one, two)))
+
+
+def _check_golden(candidate: Bundle, baseline: Bundle) -> None:
+    """Refuse a candidate whose golden action a robot could not check as it checks the baseline's."""
+    mine = candidate.manifest
+    if baseline.manifest.golden and not mine.golden:
+        raise BundleError(f"{candidate.path} has no golden action, which the baseline has.", "make the bundle again")
+    if (allowed := max(mine.golden_tolerance, mine.golden_chunk_tolerance)) > LARGEST_TOLERANCE:
+        raise BundleError(
+            f"{candidate.path} lets its golden action differ by {allowed:g}, so that load accepts any action; allowed: "
+            f"up to {LARGEST_TOLERANCE:g}.",
+            "make the bundle again",
+        )
 
 
 def _refuse_draws(bundle: Bundle) -> None:

@@ -8,6 +8,7 @@ inferences in which both answer the same.
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections.abc import Mapping, Sequence
@@ -41,8 +42,8 @@ class Followed:
     Args:
         kind: Of the observations (``data.Drawn.kind``).
         output: Its name.
-        correlation: Over observations and elements, each by the baseline's spread: 1 follows it everywhere, 0 is what
-            a constant reaches, -1 is its opposite.
+        correlation: Over observations and elements, each by the baseline's spread: 1 gives the same everywhere, 0 is
+            what a constant reaches, -1 is its opposite.
         samples: Observations.
     """
 
@@ -181,7 +182,8 @@ def _followed(policies: Sequence[Any], calls: Sequence[_Asked], usual: Mapping[s
             _physical(policy, tensor.name, [call.outputs[which][tensor.name] for call in calls])
             for which, policy in enumerate(policies)
         )
-        followed.append(Followed(kind, tensor.name, correlation(mine, theirs, usual[tensor.name]), count))
+        value = correlation(mine, theirs, usual[tensor.name], concordant=tensor.kind != "discrete")
+        followed.append(Followed(kind, tensor.name, value, count))
     return followed
 
 
@@ -197,15 +199,18 @@ def _physical(policy: Any, name: str, values: Sequence[Array]) -> Array:
     return wide if normaliser is None else np.asarray(normaliser.inverse(wide.astype(np.float32)))
 
 
-def correlation(mine: Array, theirs: Array, usual: Array | None = None) -> float:
+def correlation(mine: Array, theirs: Array, usual: Array | None = None, concordant: bool = False) -> float:
     """Return how (N, ...) answers follow others, see ``Followed``; elements that do not vary do not count.
 
+    It is Pearson's, or the concordance correlation (Lin, Biometrics 45, 1989), for which a tenth of each answer, or one
+    that lies elsewhere, is another answer: it is never larger, and equal where mean and spread are.
     Where none varies, 1 says that they are near each other and 0 that they are not.
 
     Args:
         mine: Answers that should follow.
         theirs: Those that they should follow.
         usual: (...), how much each element varies elsewhere: one that stands still here counts by its share of that.
+        concordant: Whether scale and place count, as they do unless answers are logits.
     """
     if mine.shape != theirs.shape:
         return 0.0
@@ -218,8 +223,10 @@ def correlation(mine: Array, theirs: Array, usual: Array | None = None) -> float
         return float(near)
     floor = np.zeros(spread.shape) if usual is None else NEARLY_STILL * usual.reshape(-1)
     by = np.maximum(spread, floor)[varied]
-    one, two = ((values - values.mean(axis=0))[:, varied] / by for values in (mine, theirs))
-    size = float(np.linalg.norm(one) * np.linalg.norm(two))
+    middle = theirs.mean(axis=0)
+    one, two = ((values - (middle if concordant else values.mean(axis=0)))[:, varied] / by for values in (mine, theirs))
+    sizes = float(np.linalg.norm(one)), float(np.linalg.norm(two))
+    size = sum(each**2 for each in sizes) / 2 if concordant else math.prod(sizes)
     return float((one * two).sum() / size) if size > 0 else 0.0
 
 

@@ -30,7 +30,7 @@ from vlatool.optimize.evidence import Enough, is_recorded, told_wrong, unjudged,
 from vlatool.optimize.judge import Judged, judge
 from vlatool.optimize.made import candidate, chain
 from vlatool.optimize.plan import BASELINE, Plan, make_plan, transforms
-from vlatool.optimize.pruned import PrunedSearch
+from vlatool.optimize.pruned import PrunedSearch, with_measured
 from vlatool.optimize.recipe import Pruning, Recipe, StageList
 from vlatool.optimize.search import Search
 from vlatool.optimize.summary import report_of
@@ -128,6 +128,7 @@ def _optimized(plan: Plan, draft: Path, context: Context) -> Report:
     taught = [name for name in trained if trained[name]]
     rows = _told_wrong(plan, rows, {BASELINE: baseline, **bundles}, taught, context)
     judged, trust = judged_rows(plan, rows, {name: engine_of(bundle) for name, bundle in bundles.items()})
+    trials = {title: with_measured(table, rows) for title, table in trials.items()}
     tables = {**trials, **tried, **_explained(judged, bundles, baseline, context)}
     judged = [_with_tables(item, tables) if item.row.role == "chosen" else item for item in judged]
     told = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +26,7 @@ from vlatool.optimize.search import QUICK
 from vlatool.optimize.space import Shape, Space, quantizations, space_of
 from vlatool.optimize.study import Study, Tried
 from vlatool.optimize.trained import trainings
-from vlatool.report import TRAINING_TIME
+from vlatool.report import TRAINING_TIME, Row
 from vlatool.runtime.engine import DEFAULT_ENGINE
 from vlatool.stage.base import Context
 from vlatool.stage.cache import STREAMS
@@ -35,6 +36,9 @@ SELECTION_SEEDS = 2 * EVALUATION_SEEDS
 """First seed of the episodes that trials play: no training may reach it, and no evaluation is so long."""
 FINALISTS = 3
 TIMED = 60
+SAID = "the study says"
+NOT_MEASURED = "not measured in this run"
+MEASURED_AGAIN = "measured as a candidate"
 
 
 @dataclass(frozen=True)
@@ -168,21 +172,48 @@ class PrunedSearch:
         return f"{100 * drop:.1f} points" if points else f"{drop:.4g}"
 
     def _table(self, tried: list[Tried], space: Space) -> list[dict[str, Any]]:
-        front = front_of(tried)
+        """Return all trials; what the study says of those that were not made in this run stands in a column of its own.
+
+        A study may be written by anybody who reaches it, so that nothing of it is shown as measured.
+        """
+        front = front_of([each for each in tried if not each.elsewhere])
         return [
-            {
-                "policy": space.name(each.shape),
-                "speed-up": f"{each.speedup:.2f}x" if each.speedup else "",
-                "drop": self._told(each.drop),
-                "within": "yes" if each.drop <= self._allowed and not each.refused else "no",
-                "on the front": "yes" if each in front else "",
-                "training": f"{each.training_s / 60:.1f} min" if each.training_s else "",
-                "note": "; ".join(
-                    filter(None, (each.note or each.refused, "another process" if each.elsewhere else ""))
-                ),
-            }
-            for each in sorted(tried, key=lambda each: -each.speedup)
+            {"policy": space.name(each.shape), **self._cells(each, each in front)}
+            for each in sorted(tried, key=lambda each: (each.elsewhere, -each.speedup))
         ]
+
+    def _cells(self, each: Tried, on_the_front: bool) -> dict[str, Any]:
+        speed = f"{each.speedup:.2f}x" if each.speedup else ""
+        note = each.note or each.refused
+        if each.elsewhere:
+            said = ", ".join(filter(None, (speed, self._told(each.drop) and f"drop {self._told(each.drop)}", note)))
+            words = {"note": NOT_MEASURED, SAID: said or "nothing"}
+            return dict.fromkeys(("speed-up", "drop", "within", "on the front", "training"), "") | words
+        return {
+            "speed-up": speed,
+            "drop": self._told(each.drop),
+            "within": "yes" if each.drop <= self._allowed and not each.refused else "no",
+            "on the front": "yes" if on_the_front else "",
+            "training": f"{each.training_s / 60:.1f} min" if each.training_s else "",
+            "note": note,
+            SAID: "",
+        }
+
+
+def with_measured(table: list[dict[str, Any]], rows: Mapping[str, Row]) -> list[dict[str, Any]]:
+    """Return the trials with the speed-up and the drop of those that were measured in this run after all.
+
+    Args:
+        table: Of ``PrunedSearch.run``.
+        rows: Name -> row of each candidate, as it was measured.
+    """
+    lines = []
+    for line in table:
+        speed = rows[line["policy"]].get("speedup") if line["policy"] in rows else None
+        if line["note"] == NOT_MEASURED and speed is not None and speed.known:
+            line = {**line, "speed-up": f"{speed.value:.2f}x", "note": MEASURED_AGAIN}
+        lines.append(line)
+    return lines
 
 
 def front_of(tried: list[Tried]) -> list[Tried]:

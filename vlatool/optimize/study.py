@@ -7,7 +7,7 @@ import os
 import platform
 import uuid
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import psutil
@@ -40,7 +40,7 @@ class Tried:
         drop: Accuracy lost, a share of episodes or in the measure of the budget; infinite when not known.
         training_s: Seconds that its training took, wherever that was; 0 for none.
         note: Why it could not be made.
-        elsewhere: Whether another machine or process tried it.
+        elsewhere: Whether another machine or process tried it, so that all of this is what the study says.
         refused: Why it moves worse than the limits allow, or loses more on one task; empty when it does not.
         miss: By how much, as a multiple of the limits.
     """
@@ -75,6 +75,7 @@ class Study:
         self._allowed, self._seed = allowed, seed
         self._worker = worker()
         self._left: list[int] = []
+        self._told: dict[int, Tried] = {}
         self._space = Space((1.0,), 1, 1, {}, ())
         self._url = url
         with used(url):
@@ -170,26 +171,31 @@ class Study:
         Raises:
             UsageError: when the study cannot be written any more.
         """
+        if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
+            note = tried.note[:LONGEST] or "its accuracy could not be measured"
+            tried = Tried(tried.shape, training_s=tried.training_s, note=note)
+        tried = self._told[number] = replace(tried, refused=tried.refused[:LONGEST])
         with used(self._url):
             trial = self._trial(number)
             trial.set_user_attr(TRAINING, tried.training_s)
-            if tried.note or not (math.isfinite(tried.speedup) and math.isfinite(tried.drop)):
-                trial.set_user_attr(NOTE, tried.note[:LONGEST] or "its accuracy could not be measured")
+            if tried.note:
+                trial.set_user_attr(NOTE, tried.note)
                 self._study.tell(number, state=self._optuna.trial.TrialState.FAIL)
             else:
-                trial.set_user_attr(REFUSED, tried.refused[:LONGEST])
+                trial.set_user_attr(REFUSED, tried.refused)
                 trial.set_constraint("drop", tried.drop - self._allowed)
                 trial.set_constraint("moves", tried.miss)
                 self._study.tell(number, [tried.speedup, tried.drop])
 
     def tried(self) -> list[Tried]:
-        """Return what is known of all trials that ended.
+        """Return what is known of all trials that ended: what this object was told, and what the study says of others.
 
         Raises:
             DataError: when what the study holds is not what a trial finds.
         """
         with used(self._url):
-            return [self._read(trial) for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
+            ended = [trial for trial in self._trials() if trial.state.is_finished() and self._counts(trial)]
+            return [self._told.get(trial.number) or self._read(trial) for trial in ended]
 
     def under_way(self) -> int:
         """Return how many trials other processes have under way."""
@@ -249,8 +255,7 @@ class Study:
                 f"Trial {trial.number} of the study is not of this policy: {trial.params}, {trial.values}.",
                 "name another study",
             )
-        elsewhere = trial.user_attrs.get(WORKER) != self._worker
-        return Tried(shape, speedup, drop, seconds, note, elsewhere, refused)
+        return Tried(shape, speedup, drop, seconds, note, elsewhere=True, refused=refused)
 
 
 def worker() -> str:

@@ -30,6 +30,17 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
 
 
+def sign_test(many: int, trials: int) -> float:
+    """Return the exact one-sided p-value of a sign test: the chance of at least so many heads of fair coins.
+
+    Example:
+        >>> sign_test(2, 2), sign_test(0, 0)
+        (0.25, 1.0)
+    """
+    tail: float = sum(math.comb(trials, count) for count in range(many, trials + 1)) / 2**trials
+    return tail
+
+
 def mcnemar_exact(lost: int, won: int) -> float:
     """Return the two-sided exact p-value of McNemar's test: binomial with p = 1/2 over the discordant pairs.
 

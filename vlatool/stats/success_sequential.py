@@ -24,6 +24,9 @@ Statistical Association 89, 1994). ``tests/soak/success_trials.py`` adds up both
 to 8 % discordant pairs of 1,000 at a limit of 3 %, 2 % of 3,000 at 1 %. Where even all of them leave every other
 comparison open, 30 %, most of it by ending what is hopeless.
 
+**Pairs that begin alike** are worth fewer independent ones (``vlatool.stats.starts``): the counts are reduced to that
+number, in favour of neither side.
+
 **What the caller must see to.** Every task has the same share of the pairs at each interim analysis (``plan(tasks=)``
 makes that possible), since the drop is one over all tasks; and the pairs of an analysis are all played before it.
 """
@@ -36,6 +39,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vlatool.stats.starts import Counts, reduced
 
 Array = NDArray[np.float64]
 
@@ -130,27 +135,28 @@ class Plan:
         """Error of each interim analysis alone, on either side."""
         return spent_in_turns(tuple(after / self.most for after in self.interim_analyses), self.alpha)
 
-    def verdict(self, lost: int, won: int, pairs: int) -> str:
-        """Return ``pass``, ``fail``, ``inconclusive`` or ``go on``, without the interval.
+    def verdict(self, lost: int, won: int, pairs: int, size: int | None = None) -> str:
+        """Return ``pass``, ``fail``, ``inconclusive`` or ``go on``, without the interval; see ``judge``.
 
         Raises:
             ValueError: when no interim analysis has so many pairs, or the counts are none.
         """
         level = self._level(lost, won, pairs)
-        drop = lost - won
-        if drop > pairs * self.limit and exact_p(lost, won, pairs, self.limit) <= level:
+        least, largest = reduced(lost, won, pairs, size or pairs)
+        if _drop(least) > self.limit and exact_p(*least, self.limit) <= level:
             return "fail"
-        if drop < pairs * self.limit and exact_p(won, lost, pairs, -self.limit) <= level:
+        if _drop(largest) < self.limit and exact_p(*_turned(largest), -self.limit) <= level:
             return "pass"
         return "inconclusive" if pairs == self.most or self._futile(lost, won, pairs) else GO_ON
 
-    def judge(self, lost: int, won: int, pairs: int) -> Decision:
+    def judge(self, lost: int, won: int, pairs: int, size: int | None = None) -> Decision:
         """Judge the pairs of an interim analysis.
 
         Args:
             lost: Pairs, of all so far, in which the baseline alone succeeded.
             won: Pairs in which the variant alone succeeded.
             pairs: All of them.
+            size: Independent pairs that they are worth (``starts.independent``); all of them when None.
 
         Raises:
             ValueError: when no interim analysis has so many pairs, or the counts are none.
@@ -163,10 +169,10 @@ class Plan:
             >>> found.verdict, round(found.low, 3), round(found.high, 3), found.saved
             ('pass', -0.02, 0.029, 0.7)
         """
-        verdict = self.verdict(lost, won, pairs)
-        return Decision(verdict, *self.interval(lost, won, pairs), self.limit, lost, won, pairs, self.most)
+        verdict = self.verdict(lost, won, pairs, size)
+        return Decision(verdict, *self.interval(lost, won, pairs, size), self.limit, lost, won, pairs, self.most)
 
-    def interval(self, lost: int, won: int, pairs: int) -> tuple[float, float, float]:
+    def interval(self, lost: int, won: int, pairs: int, size: int | None = None) -> tuple[float, float, float]:
         """Return the drop with its repeated confidence interval, as ``intervals.paired_drop`` does for a fixed number.
 
         Over all interim analyses together, each bound is wrong with chance ``alpha`` at most, so it may be reported
@@ -176,8 +182,9 @@ class Plan:
             ValueError: when no interim analysis has so many pairs, or the counts are none.
         """
         level = self._level(lost, won, pairs)
-        low = _lower_bound(lost, won, pairs, level, self.limit)
-        return (lost - won) / pairs, low, -_lower_bound(won, lost, pairs, level, -self.limit)
+        least, largest = reduced(lost, won, pairs, size or pairs)
+        high = -_lower_bound(*_turned(largest), level, -self.limit)
+        return (lost - won) / pairs, _lower_bound(*least, level, self.limit), high
 
     def _level(self, lost: int, won: int, pairs: int) -> float:
         if pairs not in self.interim_analyses:
@@ -352,7 +359,19 @@ def _lower_bound(lost: int, won: int, pairs: int, level: float, limit: float) ->
     return (below + above) / 2
 
 
-def exact_drop(lost: int, won: int, pairs: int, confidence: float = 0.95) -> tuple[float, float, float]:
+def _drop(counts: Counts) -> float:
+    lost, won, pairs = counts
+    return (lost - won) / pairs
+
+
+def _turned(counts: Counts) -> Counts:
+    lost, won, pairs = counts
+    return won, lost, pairs
+
+
+def exact_drop(
+    lost: int, won: int, pairs: int, confidence: float = 0.95, size: int | None = None
+) -> tuple[float, float, float]:
     """Return the drop of a fixed number of pairs, with an interval whose bounds err no more often than they say.
 
     ``intervals.paired_drop`` is quicker, and near nominal on both sides together; on one side it errs up to five times
@@ -361,5 +380,12 @@ def exact_drop(lost: int, won: int, pairs: int, confidence: float = 0.95) -> tup
     Args:
         lost, won, pairs: Counts; pairs from 1.
         confidence: Of the interval.
+        size: Independent pairs that they are worth (``starts.independent``); all of them when None.
+
+    Example:
+        >>> [round(bound, 2) for bound in exact_drop(0, 0, 300)]
+        [0.0, -0.01, 0.01]
+        >>> [round(bound, 2) for bound in exact_drop(0, 0, 300, size=3)]
+        [0.0, -0.71, 0.71]
     """
-    return plan(0.0, pairs, alpha=(1 - confidence) / 2, analyses=1).interval(lost, won, pairs)
+    return plan(0.0, pairs, alpha=(1 - confidence) / 2, analyses=1).interval(lost, won, pairs, size)

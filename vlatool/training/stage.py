@@ -133,8 +133,7 @@ class TrainingStage(ModuleStage):
                 "take a larger --batch, or fewer parts",
             )
         self._check_shard(source, parts)
-        rounds = len(self.pauses()) + bool(self.patience)
-        last = self.first_seed + self.episodes + rounds * self.student_episodes
+        last = self.first_seed + self.episodes + self._rounds() * self.student_episodes
         if max(self.first_seed + 1, last) > EVALUATION_SEEDS:
             raise RecipeError(
                 f"The episodes to train on take the seeds {self.first_seed} to {last}; evaluations begin at "
@@ -173,6 +172,14 @@ class TrainingStage(ModuleStage):
         """Return before which steps the student plays, or is judged on recorded observations."""
         looks = self.student_episodes or self.patience
         return list(range(self.every, round(self.steps * LAST_SHARE), self.every)) if looks else []
+
+    def _rounds(self) -> int:
+        """Return how often the student plays, the judgement of the last weights included."""
+        return len(self.pauses()) + bool(self.patience)
+
+    def seeds(self, tasks: int) -> range:
+        """Return the seeds of the episodes that are played of each task, as many as there are at most."""
+        return range(self.first_seed, self.plan().seed(1 + self._rounds(), tasks))
 
     def lesson(self, modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> Lesson:
         """Return what the student does with a batch, and how far that is from what the teacher says of it."""

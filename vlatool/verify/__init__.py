@@ -71,23 +71,21 @@ def check(options: Options) -> None:
 
 
 def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> Report:
-    """Return what was found as a report; its verdict is ``fail`` when the actions differ."""
-    name, count, differing = bundle.manifest.name, int(comparison["samples"]), int(comparison["differing"])
+    """Return what was found as a report.
+
+    Its verdict is ``fail`` when the actions differ, and ``inconclusive`` when they are the same as far as the original
+    gives them, which is not as far as they are executed.
+    """
+    name, count, spec = bundle.manifest.name, int(comparison["samples"]), bundle.manifest.spec
+    steps, worst = int(comparison["steps"]), float(comparison["error"])
+    verdict = "fail" if comparison["differing"] else "inconclusive" if steps < spec.executed else "pass"
     observations = str(comparison["observations"]).removesuffix("s" if count == 1 else "")
     title = f"{name} against {options.against} on {count} {observations}"
-    worst = float(comparison["error"])
-    if differing:
-        first = comparison["first"]
-        sentences = [
-            f"{name} does not give what {options.against} gives: {differing} of {count} observations differ by more "
-            f"than {options.tolerance:g}, the first is observation {first}; the largest relative error is {worst:.3g}.",
-            *map(str, comparison["causes"]),
-        ]
-        sentences += [] if comparison["hooks"] or comparison["certain"] else [HOOKS[0].upper() + HOOKS[1:] + "."]
-    else:
-        sentences = [f"{name} gives what {options.against} gives: the largest relative error is {worst:.3g} (allowed: "
-                f"{options.tolerance:g})."]  # fmt: skip
-    measurements = [Measurement("relative_error_max", worst, "1", samples=count, note="action, in physical units")]
+    sentences = _sentences(name, options, comparison, verdict, spec.executed)
+    compared = f"Compared: {steps} of the {spec.chunk} steps of a chunk, of which {spec.executed} are executed"
+    sentences += [f"{compared}, on {count} {observations}."] if spec.chunk > 1 else []
+    note = f"action, in physical units, {steps} of {spec.chunk} steps"
+    measurements = [Measurement("relative_error_max", worst, "1", samples=count, note=note)]
     measurements += [
         Measurement(f"error_max.{element['element']}", float(element["max error"]), str(element["unit"]), samples=count,
                     note="largest |difference|") for element in comparison["elements"]
@@ -95,6 +93,29 @@ def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> 
     details = {ELEMENTS: list(comparison["elements"]), STAGES: list(comparison["stages"])}
     row = Row(name, measurements=tuple(measurements), details={key: value for key, value in details.items() if value})
     return Report(
-        "verify", title, "fail" if differing else "pass", tuple(sentences), (row,), environment=fingerprint(),
+        "verify", title, verdict, tuple(sentences), (row,), environment=fingerprint(),
         warnings=tuple(comparison["warnings"]), limits={"tolerance": options.tolerance},
     )  # fmt: skip
+
+
+def _sentences(name: str, options: Options, comparison: Mapping[str, Any], verdict: str, executed: int) -> list[str]:
+    """Return what was found in words, the verdict first."""
+    worst, allowed = float(comparison["error"]), options.tolerance
+    if verdict == "pass":
+        return [f"{name} gives what {options.against} gives: the largest relative error is {worst:.3g} (allowed: "
+                f"{allowed:g})."]  # fmt: skip
+    if verdict == "inconclusive":
+        return [
+            f"Whether {name} gives what {options.against} gives is not decided: {comparison['steps']} of the "
+            f"{executed} steps that are executed could be compared, which are the same (largest relative error "
+            f"{worst:.3g}).",
+            f"Let {options.against} return all steps of the chunk that the controller executes.",
+        ]
+    hooks = [] if comparison["hooks"] or comparison["certain"] else [HOOKS[0].upper() + HOOKS[1:] + "."]
+    return [
+        f"{name} does not give what {options.against} gives: {comparison['differing']} of {comparison['samples']} "
+        f"observations differ by more than {allowed:g}, the first is observation {comparison['first']}; the largest "
+        f"relative error is {worst:.3g}.",
+        *map(str, comparison["causes"]),
+        *hooks,
+    ]

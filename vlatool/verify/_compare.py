@@ -42,7 +42,8 @@ def compare(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     differing = [sample for sample in samples if not sample.error <= tolerance]
     sentences = causes(policy, samples, stages, tolerance) if differing else ([], True)
     return {
-        "samples": len(samples), "differing": len(differing), "first": differing[0].number if differing else -1,
+        "samples": len(samples), "steps": min(len(sample.expected) for sample in samples),
+        "differing": len(differing), "first": differing[0].number if differing else -1,
         "error": _worst([sample.error for sample in samples]), "elements": _elements(policy.spec, samples),
         "stages": stages, "causes": sentences[0], "certain": sentences[1], "hooks": original.hooks,
         "observations": "recorded observations" if recording else "random observations",

@@ -2,12 +2,16 @@ from __future__ import annotations
 
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from vlatool.accuracy.paired import Outcome, success_row
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import EVALUATION
 from vlatool.errors import DataError
 from vlatool.gate.claims import accuracy
 from vlatool.gate.claims.accuracy import data_of, examine
@@ -147,3 +151,26 @@ def test_one_recorded_episode_decides_nothing() -> None:
         "which says nothing of others"
     )
     assert accuracy.finite(-math.inf) is None
+
+
+@pytest.mark.parametrize(
+    ("starts", "lost", "verdict"),
+    [(3, 0, "inconclusive"), (3, 300, "inconclusive"), (20, 0, "pass"), (20, 300, "fail"), (300, 0, "pass")],
+)
+def test_pairs_that_begin_alike_are_worth_as_many_as_their_starts(
+    float_bundle: Bundle, starts: int, lost: int, verdict: str
+) -> None:
+    """Three hundred pairs; an environment whose seed draws one of a few episodes."""
+    base = [Outcome("open", seed, True, 5, start=f"{seed % starts}") for seed in range(300)]
+    own = [replace(each, success=each.seed >= lost) for each in base]
+    rows = success_row("baseline", "baseline", base), success_row("subject", "subject", own)
+    claim = AccuracyClaim(max_drop=0.25, episodes=300)
+    kept = {name: record for name, record in float_bundle.manifest.files.items() if name != EVALUATION}
+    bare = replace(float_bundle, manifest=replace(float_bundle.manifest, files=kept))
+    found = examine(bare, bare, claim, Context(), episodes=SimpleNamespace(rows=rows))
+    assert found.verdict == verdict, found.sentence
+    assert f"300 of them, {starts} distinct starts; allowed" in found.sentence
+    told = f"have {starts} distinct first observations, so that they count as {starts}"
+    assert (told in found.sentence) == (starts < 300)
+    drop = next(each for each in found.measurements if each.name == "success_drop")
+    assert (drop.high - drop.low > 0.05) == (starts < 300)

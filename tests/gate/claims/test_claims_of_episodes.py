@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -184,3 +186,97 @@ def test_claims_of_episodes_need_episodes(tmp_path: Path):
     gate = read_gate(file)
     assert (gate.motion.margin, gate.task_time.margin) == (0.1, 0.05)
     assert (gate.worst_task.max_drop, gate.disturbed.max_drop) == (0.03, 0.05)
+
+
+def told(count: int, missing: Collection[int] = (), names: Collection[str] = ("path_length", "jerk"), **more: Any):
+    """Episodes that all succeed; some lost what they told of the body at one step."""
+    return [
+        replace(each, success=True, **more, motion={
+            name: value for name, value in each.motion.items() if number not in missing or name not in names
+        }) for number, each in enumerate(played(1, count))
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "says"),
+    [
+        (range(45, 400), range(45, 400), "known of both in 45 of 400 common successes, and it takes 90%"),
+        (range(45, 400), (), "known of both in 45 of 400 common successes"),
+        ((), range(300), "known of both in 100 of 400"),
+        (range(30), (), "missing in 30 common successes where the baseline has it, the other way round in 0"),
+        (range(2), (), "missing in 2 common successes"),
+        (
+            range(20),
+            range(20, 24),
+            "in 20 common successes where the baseline has it, the other way round in 4",
+        ),
+        (range(400), (), "known of both in 0 of 400"),
+    ],
+)
+@pytest.mark.parametrize("metrics", [(), ("jerk",), ("path_length", "jerk")])
+def test_values_that_are_missing_let_nothing_pass(ours, theirs, says: str, metrics: tuple[str, ...]):
+    result = motion.examine(episodes(told(400, theirs), told(400, ours)), MotionClaim(metrics=metrics))
+    assert result.verdict == "inconclusive", result.sentence
+    assert says in result.sentence
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"), [((), ()), (range(5), range(5)), (range(5), range(5, 10)), ([7], ()), ((), range(20))]
+)
+def test_values_that_are_missing_by_chance_are_reported(ours, theirs):
+    result = motion.examine(episodes(told(400, theirs), told(400, ours)), MotionClaim())
+    assert result.verdict == "pass", result.sentence
+    lost = len({*ours, *theirs})
+    assert (f"unknown in {lost} of them" in result.sentence) == (lost > 0)
+
+
+def test_missing_values_do_not_leave_another_metric_to_decide():
+    """The baseline tells of a path, the candidate of no place at all: how its actions change is no answer."""
+    base, own = told(60), told(60, range(60))
+    base, own = ([replace(each, motion={**each.motion, "action_rate": 1.0}) for each in some] for some in (base, own))
+    result = motion.examine(episodes(base, own), MotionClaim())
+    assert (result.verdict, "no ratio of path_length" in result.sentence) == ("inconclusive", True)
+
+
+def test_a_metric_that_the_baseline_has_nothing_of_needs_its_values_too():
+    base = [Outcome("open", seed, True, 20, "", {"collisions": 0.0}) for seed in range(60)]
+    own = [replace(each, motion={} if each.seed < 20 else each.motion) for each in base]
+    result = motion.examine(episodes(base, own), MotionClaim(metrics=("collisions",)))
+    assert (result.verdict, "known of both in 40 of 60" in result.sentence) == ("inconclusive", True)
+
+
+def test_task_time_needs_its_values_too():
+    base, own = told(60), told(60, range(30), ("task_time",))
+    result = task_time.examine(episodes(base, own), TaskTimeClaim())
+    assert (result.verdict, "known of both in 30 of 60" in result.sentence) == ("inconclusive", True)
+
+
+def test_a_clock_that_went_wrong_in_one_arm_gives_no_pair():
+    """Its rate is that of the spec then, so that jerk would be many times smaller than by the clock."""
+    base, own = told(60), told(60)
+    own = [replace(each, refused={"time": "it is told at 5 of 7 moments"}, motion={"jerk": 1e-6}) for each in own]
+    for metrics in ((), ("jerk",)):
+        assert motion.examine(episodes(base, own), MotionClaim(metrics=metrics)).verdict == "inconclusive"
+    both = [[replace(each, refused={"time": "it stands"}) for each in told(60)] for _ in range(2)]
+    assert motion.examine(episodes(*both), MotionClaim()).verdict == "pass"
+
+
+def begun(outcomes: list[Outcome], count: int) -> list[Outcome]:
+    return [replace(each, start=str(number % count)) for number, each in enumerate(outcomes)]
+
+
+@pytest.mark.parametrize("claim", [motion, task_time, worst_task, disturbed])
+def test_episodes_that_begin_alike_decide_nothing(claim):
+    """Three hundred episodes of three starts, each a hundred times."""
+    one = begun([replace(each, success=True) for each in played(1, 3)] * 100, 3)
+    one = [replace(each, seed=seed) for seed, each in enumerate(one)]
+    asked = {
+        motion: MotionClaim(),
+        task_time: TaskTimeClaim(),
+        worst_task: WorstTaskClaim(max_drop=0.99),
+        disturbed: DisturbedClaim(max_drop=0.99),
+    }
+    found = claim.examine(episodes(one, one, delay=(one, one)), asked[claim])
+    assert (found.verdict, "3 distinct starts" in found.sentence) == ("inconclusive", True), found.sentence
+    apart = [replace(each, start="") for each in one]
+    assert claim.examine(episodes(apart, apart, delay=(apart, apart)), asked[claim]).verdict == "pass"

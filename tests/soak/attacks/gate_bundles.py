@@ -158,6 +158,112 @@ def outside(place: str, listed: bool, added: int = 4_000_000) -> Make:
     return make
 
 
+def hidden(name: str, folder: str = "graphs") -> Make:
+    """Weights that lie beside the graph in a file which the size of another bundle leaves out.
+
+    Args:
+        name: Of that file, which becomes the golden one where it is called so.
+        folder: Where the graph lies.
+    """
+
+    def make(base: Bundle, out: Path) -> Bundle:
+        made = outside(name, listed=True)(base, out)
+        file = f"{folder}/main.onnx"
+        (out / folder).mkdir(exist_ok=True)
+        for moved in ("main.onnx", name):
+            (out / "graphs" / moved).replace(out / folder / moved)
+        graphs = {"main": replace(base.manifest.graphs["main"], file=file)}
+        fields: dict[str, Any] = {"graphs": graphs, "files": {file: FileRecord("", 0)}}
+        if name.startswith("golden"):  # an archive may begin with anything: the weights, and then the golden action
+            with (out / folder / name).open("ab") as stream:
+                stream.write((out / base.manifest.golden).read_bytes())
+            (out / base.manifest.golden).unlink()
+            fields["golden"] = f"{folder}/{name}"
+        return seal(out, replace(made.manifest, **fields))
+
+    return make
+
+
+def manifest(**fields: Any) -> Make:
+    """The same files under another manifest."""
+    return lambda base, out: copied(base, out, **fields)
+
+
+def praised(base: Bundle, out: Path) -> Bundle:
+    """Negated answers, with figures in the manifest and a report inside the bundle that say how good they are."""
+    made = regilded(copied(base, out, wrong_when(None)))
+    praise = {"success": {"value": 1.0, "samples": 1000}, "success_drop": {"value": -1.0, "samples": 1000}}
+    (out / "reports").mkdir(exist_ok=True)
+    (out / "reports/report.json").write_text(json.dumps({"schema": 1, "kind": "gate", "title": "", "verdict": "pass"}))
+    return rewritten(made, accuracy=praise, made_by={"stage": "export.onnx"}, version="2.0.0", engine="")
+
+
+def tensor_of(name: str, **fields: Any) -> Make:
+    """The same graph, of which an input is given otherwise."""
+
+    def make(base: Bundle, out: Path) -> Bundle:
+        inputs = tuple(replace(each, **fields) if each.name == name else each for each in base.manifest.spec.inputs)
+        made = copied(base, out, spec=replace(base.manifest.spec, inputs=inputs))
+        return made if "max_tokens" in fields else regilded(made)
+
+    return make
+
+
+def statistics(**factors: float) -> Make:
+    """The same graph, with the spread of an input or of the action multiplied."""
+
+    def make(base: Bundle, out: Path) -> Bundle:
+        made = copied(base, out)
+        path = out / "assets/statistics.json"
+        table = json.loads(path.read_text())
+        for name, factor in factors.items():
+            table[name]["std"] = [factor * value for value in table[name]["std"]]
+        path.write_text(json.dumps(table))
+        return regilded(seal(out, made.manifest))
+
+    return make
+
+
+def shifted(base: Bundle, out: Path) -> Bundle:
+    """The same graph, with the action moved by two of its standard deviations."""
+    made = copied(base, out)
+    path = out / "assets/statistics.json"
+    table = json.loads(path.read_text())
+    table["action"]["mean"] = [
+        one + 2 * two for one, two in zip(table["action"]["mean"], table["action"]["std"], strict=True)
+    ]
+    path.write_text(json.dumps(table))
+    return regilded(seal(out, made.manifest))
+
+
+def one_word(base: Bundle, out: Path) -> Bundle:
+    """A vocabulary in which all words are the same one."""
+    made = copied(base, out)
+    path = out / "assets/vocabulary.json"
+    table = json.loads(path.read_text())
+    table["words"] = dict.fromkeys(table["words"], next(iter(table["words"].values())))
+    path.write_text(json.dumps(table))
+    return regilded(seal(out, made.manifest))
+
+
+def shorter(base: Bundle, out: Path) -> Bundle:
+    """A program that runs once in the place of three times, with a record of a stage that leaves out steps."""
+    build = (*base.manifest.build, {"stage": "prune.steps"})
+    step = replace(base.manifest.program[0], repeat=1)
+    return regilded(copied(base, out, program=(step,), build=build))
+
+
+def spare_graph(base: Bundle, out: Path) -> Bundle:
+    """A second graph that no program runs."""
+    copied(base, out)
+    (out / "graphs/spare.onnx").write_bytes((out / "graphs/main.onnx").read_bytes())
+    graphs = {**base.manifest.graphs, "spare": replace(base.manifest.graphs["main"], file="graphs/spare.onnx")}
+    return seal(
+        out,
+        replace(base.manifest, graphs=graphs, files={**base.manifest.files, "graphs/spare.onnx": FileRecord("", 0)}),
+    )
+
+
 def rewritten(bundle: Bundle, **fields: Any) -> Bundle:
     """Return the bundle with another manifest over the same files."""
     manifest = replace(bundle.manifest, **fields)

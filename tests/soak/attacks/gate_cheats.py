@@ -32,20 +32,29 @@ from gate_bundles import (
     exactly_recorded,
     golden_alone,
     golden_of_another,
+    hidden,
+    manifest,
     negated_second,
     of,
+    one_word,
     other_statistics,
     other_words,
     outside,
     own_data,
     perturbed,
+    praised,
     program,
     remembered_count,
     remembering,
     resized,
+    shifted,
+    shorter,
+    spare_graph,
     spec,
+    statistics,
     swapped,
     swept,
+    tensor_of,
     without_golden,
 )
 from gate_graphs import (
@@ -66,6 +75,7 @@ from vlatool.stage.base import Context
 RECORDED_TEXTS = ((2, 3, 4, 7), (2, 3, 4, 8), (5, 7, 0, 0), (6, 8, 0, 0))
 FAST = {"latency": None}
 """A gate that times nothing: enough for what is wrong, not slow."""
+PLAYED = {"latency": None, "accuracy": {"episodes": 4}}
 TIMED = {"latency": {"interim_analyses": [10], "pairs": 60, "margin": 0.25, "warmup": 5}, "size": None}
 """A gate with a margin above what a busy machine and a policy of 50 us make of two equal bundles."""
 
@@ -131,6 +141,40 @@ CHEATS: dict[str, Cheat] = {
     "weights beside the graph, not listed": Cheat("tiny", outside("more.bin", listed=False), FAST),
     "weights among the assets": Cheat("tiny", outside("../assets/more.bin", listed=True), FAST),
     "weights among the reports, not listed": Cheat("tiny", outside("../reports/more.bin", listed=False), FAST),
+    "weights in the golden file": Cheat("tiny", hidden("golden.npz"), FAST, "size"),
+    "weights in what is called calibration": Cheat("tiny", hidden("calibration.npz", "data"), FAST, "size"),
+    "weights in what is called evaluation": Cheat("tiny", hidden("evaluation.npz", "data"), FAST, "size"),
+    "weights in a file that desktops leave behind": Cheat("tiny", outside(".DS_Store", listed=False), FAST),
+    "weights in what is called a signature": Cheat("tiny", outside("../SIGNATURE", listed=False), FAST),
+    "weights in a graph that nothing runs": Cheat("tiny", spare_graph, FAST, "size"),
+    "lists the easy task alone": Cheat(
+        "tiny", manifest(environment={"make": "environment.py:make", "tasks": ["reach"]}), PLAYED
+    ),
+    "names another environment": Cheat(
+        "tiny", manifest(environment={"make": "easy.py:make", "tasks": ["reach", "push"]}), PLAYED
+    ),
+    "a golden action that may be any": Cheat("tiny", manifest(golden_tolerance=1e9), FAST),
+    "a golden chunk that may be any": Cheat("tiny", manifest(golden_chunk_tolerance=1e9), FAST),
+    "fewer words of an instruction": Cheat("tiny", tensor_of("instruction", max_tokens=2), FAST),
+    "fewer steps under a forged record, no accuracy claim": Cheat("noise", shorter, {**FAST, "accuracy": None}),
+    "negated, with praise of its own": Cheat("tiny", praised, {**FAST, "accuracy": None}, "answers"),
+    "a state that is hardly seen": Cheat("tiny", statistics(proprio=1000.0), FAST, "accuracy"),
+    "a state that is seen larger": Cheat("tiny", statistics(proprio=0.02), FAST, "accuracy"),
+    "a state that is not normalised": Cheat(
+        "tiny", tensor_of("proprio", normalisation="none", statistics=""), FAST, "accuracy"
+    ),
+    "all words are one": Cheat("tiny", one_word, FAST, "accuracy"),
+    "actions that are moved": Cheat("tiny", shifted, FAST, "accuracy"),
+    "actions that are too small": Cheat("tiny", statistics(action=0.1), FAST, "accuracy"),
+    "actions that are too small, no accuracy claim": Cheat(
+        "tiny", statistics(action=0.1), {**FAST, "accuracy": None}, "answers"
+    ),
+    "actions that are moved, no accuracy claim": Cheat("tiny", shifted, {**FAST, "accuracy": None}, "answers"),
+    "noise of another distribution": Cheat(
+        "noise", program(noise={"latent": {"shape": [1, 4, 2], "distribution": "uniform"}}), FAST
+    ),
+    "a rate that differs in the tenth digit": Cheat("tiny", spec(control_hz=10.000000001), FAST),
+    "a label that looks the same": Cheat("tiny", spec(action_labels=("dx", "dу")), FAST),
     "weights with other sizes in the manifest": Cheat("tiny", resized, FAST),
     "a file that was changed": Cheat("tiny", swept, FAST),
     "another rate": Cheat("tiny", spec(control_hz=5), FAST),

@@ -10,13 +10,14 @@ from vlatool.report import Measurement
 SHOWN = 3
 
 
-def judged(claim: str, drops: Mapping[str, Measurement], allowed: float) -> ClaimResult:
+def judged(claim: str, drops: Mapping[str, Measurement], allowed: float, few: str = "") -> ClaimResult:
     """Hold drops against a limit: one that is above it fails, all must be shown to be below.
 
     Args:
         claim: Its name.
         drops: Title -> drop with an interval that allows for their number.
         allowed: The largest drop, a share.
+        few: Why the episodes decide nothing, whatever the drops; empty where they may.
     """
     if not drops:
         return ClaimResult(claim, "inconclusive", "no episodes were played")
@@ -26,6 +27,8 @@ def judged(claim: str, drops: Mapping[str, Measurement], allowed: float) -> Clai
     order = sorted(shown, key=lambda title: -shown[title].value)
     told = "; ".join(_told(title, shown[title]) for title in order[:SHOWN])
     more = f"; and {len(order) - SHOWN} more" if len(order) > SHOWN else ""
+    if few:
+        verdict, more = "inconclusive", f"{more}; {few}"
     worst = max(drops.values(), key=lambda drop: drop.value)
     return ClaimResult(claim, verdict, f"more failed episodes: {told}{more}; allowed: {allowed:+.2%}", (worst,))
 

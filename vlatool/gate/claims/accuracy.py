@@ -10,6 +10,8 @@ import numpy as np
 
 from vlatool.accuracy.credibility import DECIDE, credibility
 from vlatool.accuracy.losses import drop, losses
+from vlatool.accuracy.moved import START
+from vlatool.accuracy.paired import few_starts, repeated_starts
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import EVALUATION, read_recording
 from vlatool.errors import DataError
@@ -19,6 +21,7 @@ from vlatool.gate.episodes import Episodes
 from vlatool.gate.result import CONFIDENCE, ClaimResult, worst
 from vlatool.report import Measurement, Row
 from vlatool.stage.base import Context
+from vlatool.stats.starts import distinct, independent
 from vlatool.stats.success_sequential import exact_drop
 
 MOST_SAMPLES = 100_000
@@ -35,16 +38,22 @@ class _Drop:
     baseline: tuple[Measurement, ...] = ()
     warnings: tuple[str, ...] = ()
     candidate: tuple[Measurement, ...] = ()
+    starts: str = ""
+    few: str = ""
 
     def verdict(self, allowed: float) -> str:
+        if self.few:
+            return "inconclusive"
         return "fail" if self.low > allowed else "pass" if self.high <= allowed else "inconclusive"
 
     def told(self, allowed: float) -> str:
         ends = " to ".join(f"{end:+.2%}" if math.isfinite(end) else "unbounded" for end in (self.low, self.high))
-        words = f"{self.words} {self.value:+.2%} ({ends}, {self.samples} of them; allowed: {allowed:+.2%})"
+        words = f"{self.words} {self.value:+.2%} ({ends}, {self.samples} of them{self.starts}; allowed: {allowed:+.2%})"
         gap = abs(allowed - self.value)
         if self.verdict(allowed) != "inconclusive":
             return words
+        if self.few:
+            return f"{words}; {self.few}"
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             return f"{words}, of one episode alone, which says nothing of others"
         if gap:  # an interval narrows with the root of the number
@@ -123,10 +132,12 @@ def _closed_loop(episodes: Episodes) -> _Drop:
     before, after = (row.raw["success"] for row in rows)
     lost = sum(one > two for one, two in zip(before, after, strict=True))
     won = sum(one < two for one, two in zip(before, after, strict=True))
-    value, low, high = exact_drop(lost, won, len(before), CONFIDENCE)
+    starts = rows[0].raw[START]
+    value, low, high = exact_drop(lost, won, len(before), CONFIDENCE, independent(starts))
     own = tuple(number for number in rows[1].measurements if number.name == "success")
-    words = "more failed episodes:"
-    return _Drop("success_drop", words, value, low, high, len(before), rows[0].measurements, candidate=own)
+    words, begun = "more failed episodes:", f", {distinct(starts)} distinct starts"
+    return _Drop("success_drop", words, value, low, high, len(before), rows[0].measurements,
+                 repeated_starts(rows[0]), own, begun, few_starts(rows[0]))  # fmt: skip
 
 
 def _recorded(candidate: Bundle, baseline: Bundle, data: Path, context: Context, engine: str) -> _Drop:

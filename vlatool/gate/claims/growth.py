@@ -65,9 +65,13 @@ def examine_size(candidate: Bundle, baseline: Bundle, claim: GrowthClaim) -> Cla
 def deployed_bytes(bundle: Bundle) -> int:
     """Return the bytes of everything in a bundle that a robot may need, whether the manifest names it or not.
 
-    Weights may lie in any file, so every file counts but those that are known for what else they are.
+    Weights may lie in any file, so every file counts but those that are known for what else they are; and a recorded
+    file that is a graph, or lies in the folder of one, counts whatever it is called: its weights may be there.
     """
-    spared = {*ABOUT, bundle.manifest.golden}
+    folders = tuple(graph.file.rpartition("/")[0] for graph in bundle.manifest.graphs.values())
+    within = tuple(f"{folder}/" if folder else "" for folder in folders)
+    opened = {name for name in bundle.manifest.files if name.startswith(within)}
+    spared = {*ABOUT, bundle.manifest.golden} - opened
     files = (path for path in bundle.path.rglob("*") if path.is_file())
     return sum(path.stat().st_size for path in files if path.relative_to(bundle.path).as_posix() not in spared)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vlatool.accuracy.moved import RATIO, ratios
+from vlatool.accuracy.moved import RATIO, doubts, ratios
 from vlatool.gate.claims._ratio import judged
 from vlatool.gate.config import TaskTimeClaim
 from vlatool.gate.episodes import Episodes
@@ -19,4 +19,5 @@ def examine(episodes: Episodes, claim: TaskTimeClaim) -> ClaimResult:
         DataError: when no environment is named, or it fails.
     """
     found = ratios(*episodes.rows, (METRIC,), CONFIDENCE).get(f"{METRIC}{RATIO}")
-    return judged(METRIC, {"task time": found} if found else {}, claim.margin, NOTHING)
+    nothing = doubts(*episodes.rows, (METRIC,)).get(METRIC, NOTHING)
+    return judged(METRIC, {"task time": found} if found else {}, claim.margin, nothing)
