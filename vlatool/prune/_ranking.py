@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.blocks import first, stacks
-from vlatool.module.feeds import recorded_inputs
+from vlatool.module.feeds import recorded_inputs, refuse_kept
 from vlatool.prune._slopes import slopes_of
 from vlatool.runtime.policy import relative_error
 
@@ -36,6 +36,7 @@ class Ranking:
     """
 
     def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
+        refuse_kept(source, "the ranking", "let those that stay be spread evenly (--rank even), or name them: --keep")
         self._program = BatchedProgram(source.manifest.program, modules)
         self._action = source.manifest.spec.action.name
         self._inputs = recorded_inputs(source, samples)

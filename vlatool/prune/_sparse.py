@@ -13,7 +13,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.feeds import recorded_inputs, unrecorded
+from vlatool.module.feeds import recorded_inputs, refuse_kept, unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._last import last_layers
@@ -93,6 +93,7 @@ class Sparse(ModuleStage):
         self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context
     ) -> dict[str, Tensor]:
         """Return name of a layer -> mean of x xT over what it is given on recorded observations."""
+        refuse_kept(source, "the method", "choose by the weights alone: vlatool prune magnitude")
         torch = require("torch", "build")
         program = BatchedProgram(source.manifest.program, modules)
         noise = drawn(program.noise, 1, np.random.default_rng(0))

@@ -16,7 +16,7 @@ from vlatool.module.axes import Member, Walk
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.cut import traced
 from vlatool.module.edits import UNITS, Edit
-from vlatool.module.feeds import first_feeds, recorded_inputs
+from vlatool.module.feeds import first_feeds, recorded_inputs, refuse_kept
 from vlatool.prune._selection import Selection
 from vlatool.prune._slopes import slopes_of
 
@@ -146,6 +146,8 @@ def rank_units(
             group.importance = random.random(group.size)
         return
     weights = {graph: dict(module.named_parameters()) for graph, module in modules.items()}
+    if rank == "gate":
+        refuse_kept(source, "the ranking", "rank by the weights alone: --rank magnitude")
     if rank == "magnitude":
         for group in groups:
             group.importance = _magnitude(group, weights[group.graph])

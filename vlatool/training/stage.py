@@ -18,6 +18,7 @@ from vlatool.files.work import forget, work_directory
 from vlatool.machine import host
 from vlatool.module.description import description_file
 from vlatool.module.edits import is_changed
+from vlatool.module.feeds import refuse_kept
 from vlatool.module.stage import TRAINING, Changed, ModuleStage
 from vlatool.module.zeros import has_zeros, sparse_weights, zero_share
 from vlatool.stage.base import Context, source_of
@@ -115,6 +116,8 @@ class TrainingStage(ModuleStage):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """No episode of the training is one of the evaluation's, and the teacher is another policy."""
         super().check(source, profile)
+        if source is not None:
+            refuse_kept(source, "the training", "prune it without a training after that: vlatool prune neurons")
         if self.device == "cuda":
             self._device()
         if self.teacher:
