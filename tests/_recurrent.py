@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.export.onnx import ExportOnnx
 from vlatool.sources.torch_module import TorchModule
 from vlatool.stage.base import Context
 from vlatool.stage.run import run_transform
@@ -111,11 +112,24 @@ class Writers(nn.Module):
         return (self.a(memory) + self.o(hidden))[:, None], 0.5 * memory + self.m(hidden)
 
 
+class Sum(nn.Module):
+    """Adds up what it was given."""
+
+    def __init__(self):
+        super().__init__()
+        self.out = nn.Linear(2, 2)
+
+    def forward(self, target, memory):
+        memory = memory + target
+        return self.out(memory)[:, None], memory
+
+
 def make(kind):
     torch.manual_seed(0)
-    return {"delayed": Delayed, "elman": Elman, "gru": Gru, "hidden": Hidden, "writers": Writers}[kind]().eval()
+    kinds = {"delayed": Delayed, "sum": Sum, "elman": Elman, "gru": Gru, "hidden": Hidden, "writers": Writers}
+    return kinds[kind]().eval()
 '''
-SHAPES = {"delayed": [1, 4], "elman": [1, 16], "gru": [2, 1, 8], "hidden": [1, 8], "writers": [1, 8]}
+SHAPES = {"delayed": [1, 4], "elman": [1, 16], "gru": [2, 1, 8], "hidden": [1, 8], "writers": [1, 8], "sum": [1, 2]}
 
 
 def write_recurrent(folder: Path, kind: str, *, count: int = 20, episodes: bool = True, more: str = "") -> Path:
@@ -139,9 +153,13 @@ def write_recurrent(folder: Path, kind: str, *, count: int = 20, episodes: bool 
 
 
 def recorded(count: int, seed: int = 0, *, episodes: bool = True) -> dict[str, np.ndarray]:
-    """Observations of so many episodes."""
+    """Observations of so many episodes, and what ``delayed`` does."""
     random = np.random.default_rng(seed)
-    rows = {"target": random.uniform(-1, 1, (count * LENGTH, 2)).astype(np.float32)}
+    target = random.uniform(-1, 1, (count, LENGTH, 2)).astype(np.float32)
+    if not episodes:
+        target = target.reshape(1, -1, 2)
+    action = np.concatenate([np.zeros_like(target[:, :2]), target[:, :-2]], 1) * np.float32([1, -1])
+    rows = {"target": target.reshape(-1, 2), "action": action.reshape(-1, 2)}
     return rows | ({"episode": np.arange(count * LENGTH) // LENGTH} if episodes else {})
 
 
@@ -150,3 +168,9 @@ def recurrent_bundle(folder: Path, kind: str, **options) -> Bundle:
     policy = write_recurrent(folder, kind, **options)
     trust.name(policy)
     return run_transform(TorchModule(policy=policy), None, folder.parent / f"{folder.name}-source", Context())
+
+
+def exported(folder: Path, kind: str, **options) -> Bundle:
+    """Make the float32 bundle of such a policy."""
+    source = recurrent_bundle(folder, kind, **options)
+    return run_transform(ExportOnnx(), source, folder.parent / f"{folder.name}-float", Context())

@@ -18,11 +18,13 @@ from vlatool.data._observations import evaluation_recording as evaluation_record
 from vlatool.data._observations import observations_for as observations_for
 from vlatool.data._observations import recorded_observations as recorded_observations
 from vlatool.data._observations import synthetic_observations as synthetic_observations
+from vlatool.data._played import BEGINS as BEGINS
 from vlatool.data._played import MOST as MOST
 from vlatool.data._played import PLAYED as PLAYED
 from vlatool.data._played import Encoded as Encoded
 from vlatool.data._played import kept_rows as kept_rows
 from vlatool.data._played import played_observations as played_observations
 from vlatool.data._recording import RECORD_ALL as RECORD_ALL
+from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
 from vlatool.data._recording import read_recording as read_recording

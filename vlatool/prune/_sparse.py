@@ -13,7 +13,8 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.feeds import recorded_inputs, refuse_kept, unrecorded
+from vlatool.module.carried import passages
+from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._last import last_layers
@@ -93,7 +94,6 @@ class Sparse(ModuleStage):
         self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context
     ) -> dict[str, Tensor]:
         """Return name of a layer -> mean of x xT over what it is given on recorded observations."""
-        refuse_kept(source, "the method", "choose by the weights alone: vlatool prune magnitude")
         torch = require("torch", "build")
         program = BatchedProgram(source.manifest.program, modules)
         noise = drawn(program.noise, 1, np.random.default_rng(0))
@@ -108,13 +108,13 @@ class Sparse(ModuleStage):
 
             return look
 
+        recorded = passages(source, program, noise, self.samples, 1)
         with contextlib.ExitStack() as stack, torch.no_grad():
             for name, layer in layers.items():
                 stack.callback(layer.register_forward_pre_hook(hook(name)).remove)
-            recorded = recorded_inputs(source, self.samples)
-            for number, inputs in enumerate(recorded):
+            for number, passage in enumerate(recorded):
                 context.tell("looking at what layers are given", number / len(recorded))
-                program.run(inputs, noise)
+                passage.run(program, noise)
         return {name: total / counts[name] for name, total in sums.items()}
 
 

@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for, recorded_observations
+from vlatool.data import calibration_recording, synthetic_observations
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
+from vlatool.quantize._moments import recorded_moments
 from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize._trial_compile import open_apart
 from vlatool.stage.base import Context, SampleSet, source_of
@@ -49,8 +50,9 @@ class Float16(Quantization):
             candidates += [node.name for node in model.graph.node]
         selected = self.selected(candidates, bundle)
         samples = SampleSet()
-        recorded = recorded_observations(bundle, self.samples, self.calibration)
-        seen = samples.watch(recorded or observations_for(bundle, self.samples, self.calibration))
+        recording = calibration_recording(bundle, self.calibration)
+        synthetic = samples.watch(synthetic_observations(bundle.manifest.spec, self.samples if not recording else 0))
+        seen = recorded_moments(bundle, recording, recording.spread(self.samples), samples) if recording else synthetic
         beyond = find_beyond(bundle, chosen, seen, LARGEST, context)
         report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": []}
         for graph, values in beyond.items():
