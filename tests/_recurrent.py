@@ -34,6 +34,7 @@ program:
     gives: {action: action, next_memory: memory}
     keep: {memory: {shape: SHAPE, dtype: float32}}
 """
+KEEP = "    keep: {memory: {shape: None, dtype: float32}}\n"
 ENVIRONMENT = "environment: {make: environment.py:make, tasks: [t]}\n"
 BATCHES = "training: train.py:batches\n"
 POLICY = '''\
@@ -124,15 +125,37 @@ class Sum(nn.Module):
         return self.out(memory)[:, None], memory
 
 
+class Plain(nn.Module):
+    """Keeps nothing."""
+
+    def __init__(self):
+        super().__init__()
+        self.out = nn.Linear(2, 2)
+
+    def forward(self, target):
+        return 0 * self.out(target)[:, None]
+
+
 def make(kind):
     torch.manual_seed(0)
     kinds = {"delayed": Delayed, "sum": Sum, "elman": Elman, "gru": Gru, "hidden": Hidden, "writers": Writers}
+    kinds |= {"plain": Plain, "again": Delayed}
     return kinds[kind]().eval()
 '''
-SHAPES = {"delayed": [1, 4], "elman": [1, 16], "gru": [2, 1, 8], "hidden": [1, 8], "writers": [1, 8], "sum": [1, 2]}
+SHAPES = {
+    "delayed": [1, 4],
+    "again": [1, 4],
+    "elman": [1, 16],
+    "gru": [2, 1, 8],
+    "hidden": [1, 8],
+    "writers": [1, 8],
+    "sum": [1, 2],
+}
 
 
-def write_recurrent(folder: Path, kind: str, *, count: int = 20, episodes: bool = True, more: str = "") -> Path:
+def write_recurrent(
+    folder: Path, kind: str, *, count: int = 20, episodes: bool = True, more: str = "", code: str = ""
+) -> Path:
     """Write a policy that keeps values, and a recording of so many episodes; none of 0.
 
     Args:
@@ -140,11 +163,16 @@ def write_recurrent(folder: Path, kind: str, *, count: int = 20, episodes: bool 
         kind: Of the module.
         count: Episodes.
         episodes: Whether the recording says where they begin.
-        more: Further lines of ``policy.yaml``.
+        more: Further line of ``policy.yaml``, which names a file.
+        code: Of that file.
     """
     folder.mkdir(parents=True)
+    if code:
+        (folder / ("train.py" if more == BATCHES else "environment.py")).write_text(code)
     (folder / "policy.py").write_text(POLICY)
-    described = YAML.replace("KIND", kind).replace("SHAPE", str(SHAPES[kind])) + more
+    described = YAML.replace("KIND", kind).replace("SHAPE", str(SHAPES.get(kind))) + more
+    if kind == "plain":
+        described = described.replace(", memory: memory", "").replace(", next_memory: memory", "").replace(KEEP, "")
     if count:
         described += "calibration: calibration.npz\n"
         np.savez(folder / "calibration.npz", **recorded(count, episodes=episodes))

@@ -10,9 +10,11 @@ from _recurrent import LENGTH, exported, recorded
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import calibration_recording
+from vlatool.quantize import _calibrated
 from vlatool.quantize._calibrate import calibrate
-from vlatool.quantize._moments import recorded_moments
+from vlatool.quantize._moments import led_to, recorded_moments
 from vlatool.quantize.static_int8 import StaticInt8
+from vlatool.quantize.weight_only import WeightOnly
 from vlatool.stage.base import Context, SampleSet
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*calibration samples:UserWarning")
@@ -59,3 +61,28 @@ def test_half_of_a_recording_without_episodes_is_led_to_by_the_other_half(tmp_pa
     (bundle.path / "data/calibration.npz").write_bytes(whole.read_bytes())
     found = StaticInt8().statistics(bundle, {"main": ["memory"]}, SampleSet(), Context())["main"]["memory"]
     assert found.high == 4 * LENGTH - 1 - LENGTH // 2, "the last stretch of eight is held out"
+
+
+def test_weights_are_rounded_by_what_layers_are_given_along_an_episode(tmp_path: Path):
+    """Each layer of the sum is given what is kept; the samples of a product say which."""
+    bundle = exported(tmp_path / "sum", "sum", count=0)
+    recording = calibration_recording(bundle, ones(tmp_path / "ones.npz", 2))
+    moments = recorded_moments(bundle, recording, [0, 3, LENGTH, 2 * LENGTH - 1], SampleSet())
+    kept = [values["memory"].tolist() for _, values in led_to(bundle, moments)]
+    assert kept == [[[0, 0]], [[3, 3]], [[0, 0]], [[LENGTH - 1, LENGTH - 1]]]
+
+
+def test_gptq_gives_layers_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen = []
+    real = _calibrated.gptq
+
+    def gptq(weight, rows, *rest):
+        seen.append(rows.copy())
+        return real(weight, rows, *rest)
+
+    monkeypatch.setattr(_calibrated, "gptq", gptq)
+    bundle = exported(tmp_path / "sum", "sum", count=0)
+    stage = WeightOnly(method="gptq", calibration=ones(tmp_path / "ones.npz", 2), samples=2 * LENGTH, exclude=())
+    (tmp_path / "out").mkdir()
+    stage.run(bundle, tmp_path / "out", Context())
+    assert np.concatenate(seen).reshape(-1, 2)[:, 0].tolist() == 2 * list(range(1, LENGTH + 1))

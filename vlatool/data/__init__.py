@@ -13,6 +13,7 @@ from vlatool.data._drawn import save_drawn as save_drawn
 from vlatool.data._halves import halves as halves
 from vlatool.data._observations import CALIBRATION as CALIBRATION
 from vlatool.data._observations import EVALUATION as EVALUATION
+from vlatool.data._observations import Observations as Observations
 from vlatool.data._observations import calibration_recording as calibration_recording
 from vlatool.data._observations import evaluation_recording as evaluation_recording
 from vlatool.data._observations import observations_for as observations_for

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, overload
 
@@ -11,7 +11,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._halves import LEAST, halves
-from vlatool.data._recording import Recording, read_recording
+from vlatool.data._recording import Moment, Recording, read_recording
 from vlatool.errors import DataError
 
 CALIBRATION = "data/calibration.npz"
@@ -93,6 +93,10 @@ class Observations(Sequence[dict[str, Any]]):
         if isinstance(at, slice):
             return Observations(self._recording, self._numbers[at])
         return self._recording.observation(self._numbers[at])
+
+    def along(self) -> Iterator[Moment]:
+        """Yield them, each after those before it in its episode."""
+        return self._recording.along(self._numbers)
 
 
 def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> Sequence[dict[str, Any]]:

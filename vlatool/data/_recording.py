@@ -98,9 +98,10 @@ class Recording:
         return replace(self, inputs=inputs, actions=actions, episodes=episodes, whole=whole, places=places)
 
     def begins(self) -> NDArray[np.bool_]:
-        """Say of each observation whether an episode begins with it, (N,); all are one where that is not recorded."""
+        """Say of each observation whether an episode begins with it, or none follows the one before: (N,)."""
         numbers = np.zeros(len(self), np.int64) if self.episodes is None else self.episodes
-        return np.concatenate([[True], numbers[1:] != numbers[:-1]])
+        places = np.arange(len(self)) if self.places is None else self.places
+        return np.concatenate([[True], (numbers[1:] != numbers[:-1]) | (np.diff(places) != 1)])
 
     def along(self, numbers: Sequence[int]) -> Iterator[Moment]:
         """Yield observations, each after those of its episode that were recorded before it, held out or not.

@@ -9,7 +9,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import CALIBRATION, observations_for
-from vlatool.errors import RecipeError, require
+from vlatool.errors import require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.runtime.observation import ObservationEncoder
 
@@ -33,26 +33,6 @@ def unrecorded(bundle: Bundle, count: int) -> tuple[str, ...]:
         return ()
     words = f"nothing is recorded: chosen by {count} random observations, which are none that the robot meets"
     return (f"{words}; record some, and name them in policy.yaml (calibration: FILE.npz)",)
-
-
-def refuse_kept(bundle: Bundle, what: str, fix: str) -> None:
-    """Refuse a policy that keeps values where each observation would be taken for the first of an episode.
-
-    Args:
-        bundle: Of the policy.
-        what: Would see it so.
-        fix: What else to do.
-
-    Raises:
-        RecipeError: naming a kept value.
-    """
-    kept = [name for step in bundle.manifest.program for name in step.keep]
-    if kept:
-        raise RecipeError(
-            f"{bundle.manifest.name} keeps '{kept[0]}' from step to step, and {what} would see each observation as the "
-            "first of an episode, where that is zero.",
-            fix,
-        )
 
 
 def first_feeds(modules: Mapping[str, nn.Module], bundle: Bundle) -> dict[str, list[Tensor]]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import keeps_values
 from vlatool.data import Moment, Recording, played_observations
+from vlatool.module.torch_policy import torch_policy
+from vlatool.runtime.policy import Policy
 from vlatool.stage.base import SampleSet
 
 
@@ -29,6 +32,23 @@ def played_moments(bundle: Bundle, seen: SampleSet) -> list[Moment]:
     keeps = keeps_values(bundle.manifest.program)
     moments = (Moment(each, row, each.begins and keeps) for row, each in enumerate(played_observations(bundle)))
     return list(_hashed(moments, seen))
+
+
+def led_to(bundle: Bundle, moments: Iterable[Moment]) -> Iterator[tuple[Mapping[str, Any], dict[str, Any]]]:
+    """Yield the samples that count, each with what the policy, as it is, keeps before it: value name -> array.
+
+    A policy that keeps nothing is not run.
+    """
+    policy: Policy | None = None
+    for moment in moments:
+        if keeps_values(bundle.manifest.program) and policy is None:
+            policy = Policy.open(bundle, threads=1, seed=0) if bundle.manifest.graphs else torch_policy(bundle, 0)
+        if policy is not None and moment.begins:
+            policy.reset(moment.number)
+        if moment.counts:
+            yield moment.observation, {} if policy is None else policy.program.kept
+        if policy is not None:
+            policy.infer(moment.observation)
 
 
 def _hashed(moments: Iterable[Moment], seen: SampleSet) -> Iterator[Moment]:

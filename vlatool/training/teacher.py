@@ -14,7 +14,6 @@ from vlatool.machine import host
 from vlatool.module.batched import BatchedProgram
 from vlatool.module.description import description_file
 from vlatool.module.edits import Edit, read_edits
-from vlatool.module.feeds import refuse_kept
 from vlatool.module.origin import origin_of
 from vlatool.module.torch_policy import load_modules, unedited_modules
 from vlatool.runtime.statistics import load_normaliser
@@ -95,7 +94,7 @@ class Teacher:
             modules: The student's, which the teacher's must not share weights with.
 
         Raises:
-            RecipeError: when it is exported, takes or gives something else, keeps values, or is the student.
+            RecipeError: when it is exported, takes or gives something else, or is the student.
             SourceError: when its modules are the student's own.
         """
         bundle, edits = student, tuple[Edit, ...]()
@@ -109,7 +108,6 @@ class Teacher:
             if bundle.hash == student.hash:
                 raise RecipeError(f"{path} is the student itself.", "name another teacher")
             edits = read_edits(bundle)
-        refuse_kept(bundle, "what it says of recordings", "take a teacher that keeps nothing")
         own = load_modules(bundle) if path is not None else unedited_modules(bundle)
         _check_apart(own, modules)
         _check_fits(bundle, student)
