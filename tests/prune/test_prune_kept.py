@@ -35,7 +35,7 @@ def test_units_that_read_or_write_what_is_kept_are_not_taken_for_useless(tmp_pat
     source = recurrent_bundle(tmp_path / kind, kind, **options)
     made = run_transform(Structured(ratio=0.4, multiple=1), source, tmp_path / "out", Context())
     whole, pruned = actions(source), actions(made)
-    assert np.linalg.norm(pruned - whole) / np.linalg.norm(whole) < 0.1
+    assert np.linalg.norm(pruned - whole) / np.linalg.norm(whole) < 0.2
 
 
 def test_zeros_are_chosen_by_what_layers_are_given_with_it(tmp_path: Path):
