@@ -74,3 +74,57 @@ def test_noise_is_drawn_as_declared():
     assert not bool(found["c"].any())
     again = drawn(wanted, 4, np.random.default_rng(0))
     assert torch.equal(found["a"], again["a"])
+
+
+class Gru(nn.Module):
+    def __init__(self, of_batch: str = ""):
+        super().__init__()
+        self.gru, self.of_batch = nn.GRU(3, 4, num_layers=2), of_batch
+
+    def forward(self, x, memory, count):
+        if self.of_batch == "first":
+            memory = memory[:, :1].expand(-1, len(x), -1)
+        seen, memory = self.gru(x[None], memory.contiguous())
+        return seen[0], memory, count + 1
+
+
+def kept_steps(shape: list[int]) -> tuple[ProgramStep, ...]:
+    keep = {"memory": {"shape": shape}, "count": {"shape": [1, 1], "dtype": "int64"}}
+    return (
+        ProgramStep(
+            "main",
+            {"x": "x", "memory": "memory", "count": "count"},
+            {"y": "y", "m": "memory", "c": "count"},
+            keep=keep,
+        ),
+    )
+
+
+@pytest.mark.parametrize("of_batch", ["", "first"])
+def test_what_is_kept_goes_from_run_to_run_as_in_the_runtime(of_batch: str):
+    """With the batch in the axis that modules take; where rows would mix, row by row."""
+    torch.manual_seed(0)
+    steps, module = kept_steps([2, 1, 4]), Gru(of_batch).eval()
+    batched = BatchedProgram(steps, {"main": module})
+    x = np.random.default_rng(0).standard_normal((5, 3, 3)).astype(np.float32)
+    kept, ours = {}, []
+    for now in x:
+        values = batched.run({"x": torch.from_numpy(now)}, kept)
+        kept = batched.kept_of(values)
+        ours.append(values["y"])
+    assert batched.together(3) == (not of_batch)
+    assert kept["memory"].shape == (3, 2, 1, 4)
+    assert kept["count"].reshape(-1).tolist() == [5, 5, 5]
+    for row in range(3):
+        program = Program(steps, {"main": TorchSession(module, steps[0])})
+        wanted = [program.run({"x": now[row : row + 1]})["y"] for now in x]
+        for got, want in zip(ours, wanted, strict=True):
+            np.testing.assert_allclose(got[row : row + 1].detach().numpy(), want, rtol=1e-5, atol=1e-6)
+    (slope,) = torch.autograd.grad(ours[-1].sum(), [module.gru.weight_ih_l0])
+    assert float(slope.abs().sum()) > 0
+
+
+def test_a_kept_value_of_another_shape_is_named():
+    batched = BatchedProgram(kept_steps([2, 1, 4]), {"main": lambda x, memory, count: (x, memory[:1], count)})
+    with pytest.raises(SourceError, match=r"kept value 'memory' is \[1, 1, 4\]; the program declares \[2, 1, 4\]"):
+        batched.run({"x": torch.ones(1, 3)}, {})

@@ -105,6 +105,11 @@ class ProgramStep:
         return {*self.schedule, *self.noise, *self.keep}
 
 
+def keeps_values(program: Iterable[ProgramStep]) -> bool:
+    """Return whether what a policy gives depends on the observations before, too."""
+    return any(step.keep for step in program)
+
+
 def program_from(data: Any) -> tuple[ProgramStep, ...]:
     """Build a program from a list of mappings.
 

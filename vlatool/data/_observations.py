@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.bundle.spec import TensorSpec
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._drawn import sentence, words_of
 from vlatool.data._halves import LEAST, halves
-from vlatool.data._recording import Recording, read_recording
+from vlatool.data._recording import Moment, Recording, read_recording
 from vlatool.errors import DataError
 
 CALIBRATION = "data/calibration.npz"
@@ -97,6 +97,10 @@ class Observations(Sequence[dict[str, Any]]):
             return Observations(self._recording, self._numbers[at])
         return self._recording.observation(self._numbers[at])
 
+    def along(self) -> Iterator[Moment]:
+        """Yield them, each after those before it in its episode."""
+        return self._recording.along(self._numbers)
+
 
 def recorded_observations(source: Bundle, count: int, path: Path | None = None) -> Sequence[dict[str, Any]]:
     """Return up to ``count`` recorded observations, spread over the recording; none when the bundle carries none.
@@ -121,9 +125,17 @@ def synthetic_observations(source: Bundle, count: int, seed: int = 0) -> list[di
 
     Instructions are words of the vocabulary: an empty one is padding alone, which many policies mask away as a whole.
     """
-    random, inputs = np.random.default_rng(seed), source.manifest.spec.inputs
-    words = {tensor.name: _words(source, tensor) for tensor in inputs if tensor.kind == "text"}
-    return [{tensor.name: _synthetic(tensor, random, words) for tensor in inputs} for _ in range(count)]
+    spec = source.manifest.spec
+    words = {tensor.name: _words(source, tensor) for tensor in spec.inputs if tensor.kind == "text"}
+    return random_observations(spec, count, seed, words)
+
+
+def random_observations(
+    spec: PolicySpec, count: int, seed: int = 0, words: Mapping[str, Sequence[str]] | None = None
+) -> list[dict[str, Any]]:
+    """Return seeded random observations that fit a spec; its instructions are of ``words``: input -> vocabulary."""
+    random = np.random.default_rng(seed)
+    return [{each.name: _synthetic(each, random, words or {}) for each in spec.inputs} for _ in range(count)]
 
 
 def _words(source: Bundle, tensor: TensorSpec) -> list[str]:
@@ -136,7 +148,7 @@ def _words(source: Bundle, tensor: TensorSpec) -> list[str]:
 
 def _synthetic(tensor: TensorSpec, random: np.random.Generator, words: Mapping[str, Sequence[str]]) -> Any:
     if tensor.kind == "text":
-        return sentence(words[tensor.name], random, range(1, min(LONGEST, tensor.max_tokens) + 1))
+        return sentence(words.get(tensor.name, ()), random, range(1, min(LONGEST, tensor.max_tokens) + 1))
     shape = tuple(axis if isinstance(axis, int) else 1 for axis in tensor.shape[1:])
     if tensor.dtype == "uint8":
         return random.integers(0, 256, shape, np.uint8)

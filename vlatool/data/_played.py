@@ -15,6 +15,8 @@ from vlatool.files.npz import open_npz
 
 Array = NDArray[Any]
 PLAYED = "data/played.npz"
+BEGINS = "(begins)"
+"""Array that says of each row whether an episode begins with it, where the policy keeps values."""
 MOST = 128
 """Observations that are kept: twice those that calibrate by default."""
 LEAST = 16
@@ -24,6 +26,9 @@ BYTES = 64 << 20
 
 class Encoded(dict[str, Array]):
     """An observation as the graphs take it, name -> (1, ...): normalised, text as ids."""
+
+    begins = True
+    """Whether an episode begins with it, or nothing before it is known."""
 
 
 def kept_rows(most: int, row_bytes: int) -> int:
@@ -46,7 +51,10 @@ def played_observations(source: Bundle) -> list[Encoded]:
     names = [tensor.name for tensor in source.manifest.spec.inputs]
     if len({len(arrays[name]) for name in names}) > 1:
         raise _broken(path, "its inputs have different numbers of rows")
-    return [Encoded({name: arrays[name][row : row + 1] for name in names}) for row in range(len(arrays[names[0]]))]
+    rows = [Encoded({name: arrays[name][row : row + 1] for name in names}) for row in range(len(arrays[names[0]]))]
+    for row, begins in zip(rows, arrays.get(BEGINS, ()), strict=False):
+        row.begins = bool(begins)
+    return rows
 
 
 def _check(path: Path, tensor: TensorSpec, array: Array | None) -> None:

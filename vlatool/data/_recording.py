@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,23 @@ EXPERT = ("action", "episode")
 
 
 @dataclass(frozen=True)
+class Moment:
+    """An observation of a recording, where observations follow each other as they were recorded.
+
+    Args:
+        observation: Without the batch axis.
+        number: In the recording.
+        begins: Whether an episode begins with it.
+        counts: Whether it was asked for; what comes before such a one is there for the values that a policy keeps.
+    """
+
+    observation: Mapping[str, Any]
+    number: int
+    begins: bool = False
+    counts: bool = True
+
+
+@dataclass(frozen=True)
 class Recording:
     """Observations with, where they were recorded, the expert's actions.
 
@@ -37,6 +54,8 @@ class Recording:
         episodes: (N,) int64 episode of each sample; None when not recorded.
         ignored: Names of arrays that the spec does not know.
         chunk: Actions in one inference of the policy.
+        whole: What it was chosen from; None when it is all that was recorded.
+        places: (N,) number of each observation in ``whole``.
     """
 
     path: Path
@@ -45,6 +64,8 @@ class Recording:
     episodes: Array | None
     ignored: tuple[str, ...] = ()
     chunk: int = 1
+    whole: Recording | None = None
+    places: Array | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -72,7 +93,30 @@ class Recording:
         }
         actions = None if self.actions is None else self.actions[chosen]
         episodes = None if self.episodes is None else self.episodes[chosen]
-        return replace(self, inputs=inputs, actions=actions, episodes=episodes)
+        places = np.flatnonzero(chosen) if self.places is None else self.places[chosen]
+        whole = self.whole or self
+        return replace(self, inputs=inputs, actions=actions, episodes=episodes, whole=whole, places=places)
+
+    def begins(self) -> NDArray[np.bool_]:
+        """Say of each observation whether an episode begins with it, or none follows the one before: (N,)."""
+        numbers = np.zeros(len(self), np.int64) if self.episodes is None else self.episodes
+        places = np.arange(len(self)) if self.places is None else self.places
+        return np.concatenate([[True], (numbers[1:] != numbers[:-1]) | (np.diff(places) != 1)])
+
+    def along(self, numbers: Sequence[int]) -> Iterator[Moment]:
+        """Yield observations, each after those of its episode that were recorded before it, held out or not.
+
+        Args:
+            numbers: Of those that count, ascending.
+        """
+        whole = self.whole or self
+        own = {int(number if self.places is None else self.places[number]): int(number) for number in numbers}
+        begins = whole.begins()
+        firsts = np.flatnonzero(begins)
+        last = {int(np.searchsorted(firsts, place, side="right")): place for place in own}
+        for episode, end in last.items():
+            for place in range(int(firsts[episode - 1]), end + 1):
+                yield Moment(whole.observation(place), own.get(place, place), bool(begins[place]), place in own)
 
     @property
     def unjudged(self) -> tuple[str, ...]:

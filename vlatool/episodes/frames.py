@@ -11,6 +11,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.data import BEGINS
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.observation import ObservationEncoder
 
@@ -33,21 +34,31 @@ class KeepingEncoder(ObservationEncoder):
         self.names = encode.names
         self._encode = encode
         self._kept: list[dict[str, Array]] | None = None
+        self._begins: list[bool] = []
+        self._new = True
+
+    def begin(self) -> None:
+        """Note that an episode begins with what is encoded next."""
+        self._new = True
 
     def __call__(self, observation: Mapping[str, Any]) -> dict[str, Array]:
         """Encode an observation, as ``ObservationEncoder`` does."""
         values = self._encode(observation)
         if self._kept is not None:
             self._kept.append({name: np.array(value) for name, value in values.items()})
+            self._begins.append(self._new)
+            self._new = False
         return values
 
     @contextlib.contextmanager
     def kept(self, folder: Path) -> Iterator[None]:
-        """Keep what is encoded in this block as ``folder/NAME.npy``, (N, ...)."""
-        self._kept = []
+        """Keep what is encoded in this block as ``folder/NAME.npy``, (N, ...), and in which rows episodes begin."""
+        self._kept, self._begins = [], []
         try:
             yield
             folder.mkdir(parents=True, exist_ok=True)
+            if self._kept:
+                np.save(folder / f"{BEGINS}.npy", np.array(self._begins))
             for name in self.names if self._kept else ():
                 np.save(file_of(folder, name), np.concatenate([values[name] for values in self._kept]))
         finally:

@@ -175,11 +175,14 @@ class Worker:
         """Play the episodes of a job; tell of each that it begins."""
         spec = self.queue.policy.spec
         os.chdir(self._home)  # an environment before may have changed it, and the next one's file is named from here
+        if job.control or job.noise:
+            self._ask()
         world = world_of(self.environment(job), job.task, spec, job.film)
         with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
             outcomes = []
             for seed in job.seeds:
                 tell(under_way(job.task, seed), None)
+                self._frames.begin()
                 outcomes.append(_episode(world, self._actor(job, seed), spec, job, seed, limit))
             return outcomes
 
@@ -188,11 +191,15 @@ class Worker:
         if not job.control and not job.noise:
             late = int(job.latency_ms * self.queue.policy.spec.control_hz / 1e3)
             return Late(self.queue, late) if late else self.queue
+        if job.noise:
+            return Noisy(self.queue, job.noise, self._ask(), seed)
+        return Blind(job.control, self.queue.policy.spec.action, self._ask(), seed)
+
+    def _ask(self) -> Array:
+        """Return what the policy answers to recorded observations; asked once, and before episodes are kept."""
         if self._answers is None:
             self._answers = answers_of(self.queue.policy)
-        if job.noise:
-            return Noisy(self.queue, job.noise, self._answers, seed)
-        return Blind(job.control, self.queue.policy.spec.action, self._answers, seed)
+        return self._answers
 
     def close(self) -> None:
         """Close the open environment; one that fails to close has done its work all the same."""

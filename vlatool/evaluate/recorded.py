@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +16,9 @@ from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.losses import agreeing, scale_of
 from vlatool.accuracy.skill import skill, variation
 from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.program import keeps_values
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data import CALIBRATION, EVALUATION, Recording, evaluation_recording
+from vlatool.data import CALIBRATION, EVALUATION, Moment, Recording, evaluation_recording
 from vlatool.errors import DataError
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
@@ -152,18 +153,28 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
     try_out(bundle, engine)
     policy = Policy.open(bundle, engine=engine, threads=1, seed=0)
     policy.warm_up(1)
-    chunks = []
-    episode = None
-    for number, index in enumerate(indices):
-        if number % 16 == 0:
-            context.tell("running recorded observations", number / len(indices))
-        current = None if recording.episodes is None else int(recording.episodes[index])
-        if current != episode:
+    chunks: list[Array] = []
+    for moment in moments_of(recording, indices, keeps=keeps_values(bundle.manifest.program)):
+        if len(chunks) % 16 == 0:
+            context.tell("running recorded observations", len(chunks) / len(indices))
+        if moment.begins:
             policy.reset()
-            episode = current
         with policy.stopped_after(FIRST_RUN_S):
-            chunks.append(policy.infer(recording.observation(index)).chunk)
+            chunk = policy.infer(moment.observation).chunk
+        chunks += [chunk] if moment.counts else []
     return np.stack(chunks)
+
+
+def moments_of(recording: Recording, indices: Sequence[int], *, keeps: bool) -> Iterator[Moment]:
+    """Yield the observations that a policy is given; one that keeps values is given all that come before them, too."""
+    if keeps:
+        yield from recording.along(indices)
+        return
+    episode = None
+    for index in indices:
+        current = None if recording.episodes is None else int(recording.episodes[index])
+        yield Moment(recording.observation(index), index, begins=current != episode)
+        episode = current
 
 
 def compare(action: TensorSpec, got: Array, wanted: Array | None, whose: str) -> list[Measurement]:

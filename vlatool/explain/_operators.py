@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import Moment, Observations
 from vlatool.machine.host import onednn_max_cpu_isa
 from vlatool.runtime.engine import (
     BFLOAT16,
@@ -106,11 +107,21 @@ def profile(
 
 
 def raw_actions(policy: Policy, observations: Iterable[Mapping[str, Any]]) -> list[Any]:
-    """Return the raw action of each observation, each an episode of its own."""
+    """Return the raw action of each observation, each an episode of its own.
+
+    A policy that keeps values is given what was recorded before each in its episode, too.
+    """
+    moments: Iterable[Moment]
+    if policy.program.keeps and isinstance(observations, Observations):
+        moments = observations.along()
+    else:
+        moments = (Moment(observation, number, begins=True) for number, observation in enumerate(observations))
     actions = []
-    for observation in observations:
-        policy.reset()
-        actions.append(np.array(policy.infer(observation).outputs[policy.spec.action.name]))
+    for moment in moments:
+        if moment.begins:
+            policy.reset()
+        action = np.array(policy.infer(moment.observation).outputs[policy.spec.action.name])
+        actions += [action] if moment.counts else []
     return actions
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ class Observations:
         recorded: Whether they are recorded, so that errors on them mean something.
     """
 
-    values: list[dict[str, Any]] = field(default_factory=list)
+    values: Sequence[dict[str, Any]] = ()
     words: str = ""
     recorded: bool = True
 
@@ -129,17 +129,16 @@ def observations_of(bundle: Bundle, baseline: Bundle | None, data: Path | None, 
         DataError: when the given data does not fit the policy.
     """
     if data is not None:
-        return Observations(list(recorded_observations(bundle, count, data)), data.name)
+        return Observations(recorded_observations(bundle, count, data), data.name)
     sources = [candidate for candidate in (bundle, baseline) if candidate is not None]
     for source in sources:
         if EVALUATION in source.manifest.files:
-            values = list(recorded_observations(source, count, source.path / EVALUATION))
+            values = recorded_observations(source, count, source.path / EVALUATION)
             return Observations(values, "recorded observations that calibration has not seen")
     for source in sources:
-        if values := list(recorded_observations(source, count)):
+        if values := recorded_observations(source, count):
             return Observations(values, "the calibration's own observations")
-    values = synthetic_observations(bundle, count)
-    return Observations(values, "synthetic observations", recorded=False)
+    return Observations(synthetic_observations(bundle, count), "synthetic observations", recorded=False)
 
 
 def sensitivity_stage(stage: Stage | None) -> StaticInt8 | None:

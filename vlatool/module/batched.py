@@ -35,9 +35,11 @@ SAME = 1e-3
 class BatchedProgram:
     """Runs the steps of a program over torch modules, as ``vlatool.runtime.program`` does over graphs.
 
-    Values have the batch in front: where the program says ``[1, 50, 7]``, a batch of B has ``(B, 50, 7)``. Kept values
-    begin at zero in every run, as they do after ``reset``. Modules that take one observation alone, such as those with
-    ``reshape(1, ...)``, are run row by row.
+    Values have the batch in front: where the program says ``[1, 50, 7]``, a batch of B has ``(B, 50, 7)``. Modules that
+    take one observation alone, such as those with ``reshape(1, ...)``, are run row by row. Kept values are given and
+    returned with the batch before their whole shape: ``(B, 2, 1, 128)`` where the program says ``[2, 1, 128]``; modules
+    get them with the batch in the place of an axis of 1, whichever they take. They begin at zero where none are given,
+    as they do after ``reset``.
 
     Args:
         steps: As in the manifest.
@@ -45,6 +47,7 @@ class BatchedProgram:
 
     Attributes:
         noise: What the program draws, value name -> shape and distribution.
+        kept: What the program keeps from run to run, value name -> shape and dtype.
         loop: The first step that runs several times and carries values from turn to turn; None where there is none.
     """
 
@@ -52,8 +55,10 @@ class BatchedProgram:
         self.steps = tuple(steps)
         self.modules = modules
         self._batches: bool | None = None
+        self._axis = 0
         self._retraced: dict[tuple[str, int], nn.Module] = {}
         self.noise = {name: wanted for step in self.steps for name, wanted in step.noise.items()}
+        self.kept = {name: wanted for step in self.steps for name, wanted in step.keep.items()}
         self.loop = next((step for step in self.steps if step.repeat > 1 and step.carry), None)
 
     def run(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -61,7 +66,7 @@ class BatchedProgram:
 
         Args:
             inputs: Encoded inputs, value name -> (B, ...).
-            noise: What the program draws, value name -> (B, ...).
+            noise: What the program draws, value name -> (B, ...); with it what was kept of the run before, if it was.
 
         Returns:
             Every value, of the inputs too.
@@ -71,6 +76,10 @@ class BatchedProgram:
         """
         self.look(inputs, noise)
         return self._by_rows(self._run, inputs, noise)
+
+    def kept_of(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what is kept of a run for the next one."""
+        return {name: values[name] for name in self.kept}
 
     def path(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Run all steps, as ``run`` does; what the turns of ``loop`` carry is kept, too.
@@ -117,24 +126,40 @@ class BatchedProgram:
         return {graph: self._module(graph, size if self.together(size) else 1) for graph in self.modules}
 
     def _takes_batches(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> bool:
-        """Say whether two rows together give what each gives alone."""
-        torch = require("torch", "build")
-        with torch.no_grad():
-            alone = [self._run(_rows(inputs, row, row + 1), _rows(noise, row, row + 1)) for row in range(2)]
-            try:
-                both = self._run(_rows(inputs, 0, 2), _rows(noise, 0, 2))
-            except SourceError:
-                return False
-        wanted = {name: torch.cat([row[name] for row in alone]) for name in alone[0]}
-        return all(
-            both[name].shape == value.shape and torch.allclose(both[name].float(), value.float(), SAME, SAME)
-            for name, value in wanted.items()
-        )
+        """Say whether two rows together give what each gives alone; of what is kept, too, once it is not zero."""
+        drawn = {name: value for name, value in noise.items() if name not in self.kept}
+        with require("torch", "build").no_grad():
+            first = self._alone(inputs, drawn)
+            again = {**drawn, **self.kept_of(first)}
+            wanted = [(drawn, first), *([(again, self._alone(inputs, again))] if self.kept else [])]
+            sizes = [len(kept["shape"]) for kept in self.kept.values()]
+            for self._axis in range(max(sizes, default=1)):
+                if all(self._is_same(_rows(inputs, 0, 2), others, values) for others, values in wanted):
+                    return True
+        return False
+
+    def _alone(self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the first two rows give, each for itself."""
+        rows = [self._run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(2)]
+        return {name: require("torch", "build").cat([row[name] for row in rows]) for name in rows[0]}
+
+    def _is_same(
+        self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor], wanted: Mapping[str, Tensor]
+    ) -> bool:
+        """Say whether a batch gives what is wanted of it."""
+        try:
+            both = self._run(inputs, _rows(others, 0, 2))
+        except SourceError:
+            return False
+        close = require("torch", "build").allclose
+        return all(both[name].shape == value.shape and close(both[name].float(), value.float(), SAME, SAME)
+                   for name, value in wanted.items())  # fmt: skip
 
     def _run(
         self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor], *, keeps_path: bool = False
     ) -> dict[str, Tensor]:
-        values = {**inputs, **noise, **self._zeros(len(next(iter(inputs.values()))))}
+        size = len(next(iter(inputs.values())))
+        values = {**inputs, **noise, **self._fed(noise, size)}
         for step in self.steps:
             carried = tuple(step.carry.values()) if keeps_path and step is self.loop else ()
             path = {name: [values[name]] for name in carried}
@@ -144,11 +169,11 @@ class BatchedProgram:
                 for name, before in path.items():
                     before.append(values[name])
             values |= {PATH + name: require("torch", "build").stack(points, 1) for name, points in path.items()}
-        return values
+        return values | {name: self._held(name, values[name], size) for name in self.kept}
 
     def _turn(self, inputs: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
         torch = require("torch", "build")
-        turns, values = start[TURN], {**inputs, **start, **self._zeros(len(start[TURN]))}
+        turns, values = start[TURN], {**inputs, **start, **self._fed(start, len(start[TURN]))}
         for step in self.steps:
             if step is self.loop:
                 for name, numbers in step.schedule.items():
@@ -159,14 +184,44 @@ class BatchedProgram:
                 values |= self._step(step, values)
         raise ValueError("the program has no loop")
 
-    def _zeros(self, size: int) -> dict[str, Tensor]:
-        """Return what is kept, as it is after ``reset``."""
-        torch = require("torch", "build")
-        return {
-            name: torch.zeros((size, *kept["shape"][1:]), dtype=getattr(torch, kept.get("dtype", "float32")))
-            for step in self.steps
-            for name, kept in step.keep.items()
-        }
+    def _fed(self, others: Mapping[str, Tensor], size: int) -> dict[str, Tensor]:
+        """Return what is kept as modules take it; as it is after ``reset`` where it is not given."""
+        torch, fed = require("torch", "build"), dict[str, Any]()
+        for name, kept in self.kept.items():
+            dtype = getattr(torch, kept.get("dtype", "float32"))
+            value = others[name] if name in others else torch.zeros((size, *kept["shape"]), dtype=dtype)
+            axis = self._batch_axis(name) if size > 1 else 0
+            fed[name] = value.squeeze(axis + 1).movedim(0, axis) if size > 1 else value[0]
+        return fed
+
+    def _held(self, name: str, value: Tensor, size: int) -> Tensor:
+        """Return what a module gave for a kept value, with the batch before its shape.
+
+        Raises:
+            SourceError: when it has another shape than the program declares.
+        """
+        shape, axis = list(self.kept[name]["shape"]), self._batch_axis(name) if size > 1 else 0
+        wanted = [*shape[:axis], size, *shape[axis + 1 :]] if size > 1 else shape
+        if list(value.shape) != wanted:
+            raise SourceError(
+                f"The kept value '{name}' is {list(value.shape)}; the program declares {wanted}.",
+                "declare under 'keep' what the graph gives",
+            )
+        dtype = getattr(require("torch", "build"), self.kept[name].get("dtype", "float32"))
+        value = value.to(dtype) if value.is_floating_point() and dtype.is_floating_point else value
+        return value.movedim(axis, 0).unsqueeze(axis + 1) if size > 1 else value[None]
+
+    def _batch_axis(self, name: str) -> int:
+        """Return the axis of a kept value in which a batch is: the one that modules take, or the next of size 1.
+
+        Raises:
+            SourceError: when no axis has the size 1.
+        """
+        shape = self.kept[name]["shape"]
+        ones = [axis for axis, size in enumerate(shape) if size == 1]
+        if not ones:
+            raise SourceError(f"The kept value '{name}' has no axis for a batch: {list(shape)}.")
+        return next((axis for axis in ones if axis >= self._axis), ones[-1])
 
     def _scheduled(self, step: ProgramStep, turn: int, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the numbers of one turn for each row."""

@@ -108,7 +108,8 @@ def _run(module: nn.Module, feeds: Sequence[Tensor]) -> None:
 
 
 def _repeated(feeds: Sequence[Tensor], size: int) -> list[Tensor]:
-    return [feed.expand(size, *feed.shape[1:]).contiguous() if feed.dim() else feed for feed in feeds]
+    return [feed.expand(size, *feed.shape[1:]).contiguous() if len(feed.shape) and len(feed) == 1 else feed
+            for feed in feeds]  # fmt: skip
 
 
 def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module:

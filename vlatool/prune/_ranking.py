@@ -12,7 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.blocks import first, stacks
-from vlatool.module.feeds import recorded_inputs
+from vlatool.module.carried import LEADING, passages
 from vlatool.prune._slopes import slopes_of
 from vlatool.runtime.policy import relative_error
 
@@ -38,8 +38,8 @@ class Ranking:
     def __init__(self, modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> None:
         self._program = BatchedProgram(source.manifest.program, modules)
         self._action = source.manifest.spec.action.name
-        self._inputs = recorded_inputs(source, samples)
         self._noise = drawn(self._program.noise, 1, np.random.default_rng(SEED))
+        self._passages = passages(source, self._program, self._noise, samples, LEADING)
         self._blocks = {
             (graph, name, number): block
             for graph, module in modules.items()
@@ -48,9 +48,9 @@ class Ranking:
         }
 
     def actions(self) -> Iterator[Any]:
-        """Yield the raw action of each observation as a tensor."""
-        for inputs in self._inputs:
-            yield self._program.run(inputs, self._noise)[self._action]
+        """Yield the raw action of each observation as a tensor, with what is kept of those before it."""
+        for passage in self._passages:
+            yield passage.run(self._program, self._noise)[self._action]
 
     def errors(self, candidates: Sequence[Place], removed: Collection[Place]) -> dict[Place, float]:
         """Return the mean relative error of the actions without each candidate, in addition to what is removed."""

@@ -13,7 +13,8 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
 from vlatool.module.batched import BatchedProgram, drawn
-from vlatool.module.feeds import recorded_inputs, unrecorded
+from vlatool.module.carried import passages
+from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._last import last_layers
@@ -107,13 +108,13 @@ class Sparse(ModuleStage):
 
             return look
 
+        recorded = passages(source, program, noise, self.samples, 1)
         with contextlib.ExitStack() as stack, torch.no_grad():
             for name, layer in layers.items():
                 stack.callback(layer.register_forward_pre_hook(hook(name)).remove)
-            recorded = recorded_inputs(source, self.samples)
-            for number, inputs in enumerate(recorded):
+            for number, passage in enumerate(recorded):
                 context.tell("looking at what layers are given", number / len(recorded))
-                program.run(inputs, noise)
+                passage.run(program, noise)
         return {name: total / counts[name] for name, total in sums.items()}
 
 

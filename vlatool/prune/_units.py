@@ -15,9 +15,10 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.axes import Member, Walk
 from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.carried import LEADING, passages
 from vlatool.module.cut import traced
 from vlatool.module.edits import UNITS, Edit
-from vlatool.module.feeds import first_feeds, recorded_inputs
+from vlatool.module.feeds import first_feeds
 from vlatool.prune._selection import Selection
 from vlatool.prune._slopes import slopes_of
 
@@ -259,8 +260,8 @@ def _by_unit(values: Tensor, member: Member) -> Tensor:
 
 
 def _actions(modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> Iterator[Any]:
-    """Yield the raw action of each recorded observation."""
+    """Yield the raw action of each recorded observation, with what the policy keeps of those before it."""
     program = BatchedProgram(source.manifest.program, modules)
     noise = drawn(program.noise, 1, np.random.default_rng(SEED))
-    for inputs in recorded_inputs(source, samples):
-        yield program.run(inputs, noise)[source.manifest.spec.action.name]
+    for passage in passages(source, program, noise, samples, LEADING):
+        yield passage.run(program, noise)[source.manifest.spec.action.name]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._ranges import Statistics
@@ -57,7 +58,7 @@ class _Calibrating(Watcher):
 def calibrate(
     bundle: Bundle,
     values: Values,
-    observations: Iterable[Mapping[str, Any]],
+    observations: Iterable[Mapping[str, Any] | Moment],
     context: Context,
     *,
     channels: bool = False,
@@ -69,7 +70,7 @@ def calibrate(
     Args:
         bundle: A float32 bundle.
         values: What is looked at.
-        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time.
+        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time; see ``run_watched``.
         context: For progress.
         channels: Whether the largest magnitude of each entry of the last axis is kept too.
         numbers: What messages call the observations: their places in the recording; counted from 0 when empty.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
-from vlatool.data import recorded_observations
+from vlatool.data import calibration_recording
 from vlatool.errors import DataError, GraphError, require
 from vlatool.quantize._blocks import METHODS
 from vlatool.quantize._compute import figures, piece, records_of, store, stored_meaning, whole_weight
 from vlatool.quantize._gptq import Rounded, awq, gptq, nearest_codes
 from vlatool.quantize._journal import DATA
 from vlatool.quantize._layerwise import Layerwise, Values
+from vlatool.quantize._moments import led_to, recorded_moments
 from vlatool.quantize._records import Record, Tools, padded
 from vlatool.quantize._rewrite import Product, Task
 from vlatool.quantize._weight_options import WeightOptions
@@ -32,6 +33,8 @@ from vlatool.stage.base import SampleSet
 Array = NDArray[Any]
 FEW, MOST = 4096, 1024
 """Numbers of an observation up to which it is a state, and how many samples are taken of such ones."""
+Sample = tuple[Mapping[str, Any], dict[str, Any]]
+"""Observation, and what the policy keeps before it."""
 SLACK = 2.0
 """How much more of a weight's norm a method may lose that spares the product instead."""
 
@@ -40,9 +43,10 @@ def calibrated_records(
     plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, seen: SampleSet
 ) -> list[Record]:
     """Return all records; those of quantized weights drive the policy from layer to layer and must run in order."""
-    recorded = recorded_observations(bundle, _count(bundle, stage), stage.calibration)
-    observations = [dict(observation) for observation in seen.watch(recorded)]
-    walk = _Walk(plan, bundle, stage, place, observations)
+    recording = calibration_recording(bundle, stage.calibration)
+    numbers = recording.spread(_count(bundle, stage)) if recording is not None else []
+    moments = recorded_moments(bundle, recording, numbers, seen) if recording is not None else ()
+    walk = _Walk(plan, bundle, stage, place, list(led_to(bundle, moments)))
     records: list[Record] = []
     for number, task in enumerate(plan.tasks):
         if task.kind == "copy":
@@ -69,10 +73,10 @@ class _Walk:
     """The policy on all samples, halted at each layer that is quantized."""
 
     def __init__(
-        self, plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, observations: list[dict[str, Any]]
+        self, plan: WeightsPlan, bundle: Bundle, stage: WeightOptions, place: Path, samples: list[Sample]
     ) -> None:
         self._plan, self._bundle, self._stage, self._place = plan, bundle, stage, place
-        self._observations = observations
+        self._samples = samples
         self._offsets = plan.offsets()
         self._wanted = -1
         self._shared = {id(layer): number for graph in plan.graphs.values() for layer, number in graph.products}
@@ -105,7 +109,7 @@ class _Walk:
         manifest = self._bundle.manifest
         encode = ObservationEncoder(manifest.spec, self._bundle.path / "assets")
         random = np.random.default_rng(0)
-        samples: list[Values] = [dict(encode(observation)) for observation in self._observations]
+        samples: list[Values] = [{**encode(observation), **kept} for observation, kept in self._samples]
         for step in manifest.program:
             for values in samples:
                 _begin(step, values, random)
@@ -163,14 +167,12 @@ class _Walk:
 
 
 def _begin(step: ProgramStep, values: Values, random: np.random.Generator) -> None:
-    """Bring noise, the first entries of schedules and zeros for kept values into being."""
+    """Bring noise and the first entries of schedules into being."""
     for name, noise in step.noise.items():
         values[name] = draw(noise, random)
     for name, numbers in step.schedule.items():
         whole = all(isinstance(number, int) for number in numbers)
         values[name] = np.array([numbers[0]], np.int64 if whole else np.float32)
-    for name, kept in step.keep.items():
-        values[name] = np.zeros(kept["shape"], kept.get("dtype", "float32"))
 
 
 def _note(task: Task, weight: Array, rounded: Rounded, rows: Array, tolerance: float) -> dict[str, Any]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import PLAYED, calibration_checks, calibration_recording, played_observations
+from vlatool.data import PLAYED, Recording, calibration_checks, calibration_recording
 from vlatool.errors import DataError
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._calibrate import Values, calibrate
+from vlatool.quantize._moments import played_moments, recorded_moments
 from vlatool.quantize._ranges import Statistics
 from vlatool.stage.base import Context, SampleSet
 
@@ -43,12 +44,11 @@ class Calibrated(Quantization):
         if calibration_recording(source, self.calibration) is None:
             raise self._missing(source)
 
-    def observed(self, bundle: Bundle, seen: SampleSet) -> tuple[list[int], Iterator[Mapping[str, Any]]]:
-        """Return the numbers of the calibration samples and an iterator over them; warn of what makes them unreliable.
+    def chosen(self, bundle: Bundle) -> tuple[Recording, list[int]]:
+        """Return the recording and the numbers of the calibration samples; warn of what makes them unreliable.
 
         Args:
             bundle: Whose own recording is used when no other is given.
-            seen: Takes the hash of each sample that goes by.
 
         Raises:
             DataError: when there is none.
@@ -60,7 +60,7 @@ class Calibrated(Quantization):
         asked = self.samples if self.samples != type(self).model_fields["samples"].default else 0
         for doubt in calibration_checks(recording, numbers, bundle.manifest.spec, bundle.path / "assets", asked):
             warnings.warn(doubt, stacklevel=3)
-        return numbers, seen.watch(recording.observation(number) for number in numbers)
+        return recording, numbers
 
     def statistics(
         self,
@@ -79,12 +79,14 @@ class Calibrated(Quantization):
         Raises:
             DataError, GraphError: see ``calibrate``.
         """
-        played = [] if self.calibration else played_observations(bundle)
-        alone = played and calibration_recording(bundle) is None
-        numbers, recorded = ([], iter(())) if alone else self.observed(bundle, seen)
-        observations = itertools.chain(recorded, seen.watch(played))
-        numbers = [*numbers, *range(len(played))]
-        return calibrate(bundle, values, observations, context, numbers=numbers, spared=spared)
+        kept = not self.calibration and PLAYED in bundle.manifest.files
+        if kept and calibration_recording(bundle) is None:
+            return calibrate(bundle, values, played_moments(bundle, seen), context, spared=spared)
+        recording, numbers = self.chosen(bundle)
+        recorded = recorded_moments(bundle, recording, numbers, seen)
+        played = (moment for _ in range(kept) for moment in played_moments(bundle, seen))  # after the others
+        moments = itertools.chain(recorded, played)
+        return calibrate(bundle, values, moments, context, numbers=numbers, spared=spared)
 
     def _missing(self, bundle: Bundle) -> DataError:
         plays = ", or quantize.qat, which plays episodes" if self.without and bundle.manifest.environment else ""

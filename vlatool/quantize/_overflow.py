@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import Moment
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._watched import Watcher, run_watched
 from vlatool.stage.base import Context
@@ -71,14 +72,18 @@ class _Watching(Watcher):
 
 
 def find_beyond(
-    bundle: Bundle, graphs: Iterable[str], observations: Iterable[Mapping[str, Any]], limit: float, context: Context
+    bundle: Bundle,
+    graphs: Iterable[str],
+    observations: Iterable[Mapping[str, Any] | Moment],
+    limit: float,
+    context: Context,
 ) -> dict[str, dict[str, Beyond]]:
     """Return graph -> value -> where it goes beyond ``limit``; infinity does not count, every float type has it.
 
     Args:
         bundle: A float32 bundle.
         graphs: Names of the graphs that are watched.
-        observations: Raw observations, consumed one at a time.
+        observations: Raw observations, consumed one at a time; see ``run_watched``.
         limit: Largest finite magnitude that is allowed.
         context: For progress.
 

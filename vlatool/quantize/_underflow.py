@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.data import Moment
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._float16_graph import HALF, LARGEST, around
 from vlatool.quantize._watched import Watcher, run_watched
@@ -115,7 +116,7 @@ class _Watching(Watcher):
 
 
 def find_small(
-    bundle: Bundle, graphs: Iterable[str], observations: Iterable[Mapping[str, Any]], context: Context
+    bundle: Bundle, graphs: Iterable[str], observations: Iterable[Mapping[str, Any] | Moment], context: Context
 ) -> dict[str, Small]:
     """Return graph -> the sizes of its values.
 

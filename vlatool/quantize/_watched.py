@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Encoded
+from vlatool.data import Encoded, Moment
 from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
@@ -34,6 +34,7 @@ class Watcher:
     def __init__(self, path: Path, copy: Path, show: Callable[[OnnxGraph], None]) -> None:
         graph = OnnxGraph(require("onnx", "build").load(str(path), load_external_data=False))
         self.sample = 0
+        self.counts = True
         self._outputs = [value.name for value in graph.graph.output]
         show(graph)
         self._about = f"the graph '{path.stem}' with further outputs"
@@ -48,7 +49,8 @@ class Watcher:
         """Run, look at the values, return the graph's own outputs."""
         with risky(engine_class(), f"ran {self._about}"):
             values = self._session.run(feeds)
-        self.watch(feeds, values)
+        if self.counts:
+            self.watch(feeds, values)
         return {name: values[name] for name in self._outputs}
 
 
@@ -66,7 +68,7 @@ class _Passing(ObservationEncoder):
 def run_watched(
     bundle: Bundle,
     watchers: Mapping[str, Watcher],
-    observations: Iterable[Mapping[str, Any]],
+    observations: Iterable[Mapping[str, Any] | Moment],
     context: Context,
     what: str,
     numbers: Sequence[int] = (),
@@ -76,7 +78,8 @@ def run_watched(
     Args:
         bundle: A float32 bundle.
         watchers: Graph name -> session; graphs without one run as they are.
-        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time.
+        observations: Raw ones, or as the graphs take them (``Encoded``), consumed one at a time. Of moments, those that
+            do not count are not watched, and where an episode begins the policy forgets what it kept.
         context: For progress.
         what: Is being done, before the words "sample 3".
         numbers: What messages call the observations: their places in the recording; counted from 0 when empty.
@@ -88,14 +91,17 @@ def run_watched(
     others = {name: open_graph(bundle, graphs[name], engine_class(), 1) for name in graphs if name not in watchers}
     policy = Policy(bundle, Program(bundle.manifest.program, {**others, **watchers}, seed=0), DEFAULT_ENGINE)
     policy.encode = _Passing(policy.encode)
-    for place, observation in enumerate(observations):
-        number = numbers[place] if numbers else place
+    for place, each in enumerate(observations):
+        moment = each if isinstance(each, Moment) else Moment(each, numbers[place] if numbers else place)
+        number = moment.number
         if place % 8 == 0:
-            context.tell(f"{what} sample {number}", place / len(numbers) if numbers else None)
+            context.tell(f"{what} sample {number}", place / len(numbers) if place < len(numbers) else None)
         for watcher in watchers.values():
-            watcher.sample = number
+            watcher.sample, watcher.counts = number, moment.counts
+        if moment.begins:
+            policy.reset(number)
         try:
-            policy.infer(observation)
+            policy.infer(moment.observation)
         except (GraphError, DataError) as error:
             if error.message.startswith(SAMPLE):
                 raise

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import observations_for, recorded_observations
+from vlatool.data import Moment, calibration_recording, synthetic_observations
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.machine.risky import risky
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
+from vlatool.quantize._moments import recorded_moments
 from vlatool.quantize._overflow import find_beyond
 from vlatool.quantize._trial_compile import open_apart
 from vlatool.quantize._underflow import find_small, too_small
@@ -61,9 +62,14 @@ class Float16(Quantization):
             candidates += [node.name for node in model.graph.node]
         selected = self.selected(candidates, bundle)
         samples = SampleSet()
-        recorded = recorded_observations(bundle, self.samples, self.calibration)
-        seen = list(samples.watch(recorded or observations_for(bundle, self.samples, self.calibration)))
-        beyond = find_beyond(bundle, chosen, seen, LARGEST, context)
+        recording = calibration_recording(bundle, self.calibration)
+
+        def seen(samples: SampleSet) -> Iterable[Moment | Mapping[str, Any]]:
+            if recording is None:
+                return samples.watch(synthetic_observations(bundle, self.samples))
+            return recorded_moments(bundle, recording, recording.spread(self.samples), samples)
+
+        beyond = find_beyond(bundle, chosen, seen(samples), LARGEST, context)
         report: dict[str, Any] = {"kept": 0, "subnormal_weights": 0, "beyond": [], "moved": {}}
         for graph, values in beyond.items():
             for value, excess in values.items():
@@ -73,7 +79,7 @@ class Float16(Quantization):
                     f"{value} reaches {size:g} in sample {excess.sample}, beyond float16: it stays float32", None
                 )
 
-        small = find_small(bundle, chosen, seen, context)
+        small = find_small(bundle, chosen, seen(SampleSet()), context)
 
         def convert(name: str, original: Path, target: Path) -> None:
             model = load(original)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -18,6 +18,7 @@ from vlatool.graph.nodes import reads
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._calibration import Calibrated
+from vlatool.quantize._moments import recorded_moments
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._smooth_groups import Edit, Group, find_groups
 from vlatool.quantize._smooth_scales import Unseen, best_alpha, int8_loss, smooth_scales, weight_peaks
@@ -27,8 +28,6 @@ from vlatool.stage.base import Context, SampleSet, source_of
 
 Array = NDArray[Any]
 
-Sample = tuple[int, Mapping[str, Any]]
-"""Number and observation."""
 OPS = ("MatMul", "Gemm")
 REPORT = "reports/smooth_quant.json"
 SAME = 1e-4
@@ -77,10 +76,11 @@ class SmoothQuant(Calibrated):
             with foreign_errors(name):
                 groups[name] = find_groups(load(bundle.file(bundle.manifest.graphs[name].file)), layers)
         values = {name: [value for group in members for value in group.activations] for name, members in groups.items()}
-        halves = self._halves(list(zip(*self.observed(bundle, samples), strict=True)))
+        recording, chosen = self.chosen(bundle)
+        halves = self._halves(chosen)
         peaks = []
-        for half in halves:
-            numbers, observations = zip(*half, strict=True)
+        for numbers in halves:
+            observations = recorded_moments(bundle, recording, numbers, samples)
             peaks.append(_peaks(calibrate(bundle, values, observations, context, channels=True, numbers=numbers)))
         notes: list[dict[str, Any]] = []
 
@@ -111,11 +111,11 @@ class SmoothQuant(Calibrated):
         more = f" ({blocked} of them for want of --insert)" if blocked else ""
         return (f"{text}, {count['left']} left as they are{more}",)
 
-    def _halves(self, observations: list[Sample]) -> list[list[Sample]]:
-        """Return all observations, or for ``auto`` every other one and the rest, whose peaks are compared."""
-        if self.alpha != "auto" or len(observations) < 2:
-            return [observations]
-        return [observations[::2], observations[1::2]]
+    def _halves(self, numbers: list[int]) -> list[list[int]]:
+        """Return all samples, or for ``auto`` every other one and the rest, whose peaks are compared."""
+        if self.alpha != "auto" or len(numbers) < 2:
+            return [numbers]
+        return [numbers[::2], numbers[1::2]]
 
     def _smooth(self, model: Any, group: Group, halves: list[Array], samples: int) -> dict[str, Any]:
         """Smooth one activation in place and return what was done.

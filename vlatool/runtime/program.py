@@ -75,6 +75,15 @@ class Program:
         """Whether an inference depends on those before it."""
         return bool(self._kept)
 
+    @property
+    def kept(self) -> dict[str, Array]:
+        """What the next inference is given of those before, value name -> array."""
+        return dict(self._kept)
+
+    @kept.setter
+    def kept(self, values: Mapping[str, Array]) -> None:
+        self._kept = dict(values)
+
     def run(
         self,
         values: dict[str, Any],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
+from vlatool.data import Observations
 from vlatool.errors import DataError, require
 from vlatool.graph.files import foreign_errors, save
 from vlatool.graph.layers import Layer
@@ -71,7 +72,8 @@ def sensitivities(
 ) -> list[LayerError]:
     """Measure every layer that a stage would quantize, alone in int8 and all else in float32; the worst first.
 
-    Each observation starts an episode of its own: kept values are zero and the noise is drawn from the same seed.
+    The noise of each observation is drawn from the same seed. What a policy keeps is what it kept of the observations
+    before, in float32; zero where the observations are no recording's.
 
     Args:
         bundle: A float32 bundle.
@@ -166,6 +168,7 @@ class Switchboard:
         self._scratch = tempfile.TemporaryDirectory(prefix="vlatool-")
         self._tape = _Tape()
         self._sessions: dict[str, _Switchable] = {}
+        self._kept: Mapping[str, Array] = {}
         self.shares: dict[Place, float] = {}
         with foreign_errors("main"):
             layers, _ = stage.plan(bundle)
@@ -202,7 +205,22 @@ class Switchboard:
             session.switch([layer for graph, layer in chosen if graph == name])
         self._tape.start(recording=recording)
         self.policy.reset()
+        if self._kept:
+            self.policy.program.kept = dict(self._kept)
         return self.policy.infer(observation)
+
+    def _led_to(self, observations: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+        """Yield observations; until the next one, each run is given what the policy keeps before it."""
+        if not (self.policy.program.keeps and isinstance(observations, Observations)):
+            yield from observations
+            return
+        for moment in observations.along():
+            self._kept = {} if moment.begins else self._kept
+            if moment.counts:
+                yield moment.observation
+            self.reference(moment.observation)
+            self._kept = self.policy.program.kept
+        self._kept = {}
 
     def errors(
         self,
@@ -226,7 +244,7 @@ class Switchboard:
         spec = self.policy.spec.action
         rows: list[list[tuple[Array, ...]]] = [[] for _ in groups]
         start = time.monotonic()
-        for number, observation in enumerate(observations):
+        for number, observation in enumerate(self._led_to(observations)):
             if number and (time.monotonic() - start) * (number + 1) / number > seconds:
                 break
             reference = self.reference(observation)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.bundle.spec import DTYPES, PolicySpec, TensorSpec
-from vlatool.data import synthetic_observations
+from vlatool.data import random_observations
 from vlatool.errors import SourceError
 from vlatool.graph.files import save
 from vlatool.graph.onnx_graph import type_name
@@ -81,7 +81,7 @@ def _drawn(inputs: Sequence[TensorSpec], length: int) -> dict[str, Any]:
         replace(each, shape=tuple(length if isinstance(axis, str) else axis for axis in each.shape)) for each in inputs
     ]
     spec = PolicySpec(tuple(fixed), (TensorSpec("action of a file", (1, 1)),), 1)
-    return ObservationEncoder(spec, Path())(synthetic_observations(spec, 1, seed=length)[0])
+    return ObservationEncoder(spec, Path())(random_observations(spec, 1, seed=length)[0])
 
 
 def _is_said(value: Any) -> bool:

@@ -44,9 +44,9 @@ class Batches:
 
     def __call__(self, random: np.random.Generator) -> Iterator[Part]:
         """Yield this process's parts of the batch that the random numbers choose."""
-        rows = random.integers(len(self._frames), size=self._size)
-        for part in np.array_split(rows, self._parts)[self._own]:
-            yield len(part) / self._size, partial(self._loss, part)
+        places = self._frames.draw(random, self._size)
+        for part in np.array_split(places, self._parts)[self._own]:
+            yield self._frames.weigh(part) / self._frames.weigh(places), partial(self._loss, part)
 
     def of(self, loss: Loss, frames: Frames) -> Batches:
         """Return batches of other rows, with another loss, in the same parts."""
@@ -54,8 +54,8 @@ class Batches:
         other._of_rows, other._frames = loss, frames
         return other
 
-    def _loss(self, rows: NDArray[Any]) -> Tensor:
-        return self._of_rows(self._frames.batch(rows))
+    def _loss(self, places: NDArray[Any]) -> Tensor:
+        return self._of_rows(self._frames.batch(places))
 
 
 def mean_loss(frames: Frames, places: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
@@ -63,16 +63,16 @@ def mean_loss(frames: Frames, places: NDArray[Any], loss: Loss, rows: int, devic
 
     Args:
         frames: Where they are.
-        places: Their numbers over all rounds.
+        places: Of them, as ``Frames.sample`` gives.
         loss: Of a batch.
         rows: At a time.
         device: As in training.
     """
-    total = 0.0
+    total, count = 0.0, frames.weigh(places)
     with require("torch", "build").no_grad(), device.computing(), device.casting():
-        for part in np.array_split(places, -(-len(places) // rows)):
-            total += float(loss(frames.batch(part))) * len(part)
-    return total / len(places)
+        for part in np.array_split(places, min(len(places), -(-count // rows))):
+            total += float(loss(frames.batch(part))) * frames.weigh(part)
+    return total / count
 
 
 def draw_of(taught: Batches, alpha: float, loss: Loss | None, shown: Frames) -> Draw:

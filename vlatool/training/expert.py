@@ -16,7 +16,8 @@ from vlatool.errors import DataError, require
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.runtime.statistics import load_normaliser
 from vlatool.training.frames import BLOCK, Array, Frames, new_array
-from vlatool.training.rounds import EXPERT, NOISE, Counted, next_round, tensors, write_recorded
+from vlatool.training.rounds import EXPERT, NOISE, Counted, next_round, write_recorded
+from vlatool.training.sequences import Sequences, answered, episode_begins, whole_episodes
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -32,10 +33,11 @@ class Expert:
 
     Args:
         place: Folder of the training, or of what it holds out.
+        frames: Folder -> the rounds in it, as the lesson takes them.
     """
 
-    def __init__(self, place: Path) -> None:
-        self.frames = Frames(place / FOLDER)
+    def __init__(self, place: Path, frames: Callable[[Path], Frames] = Frames) -> None:
+        self.frames = frames(place / FOLDER)
         self.counts: dict[str, int] = {}
 
     def prepare(
@@ -61,15 +63,18 @@ class Expert:
         if not isinstance(recording, Recording) or recording.actions is None:
             where = recording.path if isinstance(recording, Recording) else source.path
             raise DataError(f"A loss against an expert's actions needs them, and {where} has none.", RECORD)
-        order = np.random.default_rng((seed, CHOICE)).permutation(len(recording))
-        used = np.zeros(len(recording), np.bool_)
-        used[order[: max(1, round(share * len(recording)))]] = True
+        order = np.random.default_rng((seed, CHOICE)).permutation
+        if isinstance(self.frames, Sequences):
+            used = whole_episodes(episode_begins(recording), share, order)
+        else:
+            used = np.zeros(len(recording), np.bool_)
+            used[order(len(recording))[: max(1, round(share * len(recording)))]] = True
         chosen = recording.only(used)
         self.counts = {"used": len(chosen), "recorded": len(recording)}
 
         def write(target: Path) -> None:
             action = source.manifest.spec.action
-            write_recorded(encode, chosen, target)
+            write_recorded(encode, chosen, target, chosen.begins())
             np.save(file_of(target, EXPERT + action.name), encoded_actions(action, source, chosen.actions))
             write_noise(source, len(chosen), (seed, CHOICE), target)
 
@@ -86,11 +91,23 @@ class Expert:
             self.frames.read(0)
 
 
-def at_most(source: Bundle, most: int) -> Recording | None:
-    """Return so many recorded observations of a bundle, spread over its recording; None when it has none."""
+def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | None:
+    """Return so many recorded observations of a bundle, spread over its recording; None when it has none.
+
+    Args:
+        source: The bundle.
+        most: Observations.
+        whole: Whether these are whole episodes.
+
+    Raises:
+        DataError: as ``episode_begins`` does, where they are.
+    """
     recording = calibration_recording(source)
     if recording is None:
         return None
+    if whole:
+        order = np.random.default_rng(CHOICE).permutation
+        return recording.only(whole_episodes(episode_begins(recording), most / len(recording), order))
     used = np.zeros(len(recording), np.bool_)
     used[recording.spread(most)] = True
     return recording.only(used)
@@ -133,8 +150,8 @@ def expert_loss(
     student = BatchedProgram(source.manifest.program, modules)
 
     def loss(rows: Mapping[str, Any]) -> Tensor:
-        expert = tensors(rows, EXPERT)[action.name]
-        given = student.run(tensors(rows), tensors(rows, NOISE))[action.name].float()
+        given, expert = answered(student, rows, action.name, EXPERT)
+        given = given.float()
         given = given.reshape(len(given), -1, given.shape[-1])[:, : expert.shape[1]]
         if action.kind != "discrete":
             far: Tensor = distance(given, expert)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -12,6 +12,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from vlatool.data import BEGINS
 from vlatool.errors import DataError
 
 Array = NDArray[Any]
@@ -44,7 +45,7 @@ class Frames:
 
     def read(self, number: int) -> None:
         """Use a round that was written, after those before it."""
-        files = sorted(self._place(number).glob("*.npy"))
+        files = sorted({*self._place(number).glob("*.npy")} - {begins_file(self._place(number))})
         self._rounds.append({unquote(file.stem): np.load(file, mmap_mode="r") for file in files})
 
     def draft(self, number: int) -> Path:
@@ -63,7 +64,28 @@ class Frames:
         sizes = [len(next(iter(arrays.values()))) for arrays in self._rounds]
         return np.arange(sizes[number]) + sum(sizes[:number])
 
-    def batch(self, rows: Array) -> dict[str, Array]:
+    def draw(self, random: np.random.Generator, size: int) -> Array:
+        """Draw the places of a batch of so many rows."""
+        return random.integers(len(self), size=size)
+
+    def weigh(self, places: Array) -> int:
+        """Return how many rows are at places."""
+        return len(places)
+
+    def sample(self, numbers: Sequence[int], most: int) -> Array:
+        """Return the places of so many rows of some rounds, or of all, evenly spaced."""
+        rows = np.concatenate([self.places(number) for number in numbers])
+        return rows[spread(len(rows), most)]
+
+    def batch(self, places: Array) -> Any:
+        """Return what a loss takes of places: name -> (B, ...)."""
+        return self.rows(places)
+
+    def kept(self, most: int) -> dict[str, Array]:
+        """Return so many rows, spread over all rounds: name -> (N, ...)."""
+        return self.rows(spread(len(self), most))
+
+    def rows(self, rows: Array) -> dict[str, Array]:
         """Return rows by their numbers over all rounds: name -> (B, ...)."""
         starts = np.cumsum([0, *(len(next(iter(arrays.values()))) for arrays in self._rounds)])
         which = np.searchsorted(starts, rows, side="right") - 1
@@ -73,8 +95,18 @@ class Frames:
             for name in self._rounds[0]
         }
 
+    def begins(self, number: int) -> Array:
+        """Return the numbers over all rounds of the rows of one with which episodes begin."""
+        places: Array = self.places(number)[np.load(begins_file(self._place(number)))]
+        return places
+
     def _place(self, number: int) -> Path:
         return self._folder / f"round-{number:03d}"
+
+
+def begins_file(folder: Path) -> Path:
+    """Return the file that says of each row of a round whether an episode begins with it; no input's has that name."""
+    return folder / f"{BEGINS}.npy"
 
 
 def spread(count: int, most: int) -> Array:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.bundle.bundle import Bundle
 from vlatool.data import Recording
 from vlatool.errors import DataError
 from vlatool.training.batches import Loss, mean_loss
 from vlatool.training.device import Device
-from vlatool.training.expert import Expert, at_most
+from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
 from vlatool.training.rounds import Counted, next_round
 
@@ -34,11 +33,12 @@ class HeldOut:
 
     Args:
         place: Folder of the training.
+        frames: Folder -> the rounds in it, as the lesson takes them.
     """
 
-    def __init__(self, place: Path) -> None:
-        self._frames = Frames(place / FOLDER)
-        self.expert = Expert(place / FOLDER)
+    def __init__(self, place: Path, frames: Callable[[Path], Frames] = Frames) -> None:
+        self._frames = frames(place / FOLDER)
+        self.expert = Expert(place / FOLDER, frames)
         self.recording: Recording | None = None
         """What is held out, after ``prepare``."""
         self._others: Counted | None = None
@@ -51,20 +51,18 @@ class HeldOut:
         return self._others
 
     def prepare(
-        self, source: Bundle, most: int, write: Callable[[Counted, Path], None], instead: Callable[[Path], bool]
+        self, recording: Recording | None, write: Callable[[Counted, Path], None], instead: Callable[[Path], bool]
     ) -> None:
         """Split the recording, and write what is held out unless an earlier run did.
 
         Args:
-            source: The student's bundle.
-            most: Observations that are used of it.
+            recording: Of the student's bundle.
             write: Called with observations and the folder for them.
             instead: Called with the folder where there are not two observations to split; says whether it wrote others.
 
         Raises:
             DataError: when there are not two observations to split.
         """
-        recording = at_most(source, most)
         if recording is None or len(recording) < 2:
             self._others = [] if recording is None else recording
             next_round(self._frames, 0, partial(_required, instead, len(self._others)))
@@ -87,7 +85,7 @@ class HeldOut:
             rows: At a time.
             device: As in training.
         """
-        return mean_loss(self._frames, np.arange(len(self._frames)), loss, rows, device)
+        return mean_loss(self._frames, self._frames.sample((0,), len(self._frames)), loss, rows, device)
 
     def mixed(self, alpha: float, loss: Loss, expert: Loss | None, rows: int, device: Device) -> float:
         """Return the same as a mixture of both terms.
@@ -102,7 +100,7 @@ class HeldOut:
         if expert is None:
             return total
         shown = self.expert.frames
-        return total + (1 - alpha) * mean_loss(shown, np.arange(len(shown)), expert, rows, device)
+        return total + (1 - alpha) * mean_loss(shown, shown.sample((0,), len(shown)), expert, rows, device)
 
 
 def _required(instead: Callable[[Path], bool], recorded: int, target: Path) -> None:

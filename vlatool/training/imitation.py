@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
@@ -16,7 +16,8 @@ from vlatool.module.batched import BatchedProgram
 from vlatool.training.flow import CHUNK, check_loops, flow_loss
 from vlatool.training.hinted import with_hints
 from vlatool.training.lesson import Lesson
-from vlatool.training.rounds import LABEL, NOISE, tensors
+from vlatool.training.rounds import LABEL
+from vlatool.training.sequences import Unroll, answered
 from vlatool.training.stage import TrainingStage
 
 if TYPE_CHECKING:
@@ -58,8 +59,19 @@ class ImitationStage(TrainingStage):
                 f"--targets flow runs single denoising steps, and {hints[0]} compares what blocks give in all of them.",
                 "leave one of them out",
             )
+        self._check_kept([name for step in source.manifest.program for name in step.keep] if source else [])
         if self.targets == "flow" and source is not None and source.manifest.spec.action.kind == "discrete":
             raise RecipeError("--targets flow compares continuous actions; the policy's are discrete.", CHUNK)
+
+    def _check_kept(self, names: Sequence[str]) -> None:
+        """Refuse what compares single observations, where a policy keeps values."""
+        asked = [f"--{name}" for name, weight in self.hints().items() if weight]
+        asked += ["--targets flow"] if self.targets == "flow" else []
+        if names and asked:
+            raise RecipeError(
+                f"{asked[0]} compares single inferences, and the policy keeps '{names[0]}' from step to step.",
+                f"leave {asked[0]} out: the actions are compared, along whole episodes",
+            )
 
     def computed(self) -> contextlib.AbstractContextManager[Any]:
         """Return a context in which the student computes."""
@@ -72,18 +84,17 @@ class ImitationStage(TrainingStage):
         student, distance = BatchedProgram(source.manifest.program, modules), self._distance(name)
 
         def loss(rows: Mapping[str, Any]) -> Tensor:
-            inputs, noise = tensors(rows), tensors(rows, NOISE)
-            student.look(inputs, noise)
-            with self.computed():
-                values = student.run(inputs, noise)
-            far: Tensor = distance(values[action.name].float(), tensors(rows, LABEL)[action.name])
+            given, wanted = answered(student, rows, action.name, LABEL, self.computed)
+            far: Tensor = distance(given.float(), wanted)
             return far
 
+        self._check_kept([*student.kept, *teacher.program.kept])
         if self.targets == "flow":
             check_loops(student, teacher.program, action.name, source.manifest.name)
             turn = flow_loss(student, distance, self.computed)
             return Lesson(f"flow {name}", modules, turn, judged=loss, turns=True)
-        return with_hints(Lesson(name, modules, loss), self.hints(), student, source, teacher, self.seed)
+        unroll = Unroll(self.window, self.burn_in) if student.kept else None
+        return with_hints(Lesson(name, modules, loss, unroll=unroll), self.hints(), student, source, teacher, self.seed)
 
     def hints(self) -> dict[str, float]:
         """Return the weight of each hint in the loss."""

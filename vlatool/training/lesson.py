@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vlatool.training.constraint import Constraint
 from vlatool.training.frames import Frames
+from vlatool.training.sequences import Sequences, Unroll
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -29,6 +31,8 @@ class Lesson:
         about: What else is to be known of the training, as JSON values.
         constraint: What holds of the weights after each step.
         expert: The same as ``loss`` for rows as ``Expert`` wrote them; None where no expert is asked.
+        unroll: How far the training goes back in time, where the student keeps values; ``loss`` then takes stretches
+            of episodes in the place of rows.
         turns: Whether the teacher also shows single turns of its loop (``rounds.label``).
     """
 
@@ -40,7 +44,12 @@ class Lesson:
     about: Mapping[str, Any] = field(default_factory=dict)
     constraint: Constraint | None = None
     expert: Callable[[Mapping[str, Any]], Tensor] | None = None
+    unroll: Unroll | None = None
     turns: bool = False
+
+    def frames(self, folder: Path) -> Frames:
+        """Return the rounds in a folder, as ``loss`` takes them."""
+        return Frames(folder) if self.unroll is None else Sequences(folder, self.unroll)
 
     @property
     def examined(self) -> Callable[[Mapping[str, Any]], Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Any
 
@@ -46,11 +47,21 @@ def write_training_report(made: Bundle, seconds: float, command: str) -> None:
     first, last = sum(losses[:few]) / few, sum(losses[-few:]) / few
     result = f"{training['loss']} {first:.4g} -> {last:.4g} in {steps} steps and {duration(seconds)}."
     report = Report(
-        "training", f"{made.manifest.name}: {stage}", summary=(result, *teacher_lines(training)), rows=(row,),
-        command=command,
+        "training", f"{made.manifest.name}: {stage}", rows=(row,), command=command,
+        summary=(*along_lines(training), result, *teacher_lines(training)),
         created=datetime.now(timezone.utc).isoformat(timespec="seconds"), environment=fingerprint(),
     )  # fmt: skip
     write_reports(report, made.path / REPORTS)
+
+
+def along_lines(training: Mapping[str, Any]) -> tuple[str, ...]:
+    """Say how far a student that keeps values is from its teacher over whole episodes, where it was trained."""
+    about = training.get("along")
+    if about is None:
+        return ()
+    of = f"{about['observations']} observations of {about['episodes']} whole episodes"
+    losses = f"{training['loss']} {about['before']:.4g} -> {about['after']:.4g}"
+    return (f"{losses} over {of}, with what is kept carried along",)
 
 
 def _round(about: Record) -> Record:

@@ -16,7 +16,8 @@ from vlatool.module.batched import PATH, BatchedProgram, drawn
 from vlatool.module.origin import origin_of
 from vlatool.stage.base import Context
 from vlatool.training.device import on_device
-from vlatool.training.frames import Array, Frames, new_array
+from vlatool.training.frames import Array, Frames, begins_file, new_array
+from vlatool.training.lanes import reset, side_by_side
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -45,8 +46,20 @@ class Counted(Protocol):
     def __iter__(self) -> Iterator[Any]: ...
 
 
-def write_recorded(encode: Callable[[Any], Mapping[str, Array]], observations: Counted, target: Path) -> None:
-    """Write encoded observations as a part of a round, one after the other: they need not fit into the memory."""
+def write_recorded(
+    encode: Callable[[Any], Mapping[str, Array]], observations: Counted, target: Path, begins: Array | None = None
+) -> None:
+    """Write encoded observations as a part of a round, one after the other: they need not fit into the memory.
+
+    Args:
+        encode: Observation -> what the policy takes.
+        observations: In the order of their episodes, where these matter.
+        target: Folder of the part.
+        begins: (N,) whether an episode begins with an observation; None where that does not matter.
+    """
+    if begins is not None and len(begins):
+        target.mkdir(parents=True, exist_ok=True)
+        np.save(begins_file(target), begins)
     target.mkdir(parents=True, exist_ok=True)
     kept: dict[str, Array] = {}
     for row, observation in enumerate(observations):
@@ -59,6 +72,8 @@ def write_recorded(encode: Callable[[Any], Mapping[str, Array]], observations: C
 def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: BatchedProgram, seed: Sequence[int],
           context: Context, *, turns: bool = False) -> list[str]:  # fmt: skip
     """Write what the teacher gives for every row of a round, and the noise that it drew, beside the inputs.
+
+    A teacher that keeps values is run along the episodes.
 
     Args:
         frames: Folder of the round.
@@ -80,13 +95,11 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
     inputs = {name: np.load(file_of(frames, name), mmap_mode="r") for name in names}
     count = len(next(iter(inputs.values())))
     kept: dict[str, Any] = {}
+    begins = np.load(begins_file(frames)) if teacher.kept else None
     with torch.no_grad():
-        for start in range(0, count, ROWS):
-            rows = {name: on_device(np.array(values[start : start + ROWS])) for name, values in inputs.items()}
-            noise = drawn(teacher.noise, len(next(iter(rows.values()))), np.random.default_rng((*seed, start)))
-            values = teacher.path(rows, noise) if turns else teacher.run(rows, noise)
+        for key, rows, own, values, noise in _shown(teacher, inputs, begins, seed, turns=turns):
             labels = {name: values[name] for name in outputs}
-            labels |= _turns(teacher, values, np.random.default_rng((*seed, start, 1))) if turns else {}
+            labels |= _turns(teacher, values, np.random.default_rng((*key, 1))) if turns else {}
             given = {LABEL + name: value for name, value in labels.items()}
             given |= {NOISE + name: noise[name] for name in noise}
             for name, value in given.items():
@@ -94,9 +107,43 @@ def label(frames: Path, names: Sequence[str], outputs: Sequence[str], teacher: B
                     kept[name] = new_array(file_of(frames, name), value.cpu().numpy().dtype, (count, *value.shape[1:]))
                 if value.is_floating_point() and not bool(torch.isfinite(value).all()):
                     raise DataError("The teacher gives an action that is not finite.", "look at the recordings")
-                kept[name][start : start + len(value)] = value.cpu().numpy()
-            context.tell(f"the teacher labels {count} observations", (start + 1) / count)
+                kept[name][rows[own]] = value.cpu().numpy()[own]
+            context.tell(f"the teacher labels {count} observations", (int(rows[0]) + 1) / count)
     return [name.removeprefix(LABEL) for name in kept if name.startswith(LABEL)]
+
+
+def _shown(
+    teacher: BatchedProgram, inputs: Mapping[str, Array], begins: Array | None, seed: Sequence[int], *, turns: bool
+) -> Iterator[tuple[Sequence[int], Array, Array, dict[str, Tensor], dict[str, Tensor]]]:
+    """Yield what the teacher was shown: seed, rows (B,), which of them to write, its values, and the noise.
+
+    Args:
+        teacher: Its program.
+        inputs: Name -> (N, ...).
+        begins: (N,) whether an episode begins with a row; None for a teacher that keeps nothing.
+        seed: Of the noise.
+        turns: Whether what a loop carries is among the values.
+    """
+    run = teacher.path if turns else teacher.run
+    if begins is None:
+        count = len(next(iter(inputs.values())))
+        for start in range(0, count, ROWS):
+            rows, key = np.arange(start, min(count, start + ROWS)), (*seed, start)
+            noise = drawn(teacher.noise, len(rows), np.random.default_rng(key))
+            yield key, rows, np.ones(len(rows), np.bool_), run(_at(inputs, rows), noise), noise
+        return
+    for lanes in side_by_side(begins, ROWS):
+        held: dict[str, Tensor] = {}
+        for time, (rows, new, counts) in enumerate(lanes.steps()):
+            key = (*seed, int(lanes.firsts[0]), time)
+            noise = drawn(teacher.noise, len(rows), np.random.default_rng(key))
+            values = run(_at(inputs, rows), {**noise, **reset(held, new)})
+            held = teacher.kept_of(values)
+            yield key, rows, counts, values, noise
+
+
+def _at(inputs: Mapping[str, Array], rows: Array) -> dict[str, Tensor]:
+    return {name: on_device(np.array(values[rows])) for name, values in inputs.items()}
 
 
 def _turns(teacher: BatchedProgram, values: Mapping[str, Tensor], random: np.random.Generator) -> dict[str, Tensor]:

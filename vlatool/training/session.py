@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import kept_rows, recorded_observations
+from vlatool.data import BEGINS, Recording, kept_rows, recorded_observations
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
@@ -23,24 +23,27 @@ from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
-from vlatool.training.batches import Batches, draw_of
+from vlatool.training.batches import Batches, draw_of, mean_loss
 from vlatool.training.control import exchange_labels
 from vlatool.training.crew import Crew
 from vlatool.training.events import Events
 from vlatool.training.expert import Expert, at_most
 from vlatool.training.forecast import Forecast
-from vlatool.training.frames import Frames, joined, spread
+from vlatool.training.frames import joined
 from vlatool.training.held_out import HeldOut
 from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, Trainer
 from vlatool.training.rounds import Counted, label, next_round, scene_of, write_recorded
+from vlatool.training.sequences import episode_begins
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, parameters
 from vlatool.training.teacher import Teacher
-from vlatool.training.unseen import KEY, unseen_losses
+from vlatool.training.unseen import KEY, MOST, unseen_losses
 from vlatool.training.yielded import write_yielded
 
 ROUND = "round-{:03d}.json"
 """File that says who acted in a round, and how well."""
+ALONG = "along"
+"""Of the first round: how far a student that keeps values was from its teacher over whole episodes of it."""
 RECORDED = 100_000
 """Recorded observations at most."""
 
@@ -114,12 +117,13 @@ class Session:
         self._scene = scene_of(source) if plan.episodes or plan.student_episodes else None
         self._plays = self._scene is not None and plan.student_episodes > 0
         self._encode = ObservationEncoder(self._spec, source)
-        self._frames = Frames(place)
-        self._held_out = HeldOut(place) if plan.patience and not self._plays else None
+        self._frames = lesson.frames(place)
+        self._along = lesson.unroll is not None or bool(teacher.program.kept)
+        self._held_out = HeldOut(place, lesson.frames) if plan.patience and not self._plays else None
         with self._crew.calling("prepare", {}):
             self._trainer = Trainer(lesson.trained, settings, place, self._crew.group, lesson.constraint)
         self._batches = Batches(lesson.loss, self._frames, plan.batch, plan.accumulate, self._crew.group)
-        self._expert = Expert(place)
+        self._expert = Expert(place, lesson.frames)
         self._draw = draw_of(self._batches, plan.supervision.alpha, lesson.expert, self._expert.frames)
         self._forecast = Forecast(settings.steps, self._trainer.step)
         self._events = Events(context.events, self._trainer.step)
@@ -130,10 +134,11 @@ class Session:
         if self._trainer.step:
             self._context.tell(f"going on from step {self._trainer.step}", None)
         if self._held_out is not None:
-            self._held_out.prepare(self._source, RECORDED, self._write_held_out, self._yield_held_out)
+            self._held_out.prepare(self._recorded(), self._write_held_out, self._yield_held_out)
         self._show()
         if self._plan.supervision.alpha:
             next_round(self._frames, 0, self._first)
+            self._compare("before")
         pauses = self._plan.pauses if self._plays or self._held_out is not None else ()
         for number, end in enumerate([*pauses, self._settings.steps]):
             if number and self._paused(number):
@@ -144,16 +149,16 @@ class Session:
                 self._paused(len(pauses) + 1)
         with self._all("finish"):
             self._trainer.finish()
+        self._compare("after")
         self._events.close()
         return self._about()
 
     def observations(self, most: int) -> dict[str, Any]:
         """Return rows of the inputs, spread over all rounds, fewer where they are large: name -> (N, ...)."""
         names = [tensor.name for tensor in self._spec.inputs]
-        first = self._frames.batch(np.zeros(1, int))
-        count = kept_rows(most, sum(first[name].nbytes for name in names))
-        held = self._frames.batch(spread(len(self._frames), count))
-        return {name: held[name] for name in names}
+        first = self._frames.rows(np.zeros(1, int))
+        held = self._frames.kept(kept_rows(most, sum(first[name].nbytes for name in names)))
+        return {name: held[name] for name in (*names, BEGINS) if name in held}
 
     def _show(self) -> None:
         """Write what the expert did, to learn from and to judge with, where the expert is asked."""
@@ -161,10 +166,26 @@ class Session:
             return
         chosen = self._plan.supervision.label_share, self._settings.seed
         if self._held_out is None:
-            self._expert.prepare(at_most(self._source, RECORDED), self._source, *chosen, self._encode)
+            self._expert.prepare(self._recorded(), self._source, *chosen, self._encode)
             return
         self._expert.prepare(self._held_out.others, self._source, *chosen, self._encode)
         self._held_out.expert.prepare(self._held_out.recording, self._source, *chosen, self._encode)
+
+    def _recorded(self) -> Recording | None:
+        """Return what is recorded, whole episodes where student or teacher keep values."""
+        return at_most(self._source, RECORDED, whole=self._along)
+
+    def _compare(self, when: str) -> None:
+        """Note how far a student that keeps values is from its teacher over whole episodes, and not in windows."""
+        if self._lesson.unroll is None or not self._frames.count:
+            return
+        about = self._round(0)
+        if when == "after" or not self._trainer.step:
+            places = self._frames.sample((0,), MOST)
+            how = self._lesson.examined, self._plan.batch, self._settings.device
+            about[ALONG] = {**about.get(ALONG, {}), "episodes": len(places), "observations": self._frames.weigh(places),
+                            when: mean_loss(self._frames, places, *how)}  # fmt: skip
+            self._keep(0, about)
 
     def _train(self, end: int) -> None:
         with self._crew.training(self._frames.count, len(self._frames), end):
@@ -232,6 +253,7 @@ class Session:
             "rounds": [self._round(number) for number in range(self._frames.count)] or [self._expert.round()],
             "parameters": {"student": parameters(self._lesson.modules), "teacher": parameters(teacher)},
             "teacher": supervision.about(self._trainer.looks, self._expert.counts),
+            **({"along": self._round(0)[ALONG]} if self._lesson.unroll and self._frames.count else {}),
             **({"judged": {"by": judged, "scores": scores, "best_step": best.step}} if scores else {}),
         }
 
@@ -251,8 +273,13 @@ class Session:
         self._events.add(about["step"], {"success": share})
 
     def _write_held_out(self, observations: Counted, target: Path) -> None:
-        write_recorded(self._encode, observations, target)
+        self._write(observations, target)
         self._label(target, 0, 1)
+
+    def _write(self, observations: Counted, target: Path) -> None:
+        """Write recorded observations, and where their episodes begin where that matters."""
+        begins = episode_begins(observations) if self._along and isinstance(observations, Recording) else None
+        write_recorded(self._encode, observations, target, begins)
 
     def _yield_held_out(self, target: Path) -> bool:
         """Write rows to judge with that the policy's function yields; say whether it does."""
@@ -262,13 +289,13 @@ class Session:
         return bool(self._plan.yielded)
 
     def _yield(self, count: int, seed: int, target: Path) -> None:
-        write_yielded(self._source, count, seed, target, self._context)
+        write_yielded(self._source, count, seed, target, self._context, along=self._along)
 
     def _first(self, target: Path) -> None:
         """Write the first round: recordings, batches of the policy's own, and the teacher's episodes."""
-        recorded = recorded_observations(self._source, RECORDED)
+        recorded = (self._recorded() or []) if self._along else recorded_observations(self._source, RECORDED)
         chosen = self._held_out.others if self._held_out is not None else recorded
-        write_recorded(self._encode, chosen, target / "recorded")
+        self._write(chosen, target / "recorded")
         if self._plan.yielded:
             self._yield(self._plan.yielded, self._settings.seed, target / "yielded")
         self._play(target, 0)

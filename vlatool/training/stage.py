@@ -28,7 +28,7 @@ from vlatool.training.device import Asked, Device, device_of
 from vlatool.training.events import check_events
 from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Settings, seconds_of
-from vlatool.training.report import write_training_report
+from vlatool.training.report import along_lines, write_training_report
 from vlatool.training.rounds import scene_of
 from vlatool.training.session import Plan, Session
 from vlatool.training.supervision import TEACHER_ALONE, Supervision, teacher_lines
@@ -79,6 +79,14 @@ class TrainingStage(ModuleStage):
         "are played first, else none",
     )  # fmt: skip
     first_seed: int = Field(FIRST_SEED, ge=0, description="seed of the first episode to train on")
+    window: int = Field(
+        16, ge=1, le=4096, description="consecutive observations that gradients pass through, where the policy keeps "
+        "values from step to step; a batch is so many windows as make its observations",
+    )  # fmt: skip
+    burn_in: int | None = Field(
+        None, ge=0, description="observations before each window that bring these values up to date, without "
+        "gradients; all since the episode began unless given",
+    )  # fmt: skip
     seed: int = Field(0, ge=0, description="of batches and noise")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="of matrix products in training; bfloat16 where the device has it"
@@ -121,6 +129,7 @@ class TrainingStage(ModuleStage):
                     f"{self.name()} learns from batches, and the input '{tensor.name}' has no axes.",
                     "write its shape as [1] in policy.yaml, and take it so in forward()",
                 )
+        self._check_kept_values(source)
         if self.device == "cuda":
             self._device()
         if self.teacher:
@@ -146,6 +155,30 @@ class TrainingStage(ModuleStage):
                 f"{source.manifest.name} is as its factory makes it: without --teacher it would be its own teacher.",
                 "let a part of it be the student (vlatool distill policy --student depth=0.5,width=0.75), prune it "
                 "first (vlatool prune structured), or name a --teacher",
+            )
+
+    def _check_kept_values(self, source: Bundle | None) -> None:
+        """Refuse windows where nothing is kept, and what windows are not made for."""
+        if source is None:
+            return
+        kept = [name for step in source.manifest.program for name in step.keep]
+        asked = [f"--{name.replace('_', '-')}" for name in ("window", "burn_in") if name in self.options()]
+        if asked and not kept:
+            raise RecipeError(
+                f"{asked[0]} is of policies that keep values from step to step; {source.manifest.name} keeps none.",
+                f"leave {asked[0]} out",
+            )
+        if kept and self.processes > 1:
+            raise RecipeError(
+                f"{source.manifest.name} keeps '{kept[0]}' from step to step: it is trained on windows of episodes, "
+                "which several processes do not share.",
+                "leave --processes out; --accumulate takes less memory",
+            )
+        if kept and self.batch < self.window * self.accumulate:
+            raise RecipeError(
+                f"A batch of {self.batch} observations holds {self.batch // self.window} windows of {self.window}; "
+                f"wanted {self.accumulate}, one for each part, at least.",
+                f"take --batch {self.window * self.accumulate} or more, or a shorter --window",
             )
 
     def _check_shard(self, source: Bundle | None, parts: int) -> None:
@@ -196,6 +229,7 @@ class TrainingStage(ModuleStage):
             for round_ in training["rounds"] if round_.get("episodes")
         )  # fmt: skip
         return (
+            *along_lines(training),
             f"{training['loss']} {first:.4g} -> {end:.4g} in {len(losses)} steps on {seen} observations",
             *([f"episodes that succeeded, with noise: {played}"] if played else []),
             *unseen_lines(training["rounds"]),

@@ -6,7 +6,7 @@ from typing import Any
 
 from vlatool.training.batches import Loss, mean_loss
 from vlatool.training.device import Device
-from vlatool.training.frames import Frames, spread
+from vlatool.training.frames import Frames
 
 MOST = 1024
 """Rows of a round that are looked at."""
@@ -28,8 +28,8 @@ def unseen_losses(frames: Frames, number: int, loss: Loss, rows: int, device: De
         device: As in training.
     """
     played = {NEW: number} | ({BEFORE: number - 1} if number > 1 else {})
-    places = {name: frames.places(round_) for name, round_ in played.items()}
-    return {name: mean_loss(frames, each[spread(len(each), MOST)], loss, rows, device) for name, each in places.items()}
+    places = {name: frames.sample((round_,), MOST) for name, round_ in played.items()}
+    return {name: mean_loss(frames, each, loss, rows, device) for name, each in places.items()}
 
 
 def unseen_lines(rounds: list[dict[str, Any]]) -> tuple[str, ...]:

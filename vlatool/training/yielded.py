@@ -18,6 +18,7 @@ from vlatool.module.factory import yielded
 from vlatool.module.origin import origin_of
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
+from vlatool.training.frames import begins_file
 from vlatool.training.rounds import write_recorded
 from vlatool.user_code.children import call
 
@@ -25,6 +26,8 @@ HERE = "vlatool.training.yielded"
 PRELOAD = ("numpy", HERE)
 ROWS = 8192
 """That are taken where nobody says how many."""
+EPISODE = "episode"
+"""Of a batch whose rows are steps: the number of the episode of each; where it changes, the policy is reset."""
 BATCH = 256
 """Rows of a batch that the function is asked for, at most."""
 GUIDE = "docs/guides/your-own-policy.md shows one"
@@ -52,7 +55,9 @@ def rows_asked(asked: int | None, source: Bundle, plays: bool) -> int:
     return (ROWS if named and not plays else 0) if asked is None else asked
 
 
-def write_yielded(source: Bundle, count: int, seed: int, target: Path, context: Context) -> None:
+def write_yielded(
+    source: Bundle, count: int, seed: int, target: Path, context: Context, *, along: bool = False
+) -> None:
     """Write encoded observations that the policy's function yields, as a part of a round.
 
     Args:
@@ -61,12 +66,14 @@ def write_yielded(source: Bundle, count: int, seed: int, target: Path, context: 
         seed: That the function is called with.
         target: Folder for ``NAME.npy`` of each input, (count, ...).
         context: For progress.
+        along: Whether rows are episodes, which the batches number under ``episode``.
 
     Raises:
         DataError: when it yields something else than batches of observations, or too few.
         SourceError: when it fails, ends its process, or may not run.
     """
-    job = {"source": str(source.path.absolute()), "count": count, "seed": seed, "target": str(target.absolute())}
+    place = {"source": str(source.path.absolute()), "target": str(target.absolute())}
+    job = {**place, "count": count, "seed": seed, "along": along}
     call(f"{HERE}:write", job, context.tell, origin_of(source).training.rpartition(":")[0], PRELOAD)
 
 
@@ -77,8 +84,11 @@ def write(job: Mapping[str, Any], tell: Tell) -> None:
     origin.check((".py",))
     size = min(BATCH, job["count"])
     batches = yielded(origin.training, origin.folder, {"seed": job["seed"], "size": size})
-    rows = _Rows(batches, origin.training, ObservationEncoder(source.manifest.spec, source), job["count"], size, tell)
+    encode = ObservationEncoder(source.manifest.spec, source)
+    rows = _Rows(batches, origin.training, encode, job["count"], size, tell, along=job["along"])
     write_recorded(rows.encode, rows, Path(job["target"]))
+    if job["along"]:
+        np.save(begins_file(Path(job["target"])), np.diff(rows.episodes, prepend=rows.episodes[0] - 1) != 0)
 
 
 class _Rows:
@@ -91,14 +101,25 @@ class _Rows:
         count: Rows in all.
         size: Rows of a batch, at most.
         tell: For progress.
+        along: Whether batches also hold the number of the episode of each row.
     """
 
     def __init__(
-        self, batches: Iterator[Any], function: str, encode: ObservationEncoder, count: int, size: int, tell: Tell
+        self,
+        batches: Iterator[Any],
+        function: str,
+        encode: ObservationEncoder,
+        count: int,
+        size: int,
+        tell: Tell,
+        *,
+        along: bool,
     ) -> None:
         self._batches, self._function, self._encode = batches, function, encode
         self._count, self._size, self._tell = count, size, tell
         self._row = ""
+        self._names = [*encode.names, *([EPISODE] if along else [])]
+        self.episodes: list[int] = []
 
     def __len__(self) -> int:
         return self._count
@@ -108,6 +129,7 @@ class _Rows:
         for number, batch in enumerate(self._batches, 1):
             columns = self._columns(f"{number} of '{self._function}'", batch)
             for row in range(min(len(next(iter(columns.values()))), self._count - done)):
+                self.episodes += [int(columns[EPISODE][row])] if EPISODE in self._names else []
                 self._row = f"Row {row} of batch {number} of '{self._function}'"
                 yield {name: column[row] for name, column in columns.items()}
                 done += 1
@@ -135,14 +157,23 @@ class _Rows:
     def _columns(self, place: str, batch: Any) -> dict[str, Any]:
         """Return the inputs of a batch, each with a row for each observation."""
         takes = f"the policy takes {', '.join(self._encode.names)}."
+        if EPISODE in self._names and isinstance(batch, Mapping) and EPISODE not in batch:
+            raise DataError(
+                f"Batch {place} has no '{EPISODE}', and the policy keeps values from step to step: rows are steps of "
+                "episodes.",
+                f"yield the rows of an episode one after the other, each with the number of its episode: '{EPISODE}'",
+            )
         if not isinstance(batch, Mapping):
             raise DataError(
                 f"Batch {place} is a {type(batch).__name__}; it must be a mapping of names to arrays: {takes}", GUIDE
             )
-        if missing := [name for name in self._encode.names if name not in batch]:
+        if missing := [name for name in self._names if name not in batch]:
             has = ", ".join(map(str, batch)) or "nothing"
             raise DataError(f"Batch {place} has no '{missing[0]}' (it has: {has}); {takes}", GUIDE)
-        columns = {name: _array(f"'{name}' in batch {place}", batch[name]) for name in self._encode.names}
+        columns = {name: _array(f"'{name}' in batch {place}", batch[name]) for name in self._names}
+        if EPISODE in columns and (columns[EPISODE].ndim != 1 or columns[EPISODE].dtype.kind not in "iu"):
+            got = f"{columns[EPISODE].dtype} {list(columns[EPISODE].shape)}"
+            raise DataError(f"'{EPISODE}' in batch {place} is {got}; wanted a whole number for each row.", GUIDE)
         rows = {name: len(column) for name, column in columns.items()}
         if len(set(rows.values())) > 1:
             told = ", ".join(f"{name} {count}" for name, count in rows.items())
