@@ -15,6 +15,7 @@ from vlatool.module.edits import BLOCKS, read_edits
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Pruning, StageList
 from vlatool.stage.base import Context
+from vlatool.stage.controls import PRUNED
 from vlatool.stage.run import cached_transform
 
 WIDTHS = 6
@@ -143,7 +144,13 @@ def space_of(
     widths = tuple(round(1 - step * number, 4) for number in range(WIDTHS))
     half = min(widths, key=lambda width: abs(width - HALF))
     narrow = [width for width in reversed(widths) if half <= width < 1]
-    works = next((width for width in narrow if tried("prune.structured", ratio=round(1 - width, 4))), 1.0)
+
+    def reached(width: float) -> bool:
+        """Say whether so much can go; a result that falls a little short would be the same at all smaller widths."""
+        made = tried("prune.structured", ratio=(ratio := round(1 - width, 4)))
+        return made is not None and made.manifest.made_by[PRUNED]["reached"] >= ratio
+
+    works = next((width for width in narrow if reached(width)), 1.0)
     widths = widths if works == half else tuple(width for width in widths if width >= works)
     ends = tried("prune.depth", blocks=2, rank="even") or tried("prune.depth", blocks=1, rank="even")
     steps = max(step.repeat for step in source.manifest.program)
