@@ -307,7 +307,8 @@ def test_a_graph_whose_axes_are_free_is_calibrated(tmp_path: Path) -> None:
     model.graph.initializer.append(numpy_helper.from_array(np.array([1]), "one"))
     onnx.save(model, tmp_path / "cloud.onnx")
     np.savez(tmp_path / "mine.npz", cloud=random.standard_normal((64, 9, 3)).astype(np.float32))
-    source = run_transform(OnnxFile(model=tmp_path / "cloud.onnx"), None, tmp_path / "float", Context())
+    file = OnnxFile(model=tmp_path / "cloud.onnx", shape=("cloud=1,points,3",))
+    source = run_transform(file, None, tmp_path / "float", Context())
     for layout in ("ort", "qdq", "openvino"):
         stage = StaticInt8(calibration=tmp_path / "mine.npz", layout=layout)
         made = run_transform(stage, source, tmp_path / layout, Context())

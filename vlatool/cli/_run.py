@@ -140,7 +140,7 @@ def transform(
         typer.echo(f"  {line}")
     for name, shares in precision.items():
         if not shares:
-            typer.echo(f"  {name}: no matrix product or convolution")
+            typer.echo(f"  {name}: no matrix product or convolution is counted")
             continue
         typer.echo(f"  {name}: " + ", ".join(f"{share:.1%} {kind}" for kind, share in shares.items()) + " of the MACs")
     for line in (*_moved(result), *(on_board.lines() if on_board else ())):
