@@ -4,15 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime as ort
 import pytest
 from _foreign_onnx import KINDS, write
+from onnx import helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.runtime import load
+from vlatool.sources._onnx_plain import plain
 from vlatool.sources.onnx import OnnxFile
 from vlatool.stage.base import Context
 
@@ -98,3 +101,16 @@ def test_a_scalar_and_narrow_integers_are_inputs_like_others(tmp_path: Path) -> 
     assert np.shape(whole.outputs["value"]) == ()
     narrow, _, _ = made("narrow_inputs", tmp_path / "b")
     assert [tensor.dtype for tensor in narrow.manifest.spec.inputs] == ["int8", "uint16"]
+
+
+@pytest.mark.parametrize(("width", "stored"), [(8, ["w", "wt"]), (1024, ["w"])])
+def test_a_weight_that_is_moved_is_stored_once_and_a_large_one_that_is_tied_stays_one(width, stored):
+    weight = numpy_helper.from_array(np.ones((width, 512), np.float32), "w")
+    moved = helper.make_node("Transpose", ["w"], ["wt"], perm=[1, 0])
+    product = helper.make_node("MatMul", ["x", "wt"], ["y"])
+    tied = helper.make_node("MatMul", ["y", "w"], ["z"])
+    given = helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 512])
+    for nodes, names in (([moved, product], ["wt"]), ([moved, product, tied], stored)):
+        end = helper.make_tensor_value_info(nodes[-1].output[0], onnx.TensorProto.FLOAT, None)
+        model = plain(helper.make_model(helper.make_graph(nodes, "g", [given], [end], [weight])))
+        assert [tensor.name for tensor in model.graph.initializer] == names

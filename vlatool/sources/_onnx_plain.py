@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from typing import Any
 
 from vlatool.errors import require
-from vlatool.graph.nodes import name_nodes
+from vlatool.graph.nodes import name_nodes, read_names, reads
 
 MOVERS = ("Identity", "Cast", "Transpose", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Split")
 """Operators through which exporters let a weight go on its way to a layer."""
+TIED = 1 << 20
+"""Bytes of a weight above which it stays one where it is read in two ways, as a tied embedding is."""
 LATER_IR = 4
 """Version of the file format from which initializers need not be inputs."""
 
@@ -33,9 +36,11 @@ def plain(model: Any) -> Any:
         graph.input.extend(inputs)
     model.ir_version = max(model.ir_version, LATER_IR)
     given = {value.name for value in graph.output}
+    readers = Counter(name for node in graph.node for name in set(reads(node)))
     nodes = []
     for node in graph.node:
-        made = {} if given.intersection(node.output) else _made(model, node, stored)
+        tied = any(readers[name] > 1 and stored[name].ByteSize() > TIED for name in node.input if name in stored)
+        made = {} if tied or given.intersection(node.output) else _made(model, node, stored)
         for name, tensor in made.items():
             graph.initializer.append(tensor)
             stored[name] = graph.initializer[-1]
@@ -44,8 +49,17 @@ def plain(model: Any) -> Any:
     nodes = copy.deepcopy(nodes)
     del graph.node[:]
     graph.node.extend(nodes)
+    _drop_unread(graph)
     name_nodes(model)
     return model
+
+
+def _drop_unread(graph: Any) -> None:
+    """Remove the weights that no node reads and that are no output: what was moved would be stored twice."""
+    read = read_names(graph.node) | {value.name for value in graph.output}
+    for place in reversed(range(len(graph.initializer))):
+        if graph.initializer[place].name not in read:
+            del graph.initializer[place]
 
 
 def _made(model: Any, node: Any, stored: dict[str, Any]) -> dict[str, Any]:

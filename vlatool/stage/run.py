@@ -60,8 +60,10 @@ def run_transform(
     stage.check(source, None)
     with writing(out, force=force, damaged=damaged) as draft:
         stage.accept(run_apart(stage, source, draft, context) if apart else stage.run(source, draft, context))
-        if reports is not None and reports.is_dir() and not (draft / REPORTS).exists():
-            shutil.copytree(reports, draft / REPORTS)
+        for report in reports.iterdir() if reports is not None and reports.is_dir() else ():
+            (draft / REPORTS).mkdir(exist_ok=True)
+            if report.is_file() and not (draft / REPORTS / report.name).exists():
+                shutil.copy2(report, draft / REPORTS)
     made = Bundle.open(out, verify=False)
     if apart:
         tried.note(made)
