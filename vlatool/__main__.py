@@ -1,6 +1,10 @@
 """``python -m vlatool``."""
 
+import os
 import sys
+
+if sys.path[:1] in ([""], [os.getcwd()]):
+    del sys.path[0]  # "python -m" puts the current directory there: a *.dist-info in it would be a plug-in
 
 from vlatool.errors import DISTRIBUTION, MissingExtra
 

@@ -260,3 +260,17 @@ def test_an_error_keeps_its_code_with_stderr_closed(tmp_path: Path, folder) -> N
     for redirect in small_or_full(["2>&-"], ["2>&-", "2>/dev/full"]):
         shell = f'"{sys.executable}" -m vlatool export "{mine}" -o "{tmp_path / "out"}" {redirect}'
         assert subprocess.run(["sh", "-c", shell], check=False).returncode == 3
+
+
+@pytest.mark.parametrize("module", ["vlatool", "vlatool.cli"])
+def test_a_distribution_in_the_current_directory_adds_nothing(tmp_path, module):
+    """``python -m`` puts the current directory on the search path, and names of methods are looked up along it."""
+    info = tmp_path / "acme-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[vlatool.quantize]\nacme-int3 = acme:Int3\n")
+    (tmp_path / "acme.py").write_text("raise SystemExit('imported')\n")
+    words = [sys.executable, "-m", module, "quantize", "--help"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "static-int8" in done.stdout, done.stderr
+    assert "acme" not in done.stdout + done.stderr

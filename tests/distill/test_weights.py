@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.distill.weights import Weights
@@ -62,3 +62,36 @@ def test_what_does_not_fit_is_named(source_bundle: Bundle, tuned: Path, tmp_path
         run_transform(Weights(file=tuned), source_bundle, tmp_path / "c", Context())
     with pytest.raises(SourceError, match="No such file"):
         run_transform(Weights(file=tmp_path / "none"), source_bundle, tmp_path / "d", Context())
+
+
+STRAYS = {
+    "unknown": (
+        lambda state, name: {"more.weight": torch.zeros(2)},
+        "1 tensors that the policy has not: 'more",
+        "else",
+    ),
+    "adapters": (lambda state, name: {f"{name}.lora_A.weight": torch.zeros(2)}, "holds adapters", "merge the adapters"),
+    "twice": (lambda state, name: {f"main.{name}": state[name] + 1}, "twice, also as 'main.", "keep one of them"),
+    "codes": (lambda state, name: {name: state[name].to(torch.int8)}, "is int8 in .* is float32", "dequantize"),
+    "complex": (
+        lambda state, name: {name: state[name].to(torch.complex64)},
+        "is complex64 in .* is float32",
+        "dequant",
+    ),
+}
+"""What is in a file beside the weights, or in their place, and what is said of it."""
+
+
+@pytest.mark.parametrize("kind", STRAYS)
+def test_tensors_that_nobody_asked_for_are_refused(source_bundle: Bundle, tuned: Path, tmp_path: Path, kind: str):
+    (change, message, fix), state = STRAYS[kind], load_file(tuned)
+    save_file({**state, **change(state, next(iter(state)))}, str(tuned))
+    with pytest.raises(SourceError, match=message) as caught:
+        run_transform(Weights(file=tuned), source_bundle, tmp_path / "made", Context())
+    assert fix in caught.value.fix
+
+
+def test_weights_in_half_precision_are_weights(source_bundle: Bundle, tuned: Path, tmp_path: Path):
+    state = load_file(tuned)
+    save_file({name: value.half() if value.is_floating_point() else value for name, value in state.items()}, str(tuned))
+    run_transform(Weights(file=tuned), source_bundle, tmp_path / "made", Context())

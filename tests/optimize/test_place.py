@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
+import optuna
 import pytest
 
 from vlatool.errors import DataError, UsageError
-from vlatool.optimize.place import check_place, storage_of
+from vlatool.optimize.place import FileLock, check_place, storage_of
 
 RECORD = json.dumps({"op_code": 0, "worker_id": "x", "study_name": "s", "directions": [1]}) + "\n"
 
@@ -82,3 +87,44 @@ def test_new_and_empty_files_are_places(tmp_path: Path, name: str):
     check_place(str(tmp_path / name))
     check_place(f"sqlite:///{tmp_path / 'trials.db'}")
     assert [path.name for path in tmp_path.iterdir()] == ["empty.journal"]
+
+
+def test_a_lock_that_a_killed_process_left_is_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """By a relative path, as well: Optuna's own lock is a link, and one to a relative path waits for ever."""
+    monkeypatch.chdir(tmp_path)
+    Path("sub").mkdir()
+    Path("sub/t.journal.lock").symlink_to("sub/t.journal")
+    code = "import os, sys; from vlatool.optimize.place import FileLock; from pathlib import Path; "
+    code += "FileLock(Path('sub/t.journal')).acquire(); os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    study = optuna.create_study(storage=storage_of("sub/t.journal"), study_name="one")
+    study.add_trial(optuna.trial.create_trial(value=1.0))
+    assert len(optuna.load_study(storage=storage_of("sub/t.journal"), study_name="one").trials) == 1
+
+
+def test_a_lock_that_is_held_is_named_after_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("VLATOOL_LIMITS", "study_seconds=1")
+    held = FileLock(tmp_path / "t.journal")
+    held.acquire()
+    with pytest.raises(UsageError, match=r"has held the lock .*t\.journal\.locked for 1 s") as caught:
+        FileLock(tmp_path / "t.journal").acquire()
+    assert "study_seconds" in caught.value.fix
+    held.release()
+    other = FileLock(tmp_path / "t.journal")
+    assert other.acquire()
+    other.release()
+
+
+def test_a_database_of_others_is_left_alone(tmp_path: Path):
+    with contextlib.closing(sqlite3.connect(tmp_path / "notes.db")) as database:
+        database.execute("CREATE TABLE notes (text)")
+        database.commit()
+    with pytest.raises(DataError, match="is not a study: it is a database with the tables notes"):
+        check_place(f"sqlite:///{tmp_path / 'notes.db'}")
+    (tmp_path / "text.db").write_text("nothing of the kind" * 100)
+    with pytest.raises(DataError, match="is no database of trials"):
+        check_place(f"sqlite:///{tmp_path / 'text.db'}")
+    url = f"sqlite:///{tmp_path / 'trials.db'}"
+    for _ in range(2):
+        check_place(url)
+        optuna.create_study(storage=storage_of(url), study_name="one", load_if_exists=True)

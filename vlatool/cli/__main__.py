@@ -1,5 +1,10 @@
 """``python -m vlatool.cli``."""
 
+import os
+import sys
+
 from vlatool.cli import main
 
+if sys.path[:1] in ([""], [os.getcwd()]):
+    del sys.path[0]  # see vlatool/__main__.py
 main()

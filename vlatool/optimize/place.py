@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
+import os
+import sqlite3
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from vlatool.errors import DataError, UsageError, VlatoolError, require
+from vlatool.files.limits import VARIABLE, limit
 from vlatool.files.printable import secrets_in, without_password
 
 EXAMPLES = "name a file, such as trials.journal, or a database, such as sqlite:///trials.db"
 DRIVERS = {"psycopg": "psycopg[binary]", "psycopg2": "psycopg2-binary", "MySQLdb": "mysqlclient"}
 """Module -> the distribution that has it, where that is called otherwise."""
+TABLES = {"studies", "trials", "trial_params", "version_info"}
+"""Some of those that Optuna makes."""
 
 
 def check_place(url: str) -> None:
@@ -57,6 +64,25 @@ def _check_database(url: str) -> None:
         if made.database in (None, "", ":memory:"):
             raise UsageError(f"The study {shown} would be in memory, and lost.", EXAMPLES)
         _check_file(Path(made.database), shown)
+        _check_tables(Path(made.database), shown)
+
+
+def _check_tables(path: Path, shown: str) -> None:
+    """Refuse a database that is somebody else's: Optuna would write its tables among the others.
+
+    Raises:
+        DataError: when it holds tables, and those of a study are not among them; or it is no database.
+    """
+    if not path.is_file() or not path.stat().st_size:
+        return
+    try:
+        with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    except sqlite3.Error as error:
+        raise DataError(f"{shown} is no database of trials: {error}.", EXAMPLES) from error
+    if tables and not tables >= TABLES:
+        others = ", ".join(sorted(tables - TABLES)[:3])
+        raise DataError(f"{shown} is not a study: it is a database with the tables {others}.", "name a new file")
 
 
 def _check_file(path: Path, shown: str) -> None:
@@ -112,7 +138,7 @@ def storage_of(url: str) -> Any:
     if "://" in url:
         return url
     journal = require("optuna", "search").storages.journal
-    lock = journal.JournalFileSymlinkLock(url)
+    lock = FileLock(Path(url))
     path = Path(url)
     if path.is_file() and path.stat().st_size:
         lock.acquire()
@@ -124,6 +150,55 @@ def storage_of(url: str) -> Any:
         finally:
             lock.release()
     return require("optuna", "search").storages.JournalStorage(journal.JournalFileBackend(url, lock))
+
+
+class FileLock:
+    """Keeps others from a file while a record is written; a process that ends, however, gives it up.
+
+    ``flock`` on a file beside it, which also holds between machines that share an NFS. Optuna's own lock is a link that
+    a killed process leaves.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.with_name(f"{path.name}.locked")
+        self._handle = -1
+
+    def acquire(self) -> bool:
+        """Wait for the lock.
+
+        Raises:
+            UsageError: when another process has it for longer than the limit ``study_seconds``, or it cannot be made.
+        """
+        try:
+            handle = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise UsageError(f"The study cannot be locked: {self._path}: {error.strerror}.", EXAMPLES) from error
+        end = time.monotonic() + limit("study_seconds")
+        while not _locked(handle):
+            if time.monotonic() > end:
+                os.close(handle)
+                raise UsageError(
+                    f"Another process has held the lock {self._path} for {limit('study_seconds')} s.",
+                    f"see which: fuser {self._path}; to wait longer: {VARIABLE}=study_seconds=600",
+                )
+            time.sleep(0.01)
+        self._handle = handle
+        return True
+
+    def release(self) -> None:
+        """Give it up."""
+        os.close(self._handle)
+
+
+def _locked(handle: int) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 @contextlib.contextmanager
