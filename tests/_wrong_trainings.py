@@ -188,7 +188,7 @@ ROWS = [
     option("depth=0: what stays is a share above 0, at most 1", "--student", "depth=0"),
     option("takes nothing away", "--student", "depth=1,width=1"),
     option("has no stack of blocks", "--student", "depth=0.5"),
-    option("multiply-accumulates can go", "--student", "width=0.01"),
+    option("multiply-accumulates can go", "--student", "width=0.01", code=5),
     option("alpha = 1.5", "--alpha", 1.5),
     option("alpha = nan", "--alpha", "nan"),
     option("label_share = 0", "--label-share", 0),

@@ -25,6 +25,7 @@ EXIT_CODES = {
     "MissingExtra": 4,
     "GateFailed": 1,
     "Inconclusive": 5,
+    "FallsShort": 5,
 }
 CLASSES = [value for value in vars(errors).values() if isinstance(value, type) and issubclass(value, VlatoolError)]
 

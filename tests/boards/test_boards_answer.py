@@ -26,7 +26,7 @@ from vlatool.boards.answer import (
 from vlatool.boards.simulate import Change
 from vlatool.boards.torch_workload import torch_workload
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import BundleError, DataError, OutputError, UsageError
+from vlatool.errors import BundleError, DataError, OutputError, SourceError, UsageError
 from vlatool.graph.stored import LAYOUT, digest, read_workload
 from vlatool.graph.workload import workload
 from vlatool.hardware.profile import load_profile, names
@@ -270,9 +270,9 @@ def test_a_graph_with_free_axes_is_refused_with_a_remedy_that_works(tmp_path: Pa
     graph = helper.make_graph([helper.make_node("MatMul", ["x", "w"], ["y"])], "g", [taken], [given], [weight])
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=8), model)
     asked = (str(model), "raspberry-pi-5", None, None, "", Context())
-    with pytest.raises(DataError, match="no static shape") as caught:
+    with pytest.raises(SourceError, match="has the free axes rows") as caught:
         simulated(*asked)
-    assert "policy.yaml" in caught.value.fix
+    assert "--shape x=1,rows,4" in caught.value.fix
     (tmp_path / "policy.yaml").write_text(
         "name: free\nspec:\n  inputs: [{name: x, shape: [1, 5, 4]}]\n  outputs: [{name: y, shape: [1, 5, 2]}]\n"
         "  control_hz: 10\n  chunk: 5\n"

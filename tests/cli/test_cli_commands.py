@@ -170,6 +170,7 @@ def test_a_method_may_be_named_with_hyphen_or_underscore_and_prints_json(vlatool
             "precision": {"main": made.manifest.graphs["main"].precision},
             "findings": [],
             "board": None,
+            "pruned": None,
         }
         assert made.manifest.made_by["options"] == {"per_channel": False, **weights_of_this_host()}
 

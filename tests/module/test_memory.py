@@ -9,7 +9,8 @@ from torch import nn
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError
-from vlatool.module.memory import refuse_changed_buffers, refuse_kept_values
+from vlatool.module.changed_buffers import refuse_changed_buffers
+from vlatool.module.memory import refuse_kept_values
 from vlatool.module.to_onnx import exported_by_torch
 
 STEP = ProgramStep("main", {"x": "x"}, {"y": "y"})

@@ -14,9 +14,9 @@ from safetensors.torch import save_file
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.cli import main
-from vlatool.errors import RecipeError, SourceError
+from vlatool.errors import DataError, RecipeError, SourceError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.gate.config import Gate
+from vlatool.gate.config import AccuracyClaim, Gate
 from vlatool.gate.same import check
 from vlatool.module import stage, stored
 from vlatool.module.torch_policy import load_modules, torch_policy
@@ -68,7 +68,9 @@ def test_the_program_has_larger_steps_and_runs(one: Bundle, source: Bundle, fold
     assert relative_error(ours.infer(state).chunk, wanted.infer(state).chunk) < 1e-5
     assert rebuild(exported, Context(), source=str(folder), cache=tmp_path / "cache").identical
     whole = run_transform(ExportOnnx(), source, tmp_path / "whole", Context())
-    check(exported, whole, Gate(accuracy=None))
+    with pytest.raises(DataError, match="runs fewer steps than the baseline, and no claim is made of its accuracy"):
+        check(exported, whole, Gate(accuracy=None))
+    check(exported, whole, Gate(accuracy=AccuracyClaim(data=tmp_path / "any.npz")))
 
 
 @pytest.fixture

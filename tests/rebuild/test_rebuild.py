@@ -246,7 +246,7 @@ def test_the_source_is_found_where_it_was(policy_dir, float_bundle, again, tmp_p
 
 def test_the_command_of_the_report_names_no_source(dynamic_bundle, onnx_policy, again, copied):
     bundle = copied(dynamic_bundle)
-    (bundle.path / "reports").mkdir()
+    (bundle.path / "reports").mkdir(exist_ok=True)
     command = f"vlatool optimize --profile {onnx_policy}/policy.py {onnx_policy}/tiny.onnx -o {bundle.path}"
     report = Report("optimize", "tiny", "pass", command=command)
     (bundle.path / "reports/report.json").write_text(report.to_json())

@@ -1,8 +1,8 @@
 """What a module remembers from call to call, and whether its outputs depend on it: an exported graph remembers nothing.
 
-A buffer that ``forward()`` changes is found in what torch.export traced. Attributes that are no buffers (a counter, a
-list of past observations) leave no trace there: they are found by running the module, and by putting other values into
-those that changed.
+A buffer that ``forward()`` changes is found in what torch.export traced (``changed_buffers``). Attributes that are no
+buffers (a counter, a list of past observations) leave no trace there: they are found by running the module, and by
+putting other values into those that changed.
 """
 
 from __future__ import annotations
@@ -12,15 +12,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import SourceError, VlatoolError, require
+from vlatool.errors import VlatoolError, require
+from vlatool.module.changed_buffers import forgets
+from vlatool.module.torch_policy import TorchSession
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-REMEDY = (
-    "let forward() take it as an input and return it, and declare it with 'keep' in the program of policy.yaml: "
-    "docs/guides/recurrent-policy.md"
-)
 COUNTS = (0, *(2**power for power in range(21)))
 """Values that a counter is given: it may take effect after thousands of steps."""
 FACTORS = (0.0, -1.0, 1e3, -1e3)
@@ -29,32 +27,6 @@ LONGER = 32
 """How many times as long a list is made: it may take effect once it is full."""
 SAME = 1e-5
 """Relative and absolute difference of outputs up to which they are equal."""
-
-
-def refuse_changed_buffers(exported: Any, graph: str) -> None:
-    """Look for buffers that a traced module changes and whose old value an output depends on.
-
-    Args:
-        exported: A ``torch.export.ExportedProgram``.
-        graph: Name of the graph.
-
-    Raises:
-        SourceError: naming the first one.
-    """
-    signature = exported.graph_signature
-    changed = {*signature.buffers_to_mutate.values()}
-    for placeholder, buffer in signature.inputs_to_buffers.items():
-        if buffer in changed and _reached(exported.graph, placeholder) & {*signature.user_outputs}:
-            raise _keeps(graph, f"the buffer '{buffer}'")
-
-
-def _reached(graph: Any, start: str) -> set[str]:
-    """Return the names of the nodes that a node's value flows into."""
-    reached = {start}
-    for node in graph.nodes:
-        if any(source.name in reached for source in node.all_input_nodes):
-            reached.add(node.name)
-    return reached
 
 
 def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Mapping[str, Any]]) -> None:
@@ -80,7 +52,7 @@ def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Map
             for other in (original, *_others(original)):
                 _put(module, owner, name, _copy(other))
                 if not _equal(_try(module, step, feeds[1]), expected):
-                    raise _keeps(step.graph, f"'{f'{owner}.{name}'.lstrip('.')}'")
+                    raise forgets(step.graph, f"'{f'{owner}.{name}'.lstrip('.')}'")
         finally:
             _put(module, owner, name, original)
 
@@ -173,8 +145,6 @@ def _try(module: nn.Module, step: ProgramStep, feeds: Mapping[str, Any]) -> list
 
 
 def _run(module: nn.Module, step: ProgramStep, feeds: Mapping[str, Any]) -> list[Tensor]:
-    from vlatool.module.torch_policy import TorchSession
-
     torch = require("torch", "build")
     outputs = TorchSession(module, step).run(feeds)
     return [torch.from_numpy(outputs[name]).clone() for name in step.gives]
@@ -185,12 +155,4 @@ def _equal(got: list[Tensor] | None, expected: list[Tensor]) -> bool:
     return got is not None and all(
         one.shape == other.shape and torch.allclose(one.double(), other.double(), SAME, SAME, equal_nan=True)
         for one, other in zip(got, expected, strict=True)
-    )
-
-
-def _keeps(graph: str, what: str) -> SourceError:
-    return SourceError(
-        f"The graph '{graph}' would forget: forward() changes {what} from call to call, and its outputs depend on it; "
-        "an exported graph sees it as it is now, for ever.",
-        REMEDY,
     )

@@ -15,9 +15,9 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.graph.draws import refuse_draws
 from vlatool.graph.nodes import FOLDED
+from vlatool.module.changed_buffers import refuse_changed_buffers
 from vlatool.module.factory import exits_caught
 from vlatool.module.failures import export_error
-from vlatool.module.memory import refuse_changed_buffers
 from vlatool.module.norms import divide_by_roots
 from vlatool.module.torchlib import built_once
 

@@ -22,9 +22,8 @@ PROBES = 3
 OBSERVATIONS = 16
 """Observations that such a process answers, beside the golden one."""
 ABOUT = (MANIFEST, DIGEST, LEDGER, LOCATION, CALIBRATION, EVALUATION, PLAYED, "recipe.yaml", "SIGNATURE",
-         "reports/report.html", "reports/report.md", "reports/report.json",
-    "reports/smooth_quant.json",
-    "reports/weights.json")  # fmt: skip
+         "reports/report.html", "reports/report.md", "reports/report.json", "reports/difference.json",
+         "reports/smooth_quant.json", "reports/weights.json")  # fmt: skip
 """Files of a bundle that no robot needs, beside the golden one."""
 
 
