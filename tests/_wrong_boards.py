@@ -7,12 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import onnx
 import pytest
 import yaml
 from _edits import put, take
 from _wrong_inputs import Line, Place, Row
-from onnx import TensorProto, helper
 
 from vlatool.report import Measurement, Report
 from vlatool.report import Row as Variant
@@ -77,31 +75,6 @@ class Workshop(Place):
 
     def calibrate(self, report: Path | str, *more: Any, board: str = "raspberry-pi-5") -> Line:
         return ["profiles", "calibrate", board, "--from", report, *more]
-
-    def shapeless(self) -> Path:
-        """A policy in ONNX with a product whose shape is not static."""
-        folder = self.root / "shapeless"
-        folder.mkdir()
-        nodes = [helper.make_node("NonZero", ["state"], ["places"]),
-                 helper.make_node("Cast", ["places"], ["numbers"], to=TensorProto.FLOAT),
-                 helper.make_node("Transpose", ["numbers"], ["rows"]),
-                 helper.make_node("MatMul", ["rows", "w"], ["hidden"]),
-                 helper.make_node("ReduceMean", ["hidden"], ["mean"], axes=[0], keepdims=1),
-                 helper.make_node("Unsqueeze", ["mean", "first"], ["action"])]  # fmt: skip
-        graph = helper.make_graph(
-            nodes, "g", [helper.make_tensor_value_info("state", TensorProto.FLOAT, [1, 3, 4])],
-            [helper.make_tensor_value_info("action", TensorProto.FLOAT, [1, 1, 2])],
-            [helper.make_tensor("w", TensorProto.FLOAT, [3, 2], [0.5] * 6),
-             helper.make_tensor("first", TensorProto.INT64, [1], [0])],
-        )  # fmt: skip
-        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-        onnx.save(model, folder / "shapeless.onnx")
-        (folder / "policy.yaml").write_text(
-            "schema: 1\nname: shapeless\nversion: 1.0.0\nsource: shapeless.onnx\nspec:\n"
-            "  inputs: [{name: state, shape: [1, 3, 4]}]\n"
-            "  outputs: [{name: action, shape: [1, 1, 2]}]\n  control_hz: 10\n"
-        )
-        return folder / "shapeless.onnx"
 
 
 def latency(ms: float = 9.5, origin: str = "measured") -> Measurement:
@@ -177,10 +150,6 @@ CONSTRAINTS = [
         lambda at: at.choose("--precision", "float8")),
     Row("an old board alone", "No board is certain to run", 1,
         lambda at: ["hwselect", at.float, "--boards", "jetson-nano"]),
-    Row("a policy without static shapes", "has the free axes", 3,
-        lambda at: ["hwselect", at.shapeless(), *ONE]),
-    Row("a policy without static shapes on two boards", "has the free axes", 3,
-        lambda at: ["hwselect", at.shapeless(), *ONE, "--boards", "jetson-orin-nano", "-o", at.root / "report"]),
 ]  # fmt: skip
 PROFILE_FILES = [
     Row("a profile that lacks a field", "bandwidth_gb_s: is missing", 3,
@@ -224,8 +193,6 @@ SIMULATE = [
         lambda at: ["simulate", at.float, "--profile", "raspberry-pi-5-hailo8", "--engine", "hailort"]),
     Row("simulate a policy that is not there", "is neither a bundle nor a policy source", 3,
         lambda at: ["simulate", at.root / "none", "--profile", "raspberry-pi-5"]),
-    Row("simulate a policy without static shapes", "has the free axes", 3,
-        lambda at: ["simulate", at.shapeless(), "--profile", "raspberry-pi-5"]),
 ]  # fmt: skip
 POINTS = [
     Row("no points", "cannot be read: No such file", 3, lambda at: ["hwselect", "score", at.root / "none.csv"]),
