@@ -5,11 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnx.parser
 import pytest
 from _arithmetic import products
 from onnx import numpy_helper
 
-from vlatool.bundle.bundle import Bundle, hash_file, restate
+from vlatool.bundle.bundle import Bundle, hash_file, restate, seal
+from vlatool.bundle.manifest import FileRecord, Graph, Manifest
+from vlatool.bundle.program import ProgramStep
+from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
 from vlatool.errors import GraphError
 from vlatool.runtime import arithmetic, load
@@ -269,3 +273,26 @@ def test_the_golden_file_holds_inputs_and_the_raw_action(float_bundle):
     assert expected.shape == (1, 4, 2)
     with np.load(float_bundle.file(float_bundle.manifest.golden)) as stored:
         assert len(stored["in.image"]) == 2
+
+
+@pytest.mark.parametrize(("sign", "share"), [(1.01, 0.0), (-1.0, 1.0)])
+def test_a_discrete_action_is_another_one_where_another_choice_is_made(tmp_path, sign, share):
+    """The graph gives logits, which hardly ever stay the same to the last bit."""
+    bundles = []
+    for name, factor in (("before", 1.0), ("after", sign)):
+        (tmp_path / name / "graphs").mkdir(parents=True)
+        text = "g (float[1,3] x) => (float[1,3] y) { y = Mul(x, by) }"
+        model = onnx.parser.parse_model(f'<ir_version: 10, opset_import: ["" : 20]> {text}')
+        model.graph.initializer.append(numpy_helper.from_array(np.float32(factor), "by"))
+        onnx.save(model, tmp_path / name / "graphs/main.onnx")
+        spec = PolicySpec(
+            (TensorSpec("x", (1, 3)),), (TensorSpec("y", (1, 3), kind="discrete", labels=("a", "b", "c")),), 10.0
+        )
+        graphs = {"main": Graph("graphs/main.onnx", {"float32": 1.0}, 20)}
+        step, files = ProgramStep("main", {"x": "x"}, {"y": "y"}), {"graphs/main.onnx": FileRecord("", 0)}
+        bundles.append(seal(tmp_path / name, Manifest("three", "1", spec, graphs, (step,), files)))
+    seen = observations_for(bundles[0], 16)
+    made = finish(bundles[0], tmp_path / "after", made_by={"stage": "x"}, graphs=graphs, observations=seen)
+    difference = read_difference(made)
+    assert difference is not None
+    assert (difference.mean, difference.worst, difference.samples) == (share, share, 16)

@@ -193,8 +193,10 @@ class _Held:
 
     def write(self, path: Path, recorded: bool) -> None:
         """Write a ``Difference`` as JSON."""
-        discrete = self._bundle.manifest.spec.action.kind == "discrete"
-        errors = [float(error > 0) if discrete else error for error in self.errors]
+        errors = self.errors
+        if self._bundle.manifest.spec.action.kind == "discrete":  # the output may be logits
+            pairs = zip(self._own, self._before, strict=True)
+            errors = [float(not np.array_equal(one.chunk, other.chunk)) for one, other in pairs]
         worst = _worst(errors)
         mean = float(np.mean(errors)) if math.isfinite(worst) else math.inf
         path.parent.mkdir(exist_ok=True)
