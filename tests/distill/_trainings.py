@@ -61,9 +61,8 @@ def digest(made: Bundle) -> str:
 
 
 def peers() -> list[psutil.Process]:
-    """The other processes of the training that have not ended: children of the servers that this process started."""
+    """The other processes of the training: children of the servers that this process started."""
     servers = [
         child for child in psutil.Process().children() if "vlatool.user_code._child" in " ".join(child.cmdline())
     ]
-    found = [peer for server in servers for peer in server.children()]
-    return [peer for peer in found if peer.is_running() and peer.status() != psutil.STATUS_ZOMBIE]
+    return [peer for server in servers for peer in server.children()]

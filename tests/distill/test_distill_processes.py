@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from _trainings import digest, distilled, killed_after, peers, training_of
 from safetensors.numpy import load_file
@@ -46,7 +47,7 @@ def test_two_processes_train_as_one_does(pruned_once: Bundle, tmp_path: Path, ca
     assert training_of(two)["processes"] == 2
     assert "processes" not in training_of(one)
     assert two.manifest.made_by["options"]["processes"] == 2
-    assert not peers()
+    assert not psutil.wait_procs(peers(), timeout=10)[1], "none is left, and none waits to be reaped"
 
 
 def test_a_process_that_is_killed_is_told_and_the_next_run_goes_on(
@@ -83,4 +84,4 @@ def test_what_one_process_meets_ends_the_others(policy_dir: Path, tmp_path: Path
     pruned = run_transform(Neurons(ratio=0.7), source, tmp_path / "pruned", Context())
     with pytest.raises(SourceError, match="ValueError: not with me"):
         distilled(pruned, tmp_path / "out", processes=2)
-    assert not peers()
+    assert not psutil.wait_procs(peers(), timeout=10)[1], "none is left, and none waits to be reaped"

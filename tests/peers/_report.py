@@ -26,9 +26,6 @@ TARGET = 3.0
 """Speed-up that is wanted where int8 has instructions of its own."""
 TARGETS_OF_ORT = {"vit-s": 2.6, "resnet18": 2.8, "vla-45m": 2.44, "vit-b": 3.11, "action-expert": 3.47}
 """The same where ONNX Runtime alone runs the graph, without matrix units (AMX)."""
-AVX_VNNI = "AVX2_VNNI"
-"""Set on which OpenVINO's large int8 product is 2.5 times as fast as its float32, and ONNX Runtime's 3.5 times: what
-ONNX Runtime alone is asked for is asked for there."""
 SATURATING_TARGETS = {"vit-s": 1.65, "resnet18": 2.2, "vla-45m": 1.55, "vit-b": 1.65, "action-expert": 1.65}
 SATURATING_TARGETS_OF_ORT = {**SATURATING_TARGETS, "resnet18": 1.8}
 """Both on sets without VNNI, whose int8 arithmetic is at most 2.06 times as fast as float32."""
@@ -213,8 +210,6 @@ class Table:
         if not inside:
             return Check(False, f"(b) none of ours has an error of at most {BUDGET}")
         target = SATURATING_TARGETS.get(self.workload, 0.0) if self.saturates else TARGET
-        if self.set == AVX_VNNI:
-            target = min(TARGET, TARGETS_OF_ORT.get(self.workload, TARGET))
         reached = self.speedup(inside[0])[0] >= target
         return Check(reached, f"(b) our fastest at error <= {BUDGET}: {self.told(inside[0])}; wanted {target:g}x")
 

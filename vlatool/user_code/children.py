@@ -17,7 +17,7 @@ import socket
 import subprocess
 import threading
 import warnings
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from typing import Any
@@ -197,8 +197,11 @@ class Apart:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # how it ended is found by reading
             self._talk.sendall(json.dumps(line).encode() + b"\n")
 
-    def _lines(self) -> list[dict[str, Any]]:
-        """Wait for the child; return what it says, and show what it prints."""
+    def _lines(self) -> Iterable[dict[str, Any]]:
+        """Wait for the child; return what it says, and show what it prints.
+
+        Lines are read one by one: what was said before a line that is nonsense counts, though both came together.
+        """
         ready = select.select(self._open, [], [], None if self._talk in self._open else PATIENCE_S)[0]
         if self._output in ready:
             self._print()
@@ -206,7 +209,7 @@ class Apart:
             self._receive()
         *whole, self._received = self._received.split(b"\n")
         if whole:
-            return [read(line, self.about) for line in whole]
+            return (read(line, self.about) for line in whole)
         if self._status in ready and not (self._talk in self._open and self._receive()):
             self._print(last=True)
             raise ended(_received(self._status), self.about, self._last)
