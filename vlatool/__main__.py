@@ -1,10 +1,12 @@
 """``python -m vlatool``."""
 
+import contextlib
 import os
 import sys
 
-if sys.path[:1] in ([""], [os.getcwd()]):
-    del sys.path[0]  # "python -m" puts the current directory there: a *.dist-info in it would be a plug-in
+with contextlib.suppress(OSError):  # of a current directory that is gone
+    if sys.path[:1] in ([""], [os.getcwd()]):
+        del sys.path[0]  # "python -m" puts the current directory there: a *.dist-info in it would be a plug-in
 
 from vlatool.errors import DISTRIBUTION, MissingExtra
 

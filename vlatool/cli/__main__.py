@@ -1,10 +1,12 @@
 """``python -m vlatool.cli``."""
 
+import contextlib
 import os
 import sys
 
 from vlatool.cli import main
 
-if sys.path[:1] in ([""], [os.getcwd()]):
-    del sys.path[0]  # see vlatool/__main__.py
+with contextlib.suppress(OSError):
+    if sys.path[:1] in ([""], [os.getcwd()]):
+        del sys.path[0]  # see vlatool/__main__.py
 main()
