@@ -59,6 +59,7 @@ def make():
     torch.manual_seed(0)
     return Policy()
 """
+DYNAMIC = "torch.ao.quantization.quantize_dynamic(nn.Sequential(nn.Linear(3, 3)), {nn.Linear}, dtype=torch.qint8)"
 Export = Callable[..., Bundle]
 
 
@@ -72,6 +73,9 @@ def export(tmp_path: Path) -> Export:
             each.mkdir()
         code = HEAD.replace("BODY", body.replace("\n", "\n        ")).replace("TAKES", takes)
         code = code.replace("SCRIPTED", str("scripted(" in body))
+        code = code.replace("QUANTIZED(", "self.quantized(").replace(
+            "self.random =", f"self.quantized = {DYNAMIC if 'QUANTIZED' in body else None}\n        self.random ="
+        )
         (folder / "policy.py").write_text(code)
         (folder / "policy.yaml").write_text(description)
         source = TorchModule(policy=folder).run(None, tmp_path / "source", Context())
@@ -112,10 +116,15 @@ FAILS = {
     "a TorchScript module": (
         "return self.linear(self.scripted(x))", "Linear.forward()", "self.scripted(x)", "torch.export.save"
     ),
+    "weights that torch has quantized": (
+        "return self.linear(QUANTIZED(x))", "LinearPackedParamsBase", "", "vlatool quantize"
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:torch.ao.quantization is deprecated:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:torch.quantize_per_tensor:UserWarning")
 @pytest.mark.parametrize("cause", FAILS)
 def test_a_failed_export_says_cause_line_place_and_remedy(
     cause: str, export: Export, capfd: pytest.CaptureFixture[str]

@@ -48,6 +48,11 @@ SCRIPTED = Cause(
     "build the Python module that was scripted and load its weights, or save it with torch.export.save: TorchScript "
     "cannot be exported again",
 )  # fmt: skip
+QUANTIZED = Cause(
+    "weights that torch has quantized", r"\bquantized::|quantized\.\w*PackedParams|torch\.(?:qint8|quint8|qint32)\b",
+    "let make() return the module as it was before torch quantized it, in float; vlatool quantize makes int8 of what "
+    "is exported",
+)  # fmt: skip
 CHECKED = Cause(
     "a distribution that checks its parameters", None,
     "return what the distribution is made of (its mean, its logits), or turn the checks off in policy.py: "
@@ -61,6 +66,7 @@ CONTROL_FLOW = Cause(
 )  # fmt: skip
 OTHER = Cause("", "", f"change what that line names; {GUIDE} says what forward() may hold")
 CAUSES = (
+    QUANTIZED,
     Cause(
         "a generator of random numbers", r"Optional\[Generator\]|torch\._C\.Generator",
         "let forward() take the noise as an input, and declare it in the program: "
