@@ -385,6 +385,224 @@ def scalar_ends() -> Any:
     return model(nodes, [weight("W", 16, 6)], (STATE, V("rate", F, [])), (ACTION, V("value", F, [])))
 
 
+def upsampled() -> Any:
+    """Opset 7, as the first exporters of torch wrote it: Upsample with an attribute, Dropout, weights as inputs."""
+    nodes = [
+        N("Reshape", ["state", "s"], ["a"]),
+        N("Upsample", ["a"], ["b"], scales=[1.0, 1.0, 2.0, 2.0], mode="nearest"),
+        N("Conv", ["b", "W"], ["c"], kernel_shape=[3, 3]),
+        N("Dropout", ["c"], ["d"], ratio=0.5),
+        N("GlobalAveragePool", ["d"], ["e"]),
+        N("Flatten", ["e"], ["action"]),
+    ]
+    inputs = (STATE, V("s", L, [4]), V("W", F, [6, 1, 3, 3]))
+    return model(nodes, [ints("s", 1, 1, 4, 4), weight("W", 6, 1, 3, 3)], inputs, opset=7, ir=3)
+
+
+def integer_products() -> Any:
+    """What a dynamic quantizer left behind: DynamicQuantizeLinear and MatMulInteger beside a float32 product."""
+    nodes = [
+        N("DynamicQuantizeLinear", ["state"], ["q", "qs", "qz"]),
+        N("MatMulInteger", ["q", "W", "qz"], ["i"]),
+        N("Cast", ["i"], ["f"], to=F),
+        N("Mul", ["qs", "ws"], ["s"]),
+        N("Mul", ["f", "s"], ["h"]),
+        N("Relu", ["h"], ["r"]),
+        N("MatMul", ["r", "W2"], ["action"]),
+    ]
+    codes = np.random.default_rng(0).integers(-100, 100, (16, 32)).astype(np.int8)
+    scale = np.array(0.01, np.float32)
+    return model(nodes, [nh.from_array(codes, "W"), nh.from_array(scale, "ws"), weight("W2", 32, 6)])
+
+
+def einsum_heads() -> Any:
+    """Attention of two heads in Einsum."""
+    nodes = [
+        N("Reshape", ["state", "s"], ["x"]),
+        N("Einsum", ["x", "Wq"], ["q"], equation="btc,chd->bthd"),
+        N("Einsum", ["x", "Wk"], ["k"], equation="btc,chd->bthd"),
+        N("Einsum", ["q", "k"], ["scores"], equation="bthd,bshd->bhts"),
+        N("Softmax", ["scores"], ["p"], axis=-1),
+        N("Einsum", ["p", "q"], ["o"], equation="bhts,bshd->bthd"),
+        N("ReduceMean", ["o"], ["m"], axes=[1], keepdims=0),
+        N("Flatten", ["m"], ["f"]),
+        N("MatMul", ["f", "Wo"], ["action"]),
+    ]
+    return model(nodes, [ints("s", 1, 4, 4), weight("Wq", 4, 2, 4), weight("Wk", 4, 2, 4), weight("Wo", 8, 6)])
+
+
+def best_of_many() -> Any:
+    """TopK whose indices choose rows of a table."""
+    nodes = [
+        N("MatMul", ["state", "W"], ["h"]),
+        N("TopK", ["h", "k"], ["v", "i"], axis=-1),
+        N("Gather", ["E", "i"], ["g"]),
+        N("Unsqueeze", ["v", "two"], ["vu"]),
+        N("Mul", ["g", "vu"], ["gm"]),
+        N("ReduceSum", ["gm", "one"], ["m"], keepdims=0),
+        N("MatMul", ["m", "Wo"], ["action"]),
+    ]
+    weights = [
+        weight("W", 16, 32),
+        ints("k", 4),
+        weight("E", 32, 8),
+        ints("two", 2),
+        ints("one", 1),
+        weight("Wo", 8, 6),
+    ]
+    return model(nodes, weights)
+
+
+def one_hot() -> Any:
+    """ArgMax, OneHot, and Where over what a product gives."""
+    nodes = [
+        N("MatMul", ["state", "W"], ["h"]),
+        N("ArgMax", ["h"], ["i"], axis=-1, keepdims=0),
+        N("OneHot", ["i", "depth", "v"], ["o"]),
+        N("MatMul", ["o", "W2"], ["p"]),
+        N("Greater", ["p", "z"], ["c"]),
+        N("Where", ["c", "p", "z"], ["action"]),
+    ]
+    ends, zero = np.array([0, 1], np.float32), np.array(0, np.float32)
+    constants = [nh.from_array(np.array(8), "depth"), nh.from_array(ends, "v"), nh.from_array(zero, "z")]
+    return model(nodes, [weight("W", 16, 8), weight("W2", 8, 6), *constants])
+
+
+def lstm_both_ways() -> Any:
+    """A bidirectional LSTM with lengths and first states, as keras2onnx writes it."""
+    nodes = [
+        N("Reshape", ["state", "s"], ["x"]),
+        N(
+            "LSTM",
+            ["x", "W", "R", "B", "length", "h0", "c0"],
+            ["y", "yh", "yc"],
+            hidden_size=8,
+            direction="bidirectional",
+        ),
+        N("Transpose", ["yh"], ["t"], perm=[1, 0, 2]),
+        N("Reshape", ["t", "flat"], ["f"]),
+        N("Gemm", ["f", "Wo", "bo"], ["action"], transB=1),
+    ]
+    first = [ints("s", 4, 1, 4), ints("length", 3, dtype=np.int32), ints("flat", 1, 16)]
+    weights = [
+        weight("W", 2, 32, 4),
+        weight("R", 2, 32, 8),
+        weight("B", 2, 64),
+        weight("h0", 2, 1, 8),
+        weight("c0", 2, 1, 8),
+    ]
+    return model(nodes, [*first, *weights, weight("Wo", 6, 16), weight("bo", 6)])
+
+
+def sums_and_scatter() -> Any:
+    """CumSum, and ScatterND that clears two places."""
+    nodes = [
+        N("MatMul", ["state", "W"], ["h"]),
+        N("CumSum", ["h", "axis"], ["c"]),
+        N("ScatterND", ["c", "places", "zeros"], ["s"]),
+        N("MatMul", ["s", "Wo"], ["action"]),
+    ]
+    places = nh.from_array(np.array([[0, 2], [0, 5]]), "places")
+    axis, zeros = ints("axis", 1, dtype=np.int32), nh.from_array(np.zeros(2, np.float32), "zeros")
+    return model(nodes, [weight("W", 16, 8), axis, places, zeros, weight("Wo", 8, 6)])
+
+
+def count_of_positive() -> Any:
+    """NonZero: a shape that depends on values."""
+    nodes = [
+        N("Greater", ["state", "z"], ["c"]),
+        N("NonZero", ["c"], ["nz"]),
+        N("Shape", ["nz"], ["sh"]),
+        N("Cast", ["sh"], ["f"], to=F),
+        N("Reshape", ["f", "s"], ["row"]),
+        N("MatMul", ["row", "W"], ["b"]),
+        N("MatMul", ["state", "W2"], ["a"]),
+        N("Add", ["a", "b"], ["action"]),
+    ]
+    zero = nh.from_array(np.array(0, np.float32), "z")
+    return model(nodes, [zero, ints("s", 1, 2), weight("W", 2, 6), weight("W2", 16, 6)])
+
+
+def sparse_weight() -> Any:
+    """A weight as sparse tensor, with one index for each value; another one in a Constant, with one for each axis."""
+
+    def sparse(name: str, places: Any) -> Any:
+        held = nh.from_array(np.array([1, -2, 3], np.float32), name)
+        return h.make_sparse_tensor(held, nh.from_array(np.array(places), f"{name}.places"), [16, 6])
+
+    nodes = [
+        N("Constant", [], ["V"], sparse_value=sparse("v", [[0, 1], [3, 3], [15, 5]])),
+        N("MatMul", ["state", "W"], ["a"]),
+        N("MatMul", ["state", "V"], ["b"]),
+        N("MatMul", ["state", "W2"], ["c"]),
+        N("Sum", ["a", "b", "c"], ["action"]),
+    ]
+    made = model(nodes, [weight("W2", 16, 6)])
+    made.graph.sparse_initializer.append(sparse("W", [0, 7, 50]))
+    return made
+
+
+def symbolic_batch() -> Any:
+    """A batch axis with a name, read by Shape and put together again by Concat."""
+    nodes = [
+        N("Shape", ["state"], ["sh"]),
+        N("Gather", ["sh", "z"], ["b"]),
+        N("Concat", ["b", "rest"], ["to"], axis=0),
+        N("Reshape", ["state", "to"], ["x"]),
+        N("MatMul", ["x", "W"], ["h"]),
+        N("ReduceMax", ["h"], ["action"], axes=[1], keepdims=0),
+    ]
+    inputs, outputs = (V("state", F, ["batch", 16]),), (V("action", F, ["batch", 6]),)
+    return model(nodes, [ints("z", 0), ints("rest", 4, 4), weight("W", 4, 6)], inputs, outputs)
+
+
+def chosen_action() -> Any:
+    """A discrete policy that gives the number of its action."""
+    nodes = [N("MatMul", ["state", "W"], ["h"]), N("ArgMax", ["h"], ["action"], axis=-1, keepdims=0)]
+    return model(nodes, [weight("W", 16, 6)], outputs=(V("action", L, [1]),))
+
+
+def camera_bytes() -> Any:
+    """A uint8 image, channels last; SAME_LOWER, ceil_mode, HardSwish, and a Gemm with a factor."""
+    nodes = [
+        N("Cast", ["image"], ["f"], to=F),
+        N("Mul", ["f", "k"], ["x"]),
+        N("Transpose", ["x"], ["t"], perm=[0, 3, 1, 2]),
+        N("Conv", ["t", "W"], ["c"], kernel_shape=[5, 5], strides=[2, 2], auto_pad="SAME_LOWER"),
+        N("HardSwish", ["c"], ["hs"]),
+        N("AveragePool", ["hs"], ["p"], kernel_shape=[3, 3], ceil_mode=1, strides=[2, 2], count_include_pad=1),
+        N("Flatten", ["p"], ["fl"]),
+        N("Gemm", ["fl", "Wo"], ["action"], alpha=0.5),
+    ]
+    scale = nh.from_array(np.array(1 / 255, np.float32), "k")
+    return model(nodes, [scale, weight("W", 8, 3, 5, 5), weight("Wo", 128, 6)], (V("image", T.UINT8, [1, 16, 16, 3]),))
+
+
+def idle_ends() -> Any:
+    """An input that nothing reads, an output that is a weight, and one that is an input renamed."""
+    nodes = [N("MatMul", ["state", "W"], ["action"]), N("Identity", ["state"], ["debug"])]
+    outputs = (ACTION, V("debug", F, [1, 16]), V("version", F, [1, 1]))
+    return model(nodes, [weight("W", 16, 6), weight("version", 1, 1)], (STATE, V("extra", F, [1, 3])), outputs)
+
+
+def sizes_computed() -> Any:
+    """Resize to sizes that Shape, Slice, Mul and Concat compute."""
+    nodes = [
+        N("Reshape", ["state", "s"], ["x"]),
+        N("Shape", ["x"], ["sh"]),
+        N("Slice", ["sh", "a", "b"], ["hw"]),
+        N("Mul", ["hw", "twice"], ["hw2"]),
+        N("Slice", ["sh", "z", "a"], ["nc"]),
+        N("Concat", ["nc", "hw2"], ["sizes"], axis=0),
+        N("Resize", ["x", "", "", "sizes"], ["r"], mode="linear", coordinate_transformation_mode="align_corners"),
+        N("Conv", ["r", "W"], ["c"], kernel_shape=[3, 3]),
+        N("GlobalMaxPool", ["c"], ["g"]),
+        N("Flatten", ["g"], ["action"]),
+    ]
+    numbers = [ints("s", 1, 1, 4, 4), ints("a", 2), ints("b", 4), ints("z", 0), ints("twice", 2, 2)]
+    return model(nodes, [*numbers, weight("W", 6, 1, 3, 3)])
+
+
 KINDS: dict[str, Callable[[], Any]] = {
     made.__name__: made
     for made in (
@@ -410,6 +628,20 @@ KINDS: dict[str, Callable[[], Any]] = {
         branches_of_products,
         narrow_inputs,
         scalar_ends,
+        upsampled,
+        integer_products,
+        einsum_heads,
+        best_of_many,
+        one_hot,
+        lstm_both_ways,
+        sums_and_scatter,
+        count_of_positive,
+        sparse_weight,
+        symbolic_batch,
+        chosen_action,
+        camera_bytes,
+        idle_ends,
+        sizes_computed,
     )
 }
 """Idiom -> the file."""

@@ -10,7 +10,7 @@ from onnx.reference import ReferenceEvaluator
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.errors import DataError, RecipeError
+from vlatool.errors import DataError, GraphError, RecipeError
 from vlatool.graph.files import load, save
 from vlatool.quantize._float16_graph import around, look_at_weights, phase_nodes, to_float16
 from vlatool.quantize._overflow import find_beyond
@@ -308,6 +308,22 @@ def test_an_epsilon_does_not_become_zero(tmp_path: Path, epsilon: float):
     floats = [numpy_helper.to_array(tensor) for tensor in stored if tensor.data_type in (FLOAT, HALF)]
     assert floats
     assert all((values != 0).all() for values in floats)
+
+
+def test_an_opset_without_its_operators_is_refused(tmp_path: Path):
+    value = helper.make_tensor_value_info
+    made = helper.make_graph(
+        [helper.make_node("MatMul", ["state", "w"], ["action"], "head")], "g",
+        [value("state", TensorProto.FLOAT, [1, 16])], [value("action", TensorProto.FLOAT, [1, 6])],
+        [numpy_helper.from_array(np.ones((16, 6), np.float32), "w")],
+    )  # fmt: skip
+    onnx.save(helper.make_model(made, opset_imports=[helper.make_opsetid("", 9)], ir_version=4), tmp_path / "old.onnx")
+    for name in ("float", "half"):
+        (tmp_path / name).mkdir()
+    bundle = OnnxFile(model=tmp_path / "old.onnx", opset=9).run(None, tmp_path / "float", Context())
+    with pytest.raises(GraphError, match="opset 9; float16 needs opset 10 or later") as refused:
+        Float16().run(bundle, tmp_path / "half", Context())
+    assert "vlatool export FILE.onnx --opset 13" in refused.value.fix
 
 
 def test_what_still_moves_is_told():

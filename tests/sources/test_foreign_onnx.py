@@ -24,6 +24,7 @@ INT8 = {
     "loop_of_products": 0.07, "loop_until": 0.111, "scan_of_products": 0.086, "branches_of_products": 0.314,
     "domains_and_functions": 0.407, "tf2onnx_constants": 1.0, "paddle_scale": 1.0, "identity_chain": 1.0,
     "bfloat16_inside": 1.0, "float16_inside": 1.0, "double_throughout": 1.0, "torch_script_gather": 0.5,
+    "sparse_weight": 1.0,
 }  # fmt: skip
 """File -> share of the multiply-accumulates that dynamic int8 reaches; bodies and foreign operators stay."""
 

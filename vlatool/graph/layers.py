@@ -89,12 +89,7 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
         GraphError: when the opset is too old.
     """
     graph, live = OnnxGraph(model), varying(model)
-    if 0 < graph.opset < LOWEST_OPSET:
-        raise GraphError(
-            f"The graph has opset {graph.opset}; int8 needs opset {LOWEST_OPSET} or later.",
-            f"convert the file that it came from: vlatool export FILE.onnx --opset {LOWEST_OPSET} -o BUNDLE; where "
-            "onnx cannot, which that says, export it again where it was made",
-        )
+    check_opset(graph.opset, "int8", LOWEST_OPSET)
     layers = []
     for node in model.graph.node:
         layer = None
@@ -107,6 +102,20 @@ def find_layers(model: Any, ops: Iterable[str], *, attention: bool = False, elem
             fused = len(after) == 1 and after[0].op_type in FOLLOWS
             layers.append(replace(layer, output=(after[0] if fused else node).output[0]))
     return layers
+
+
+def check_opset(opset: int, method: str, lowest: int) -> None:
+    """Refuse a graph of an opset in which a method has no operators; 0 is an opset that nobody said.
+
+    Raises:
+        GraphError: when the opset is too old.
+    """
+    if 0 < opset < lowest:
+        raise GraphError(
+            f"The graph has opset {opset}; {method} needs opset {lowest} or later.",
+            f"convert the file that it came from: vlatool export FILE.onnx --opset {LOWEST_OPSET} -o BUNDLE; where "
+            "onnx cannot, which that says, export it again where it was made",
+        )
 
 
 def _is_residual(node: Any, graph: OnnxGraph) -> bool:

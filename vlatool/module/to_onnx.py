@@ -15,6 +15,7 @@ from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.graph.draws import refuse_draws
 from vlatool.graph.nodes import FOLDED
+from vlatool.graph.plain_gemms import plain_gemms
 from vlatool.module.changed_buffers import refuse_changed_buffers
 from vlatool.module.factory import exits_caught
 from vlatool.module.failures import export_error
@@ -61,6 +62,7 @@ def exported_by_torch(module: Any, arguments: Sequence[Any], step: ProgramStep, 
     refuse_changed_buffers(exported.exported_program, step.graph)
     refuse_draws(exported.model, step.graph)
     divide_by_roots(exported.model)
+    plain_gemms(exported.model)
     return exported
 
 

@@ -8,7 +8,7 @@ import io
 import logging
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -156,10 +156,10 @@ class Quantization(Transform):
         for name in self.chosen_graphs(bundle):
             with foreign_errors(name):
                 layers[name] = find_layers(read(bundle.file(bundle.manifest.graphs[name].file)), ops, **kinds)
-        selected = self.selected([layer.name for graph in layers.values() for layer in graph], bundle)
+        selected = self.selected([layer.name for graph in layers.values() for layer in graph], bundle, tuple(ops))
         return {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
 
-    def selected(self, names: Iterable[str], bundle: Bundle) -> set[str]:
+    def selected(self, names: Iterable[str], bundle: Bundle, ops: Sequence[str] = QUANTIZED_OPS) -> set[str]:
         """Return which of those nodes are quantized, by include, exclude and parts.
 
         A pattern is held against the whole name (``blocks.0.mlp.fc1/MatMul``), the module's (``blocks.0.mlp.fc1``) and
@@ -172,7 +172,7 @@ class Quantization(Transform):
         candidates = list(names)
         if not candidates:
             raise RecipeError(
-                f"No layer of {bundle.path} can be quantized by {self.name()}: it takes MatMul, Gemm and Conv with a "
+                f"No layer of {bundle.path} can be quantized by {self.name()}: it takes {', '.join(ops)} with a "
                 "float32 weight.",
                 "look at --ops and --graphs, and at the precision of the graphs: vlatool inspect BUNDLE",
             )

@@ -159,7 +159,8 @@ def _chosen(products: dict[str, list[Product]], stage: WeightOptions, bundle: Bu
     graphs = {
         name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)
     }
-    kept = stage.selected([product.node.name for name in sorted(graphs) for product in products[name]], bundle)
+    names = [product.node.name for name in sorted(graphs) for product in products[name]]
+    kept = stage.selected(names, bundle, ("MatMul", "Gemm"))
     return {
         name: [product for product in members if name in graphs and product.node.name in kept]
         for name, members in products.items()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
 from vlatool.graph.layers import Layer, check_weights, part_inner_gemms, split_gemm
 from vlatool.graph.onnx_graph import OnnxGraph
@@ -69,6 +70,13 @@ class DynamicInt8(Quantization):
                 extra_options={"MatMulConstBOnly": True},
             )
             quantized = load(scratch / "model.onnx")
+            left = [node.name for node in quantized.graph.node if node.op_type in OPS and node.name in names]
+            if left:
+                raise GraphError(
+                    f"ONNX Runtime's quantizer leaves {len(left)} of {len(names)} layers in float32: "
+                    f"{', '.join(left[:3])}.",
+                    "leave them out: " + " ".join(f"--exclude '{name}'" for name in left[:3]),
+                )
             if self.reduce_range:
                 self._fit_pairs(quantized, OnnxGraph(model))
             save(quantized, target)

@@ -13,6 +13,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment, calibration_recording, synthetic_observations
 from vlatool.errors import GraphError
 from vlatool.graph.files import load, save
+from vlatool.graph.layers import check_opset
+from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.machine.risky import risky
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._float16_graph import LARGEST, around, look_at_weights, phase_nodes, to_float16
@@ -26,6 +28,8 @@ from vlatool.stage.base import Context, SampleSet, source_of
 
 APART = "leave layers beside a Transpose in float32 with --exclude, or use another method"
 
+LOWEST_OPSET = 10
+"""``IsInf``, by which values beyond float16 are found, came with opset 10."""
 MOVED = 0.02
 """Relative L2 change of what a graph gives above which every small number is kept, and that is told."""
 BEYOND_ALL = 1e9
@@ -59,6 +63,7 @@ class Float16(Quantization):
         candidates = []
         for name in chosen:
             model = load(bundle.file(bundle.manifest.graphs[name].file))
+            check_opset(OnnxGraph(model).opset, "float16", LOWEST_OPSET)
             candidates += [node.name for node in model.graph.node]
         selected = self.selected(candidates, bundle)
         samples = SampleSet()

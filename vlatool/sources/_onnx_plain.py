@@ -6,8 +6,11 @@ import copy
 from collections import Counter
 from typing import Any
 
+import numpy as np
+
 from vlatool.errors import require
 from vlatool.graph.nodes import name_nodes, read_names, reads
+from vlatool.graph.plain_gemms import plain_gemms
 
 MOVERS = ("Identity", "Cast", "Transpose", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Split")
 """Operators through which exporters let a weight go on its way to a layer."""
@@ -29,6 +32,7 @@ def plain(model: Any) -> Any:
     if model.functions:
         model = require("onnx.inliner", "build").inline_local_functions(model)
     graph = model.graph
+    _fill_sparse(graph)
     stored = {tensor.name: tensor for tensor in graph.initializer}
     inputs = [value for value in graph.input if value.name not in stored]
     if len(inputs) < len(graph.input):
@@ -51,7 +55,35 @@ def plain(model: Any) -> Any:
     graph.node.extend(nodes)
     _drop_unread(graph)
     name_nodes(model)
-    return model
+    return _with_plain_gemms(model) if any(node.op_type == "Gemm" and node.attribute for node in graph.node) else model
+
+
+def _fill_sparse(graph: Any) -> None:
+    """Write sparse weights, stored or in Constant nodes, as tensors with all their zeros."""
+    for sparse in graph.sparse_initializer:
+        graph.initializer.append(_dense(sparse))
+    del graph.sparse_initializer[:]
+    for node in graph.node:
+        for item in node.attribute:
+            if node.op_type == "Constant" and item.name == "sparse_value":
+                dense = _dense(item.sparse_tensor)
+                node.attribute.remove(item)
+                node.attribute.append(require("onnx", "build").helper.make_attribute("value", dense))
+
+
+def _dense(sparse: Any) -> Any:
+    """Return a sparse tensor as one with all values; its indices count all values, or name a place on each axis."""
+    helper = require("onnx", "build").numpy_helper
+    values, places = helper.to_array(sparse.values), helper.to_array(sparse.indices)
+    full = np.zeros(tuple(sparse.dims), values.dtype)
+    full[np.unravel_index(places, full.shape) if places.ndim == 1 else tuple(places.T)] = values
+    return helper.from_array(full, sparse.values.name)
+
+
+def _with_plain_gemms(model: Any) -> Any:
+    ir = require("onnx_ir", "build")
+    changed = ir.from_proto(model)
+    return ir.to_proto(changed) if plain_gemms(changed) else model
 
 
 def _drop_unread(graph: Any) -> None:
