@@ -17,7 +17,7 @@ from pydantic_core import PydanticUndefined
 from vlatool import registry
 from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
-from vlatool.errors import PluginError, UsageError, nearest
+from vlatool.errors import PluginError, UsageError, instead, nearest
 from vlatool.stage.base import Measure, Stage, Transform
 from vlatool.stage.build import validated
 
@@ -54,7 +54,10 @@ class StageGroup(DefaultGroup):
         known = self.list_commands(ctx)
         other = "" if self.names_command(ctx, args) or ctx.resilient_parsing else args[0]
         if difflib.get_close_matches(other, known, n=1) and not Path(other).exists():
-            raise UsageError(f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.")
+            raise UsageError(
+                f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.",
+                instead(other, known),
+            )
         return super().parse_args(ctx, args)
 
 

@@ -122,9 +122,15 @@ def words_of(path: Path) -> list[str]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError(f"The vocabulary {path} cannot be read: {error}.") from error
+        raise DataError(
+            f"The vocabulary {path} cannot be read: {error}.",
+            "copy the bundle again from where it was made, or make it again",
+        ) from error
     if not isinstance(data, dict) or not isinstance(data.get("model", {}), dict):
-        raise DataError(f"The vocabulary {path} is not a mapping of words or tokens.")
+        raise DataError(
+            f"The vocabulary {path} is not a mapping of words or tokens.",
+            "export the policy again: the vocabulary in the bundle is not what a policy can be asked with",
+        )
     listed = data.get("words") if data.get("kind") == "words" else data.get("model", {}).get("vocab", ())
     tokens = [item[0] if isinstance(item, list) else item for item in listed or ()]
     if data.get("kind") == "words":

@@ -31,6 +31,9 @@ class Encoded(dict[str, Array]):
     """Whether an episode begins with it, or nothing before it is known."""
 
 
+AGAIN = "train again: quantize qat writes it"
+
+
 def kept_rows(most: int, row_bytes: int) -> int:
     """Return how many observations of a size are kept."""
     return min(most, max(LEAST, BYTES // max(1, row_bytes)))
@@ -45,7 +48,7 @@ def played_observations(source: Bundle) -> list[Encoded]:
     if PLAYED not in source.manifest.files:
         return []
     path = source.file(PLAYED)
-    arrays = open_npz(path)
+    arrays = open_npz(path, fix=AGAIN)
     for tensor in source.manifest.spec.inputs:
         _check(path, tensor, arrays.get(tensor.name))
     names = [tensor.name for tensor in source.manifest.spec.inputs]
@@ -69,4 +72,4 @@ def _check(path: Path, tensor: TensorSpec, array: Array | None) -> None:
 
 
 def _broken(path: Path, why: str) -> DataError:
-    return DataError(f"{path} does not fit the policy: {why}.", "train again: quantize qat writes it")
+    return DataError(f"{path} does not fit the policy: {why}.", AGAIN)

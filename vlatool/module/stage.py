@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 
 TRAINING = f"{FOLDER}/training.json"
+LESS = "prune less, or leave out what it names; VLATOOL_DEBUG=1 shows where it was raised"
 RUN_BELOW = 1 << 32
 """Bytes of weights in shards up to which the changed policy is run on them; above, shapes alone go through it."""
 
@@ -193,7 +194,9 @@ def _run_once(bundle: Bundle) -> None:
         raise
     except Exception as error:  # the seam: the user's module may raise anything
         reason = (message_of(error).splitlines() or [""])[0]
-        raise SourceError(f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error)) from error
+        raise SourceError(
+            f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error) or LESS
+        ) from error
 
 
 def write_changed(

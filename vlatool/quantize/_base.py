@@ -19,7 +19,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.unexported import no_graph
 from vlatool.data import calibration_recording, observations_for
-from vlatool.errors import BundleError, RecipeError, nearest
+from vlatool.errors import BundleError, RecipeError, instead, nearest
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
@@ -69,7 +69,10 @@ class Quantization(Transform):
             raise no_graph(source, "quantize")
         for pattern in self.graphs:
             if not fnmatch.filter(source.manifest.graphs, pattern):
-                raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.")
+                raise RecipeError(
+                    f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.",
+                    instead(pattern, source.manifest.graphs),
+                )
         for name in self.chosen_graphs(source):
             graph = source.manifest.graphs[name]
             quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
@@ -183,11 +186,14 @@ class Quantization(Transform):
 
         for pattern in (*self.include, *self.exclude):
             if not any(meets(name, (pattern,)) for name in candidates):
-                raise RecipeError(f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.")
+                raise RecipeError(
+                    f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.",
+                    instead(pattern, candidates[:200]),
+                )
         parts = bundle.manifest.parts
         for part in self.parts:
             if part not in parts:
-                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.")
+                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.", instead(part, parts))
         globs = tuple(pattern for part in self.parts for pattern in parts[part])
         kept = {name for name in candidates if not self.include or meets(name, self.include)}
         if self.parts:
@@ -205,7 +211,10 @@ def check_ops(ops: Iterable[str]) -> None:
     """Raise a user error for an operator that no method quantizes."""
     for name in ops:
         if name not in QUANTIZED_OPS:
-            raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
+            raise RecipeError(
+                f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.",
+                instead(name, QUANTIZED_OPS),
+            )
 
 
 def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:

@@ -26,6 +26,8 @@ from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
+UNUSABLE = "make the bundle again, with the command that made it"
+
 Entry = dict[str, Any]
 RECORDED_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
 """How a record names a file that an option gives."""
@@ -112,9 +114,9 @@ def build_record(bundle: Bundle) -> tuple[Entry, ...]:
         where, stage = f"Entry {number} of the build record of {bundle.path}", entry.get("stage")
         mappings = all(isinstance(entry.get(name, {}), Mapping) for name in ("options", "versions", "files", "graphs"))
         if not (isinstance(stage, str) and mappings and isinstance(entry.get("input", ""), str)):
-            raise BundleError(f"{where} is invalid: {json.dumps(entry)[:200]}.")
+            raise BundleError(f"{where} is invalid: {json.dumps(entry)[:200]}.", UNUSABLE)
         if number and stage.startswith("sources."):
-            raise BundleError(f"{where} is a source; only the first may be.")
+            raise BundleError(f"{where} is a source; only the first may be.", UNUSABLE)
     return entries
 
 
@@ -231,11 +233,13 @@ def _stage(entry: Entry, places: _Places) -> Transform:
         if key in fields and Path in (fields[key].annotation, *get_args(fields[key].annotation)) and value is not None:
             match = RECORDED_FILE.fullmatch(str(value))
             if match is None:
-                raise BundleError(f"The build record names the file '{value}' of {name} without its hash.")
+                raise BundleError(f"The build record names the file '{value}' of {name} without its hash.", UNUSABLE)
             options[key] = places.find(match["name"], match["hash"], name)
     stage = build_stage(name, options)
     if not isinstance(stage, Transform):
-        raise BundleError(f"The build record names {name}, which measures; it may only name stages that make bundles.")
+        raise BundleError(
+            f"The build record names {name}, which measures; it may only name stages that make bundles.", UNUSABLE
+        )
     return stage
 
 
@@ -263,7 +267,10 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
     """
     stage = source_stage(source)
     if stage.name() != entry["stage"]:
-        raise SourceError(f"{source} is read by {stage.name()}; {bundle.path} was made by {entry['stage']}.")
+        raise SourceError(
+            f"{source} is read by {stage.name()}; {bundle.path} was made by {entry['stage']}.",
+            f"pass what {entry['stage']} reads: --source",
+        )
     stage = stage.as_recorded(entry, bundle)
     stage.check(None, None)
     got, recorded = stage.input_hashes(), entry.get("files", {})

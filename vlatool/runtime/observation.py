@@ -16,6 +16,7 @@ from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer
 
 FEW = 256
+MISSING = "put the file there, or correct its name in the spec"
 Array = NDArray[Any]
 Encoder = Callable[[Any], Array]
 
@@ -77,7 +78,7 @@ class ObservationEncoder:
                 self._example(),
             )
         has = ", ".join(map(str, observation)) or "nothing"
-        return DataError(f"The observation has no '{name}' (it has: {has}); {takes}")
+        return DataError(f"The observation has no '{name}' (it has: {has}); {takes}", self._example())
 
     def _example(self) -> str:
         """Return how an observation is written."""
@@ -99,7 +100,10 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         try:
             array = value if isinstance(value, np.ndarray) else np.asarray(value)
         except ValueError as error:
-            raise DataError(f"The input '{tensor.name}' is not an array: its rows have different lengths.") from error
+            raise DataError(
+                f"The input '{tensor.name}' is not an array: its rows have different lengths.",
+                "give rows of one length",
+            ) from error
         except Exception as error:  # the seam: numpy asks the object for an array, a tensor on a GPU has none
             raise DataError(
                 f"The input '{tensor.name}' is a {type(value).__name__}, which cannot be converted to a numpy array.",
@@ -131,7 +135,7 @@ def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         content = read_asset(assets, tensor.tokenizer, "tokenizer_bytes")
     except OSError as error:
         where = f"{asset_path(assets, tensor.tokenizer)} ({error.strerror})"
-        raise SpecError(f"The tokenizer of '{tensor.name}' cannot be read: {where}.") from error
+        raise SpecError(f"The tokenizer of '{tensor.name}' cannot be read: {where}.", MISSING) from error
     tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content)
 
     def encode(value: Any) -> Array:
@@ -165,7 +169,8 @@ def _batched(array: Array, tensor: TensorSpec) -> Array:
     if not fits:
         raise DataError(
             f"The input '{tensor.name}' has the shape {list(array.shape)}; the policy takes {list(tensor.shape)} "
-            "(the first axis may be left out)."
+            "(the first axis may be left out).",
+            f"give it as {list(tensor.shape[1:])} or {list(tensor.shape)}",
         )
     return array
 

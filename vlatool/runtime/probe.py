@@ -10,6 +10,7 @@ import json
 import math
 import os
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -125,7 +126,10 @@ def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) 
         raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
     if done.returncode or not answer:
         last = (message.strip() or f"exit code {done.returncode}").splitlines()[-1]
-        raise GraphError(f"{path} cannot be run in a process of its own: {last}")
+        raise GraphError(
+            f"{path} cannot be run in a process of its own: {last}",
+            f"read what it says, and see what is installed: {shlex.quote(sys.executable)} -m pip list",
+        )
     return answer
 
 

@@ -64,7 +64,7 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
     """Run the stage of a job in this process; return the hash of the bundle that it made, and what is said of it."""
     stage = build_stage(job["stage"], job["options"])
     if not isinstance(stage, Transform):
-        raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
+        raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.", "name a stage that makes a bundle")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
     context = _context(job, tell)
     with _blamed():
@@ -93,7 +93,9 @@ def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     """Run the measuring stage of a job in this process; return its report as JSON, and what it kept and noted."""
     stage = build_stage(job["stage"], job["options"])
     if not isinstance(stage, Measure):
-        raise RecipeError(f"The stage {job['stage']} makes a bundle; it measures nothing.")
+        raise RecipeError(
+            f"The stage {job['stage']} makes a bundle; it measures nothing.", "name a stage that measures"
+        )
     source = Bundle.open(Path(job["source"]), verify=False)
     unfinished: list[Path] = []
     context = replace(_context(job, tell), unfinished=unfinished if job["keeps"] else None)

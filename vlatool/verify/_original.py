@@ -95,7 +95,10 @@ class Original:
         except (VlatoolError, MemoryError):
             raise
         except Exception as error:  # the seam: user code may raise anything
-            raise SourceError(f"{where} failed: {type(error).__name__}: {message_of(error)}.") from error
+            raise SourceError(
+                f"{where} failed: {type(error).__name__}: {message_of(error)}.",
+                "call it with that observation yourself, and correct what fails; VLATOOL_DEBUG=1 shows where",
+            ) from error
 
     def _array(self, value: Any, what: str, number: int) -> Array:
         """Return an array of finite numbers, of a tensor as well."""
@@ -109,9 +112,15 @@ class Original:
                 "return a numpy array, or a tensor of float32",
             ) from error
         if array.dtype.kind not in "biuf" or not array.size:
-            raise SourceError(f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.")
+            raise SourceError(
+                f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.",
+                "return a numpy array, or a tensor of float32",
+            )
         if not np.isfinite(array).all():
-            raise SourceError(f"{what} of '{self._name}' gives NaN or infinity on observation {number}.")
+            raise SourceError(
+                f"{what} of '{self._name}' gives NaN or infinity on observation {number}.",
+                "see what its code computes from that observation; actions and inputs must be finite",
+            )
         return array
 
     def _chunk(self, answer: Any, number: int) -> Array:
