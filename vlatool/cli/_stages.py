@@ -17,6 +17,7 @@ from pydantic_core import PydanticUndefined
 from vlatool import registry
 from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
+from vlatool.cli._once import once
 from vlatool.errors import PluginError, UsageError, instead, nearest
 from vlatool.stage.base import Measure, Stage, Transform
 from vlatool.stage.build import validated
@@ -67,7 +68,7 @@ def built(function: Callable[..., Any], name: str, text: str | None = None, **se
     single.command(name, help=text, context_settings=settings)(function)
     command = typer.main.get_command(single)
     command.name = name
-    return command
+    return once(command)
 
 
 def failing(name: str, error: PluginError) -> Any:

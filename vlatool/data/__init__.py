@@ -29,4 +29,5 @@ from vlatool.data._played import played_observations as played_observations
 from vlatool.data._recording import RECORD_ALL as RECORD_ALL
 from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
+from vlatool.data._recording import checked as checked
 from vlatool.data._recording import read_recording as read_recording

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-import struct
-import zipfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,8 +15,9 @@ from vlatool.bundle.bundle import LOCATION
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import RECORD_ALL
-from vlatool.errors import DataError, MissingExtra, SourceError, SpecError, instead, nearest
+from vlatool.data import checked
+from vlatool.data.npz import NpzReader
+from vlatool.errors import MissingExtra, SourceError, SpecError, instead, nearest
 from vlatool.files.kept import carry
 from vlatool.files.printable import one_line, shortened
 from vlatool.files.yaml import read_mapping
@@ -267,7 +266,7 @@ def copy_assets(described: Description, out: Path) -> None:
     Raises:
         SourceError: when a file that the spec names is missing.
         SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
-        DataError: when a recording lacks an input; names the user's file.
+        DataError: when a recording cannot be read or does not fit the spec; names the user's file.
     """
     for file in described.assets():
         name = file.relative_to(described.folder)
@@ -281,21 +280,9 @@ def copy_assets(described: Description, out: Path) -> None:
         shutil.copyfile(file, target)
     check_assets(described, out / "assets")
     for key, path in described.recordings().items():
-        _check_recording(path, described.spec)
+        checked(path, NpzReader().read(path), described.spec)  # while it has the name that the user knows
         (out / "data").mkdir(exist_ok=True)
         carry(path, out / "data" / f"{key}.npz")
-
-
-def _check_recording(path: Path, spec: PolicySpec) -> None:
-    """Refuse a recording without one of the inputs, while it has the name that the user knows; reads names alone."""
-    try:
-        with zipfile.ZipFile(path) as stored:
-            names = [name.removesuffix(".npy") for name in stored.namelist()]
-    except (OSError, EOFError, ValueError, NotImplementedError, struct.error, zipfile.BadZipFile):
-        return  # whoever reads it says what is wrong
-    for tensor in spec.inputs:
-        if tensor.name not in names:
-            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, names)}.", RECORD_ALL)
 
 
 def check_assets(described: Description, copies: Path) -> None:

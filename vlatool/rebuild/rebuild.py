@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, get_args
 
 from vlatool.bundle.bundle import LOCATION, MANIFEST, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.files.scratch import scratch_directory
 from vlatool.files.writing import writing
 from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
@@ -26,6 +26,7 @@ from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
 
+MADE_LAST = ("graphs", "golden", MANIFEST)
 UNUSABLE = "make the bundle again, with the command that made it"
 
 Entry = dict[str, Any]
@@ -60,8 +61,15 @@ class Rebuilt:
 
     @property
     def first_difference(self) -> Compared | None:
-        """The first file that differs, None when none does."""
-        return next((file for file in self.files if not file.identical), None)
+        """The file that differs and that others which differ were made from, None when none does."""
+        differing = [file for file in self.files if not file.identical]
+        return min(differing, key=lambda file: _rank(file.file), default=None)
+
+
+def _rank(name: str) -> int:
+    """Return how late in the making of a bundle a file comes: what differs first may be why later ones do."""
+    folder = name.partition("/")[0]
+    return MADE_LAST.index(folder) + 1 if folder in MADE_LAST else 0
 
 
 @dataclass(frozen=True)
@@ -166,10 +174,10 @@ def rebuild(
     entries = build_record(bundle)
     start = _start(bundle, entries, source, files, cache)
     same: list[tuple[str, bool]] = []
-    with tempfile.TemporaryDirectory(prefix="vlatool-rebuild-") as scratch:
+    with scratch_directory("vlatool-rebuild-") as scratch:
         product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
-            before, place = product, Path(scratch) / f"{number}-{entry['stage']}"
+            before, place = product, scratch / f"{number}-{entry['stage']}"
             product = (
                 _finalized(entry, before, place) if stage is None else run_transform(stage, before, place, context)
             )

@@ -89,7 +89,7 @@ def main() -> None:
 
 def _run(path: str, engine: str, threads: int | None, first_run_s: float, memory_mb: float) -> dict[str, Any]:
     policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=0, memory_mb=memory_mb)
-    policy.warm_up(1, float("inf"), first_run_s)
+    policy.replay_golden(1, first_run_s)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refused = None
     try:

@@ -40,11 +40,7 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
     """
     job, whose = {**_job(stage, source, context), "out": str(draft)}, stage.runs(source)
     about, preload = whose or stage.name(), (*PRELOAD, *stage.imports) if whose else needed(stage)
-    try:
-        answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
-    except VlatoolError as error:  # the draft is gone when a person reads it
-        error.message = error.message.replace(f"{draft}/", "")
-        raise
+    answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
     said = answer.get("said") if isinstance(answer, Mapping) else None
     context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
     return Bundle.open(draft, verify=bool(whose))

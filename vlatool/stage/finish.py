@@ -18,6 +18,7 @@ from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
 from vlatool.machine.risky import risky
 from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
+from vlatool.runtime.contract import OF_THE_GRAPHS, OF_THE_POLICY, off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
@@ -332,8 +333,10 @@ def _outputs(
     """Return the action of each observation; ``engine`` is told where it runs these graphs for the first time."""
     policy.reset()
     actions = []
-    for observation, noise in samples:
-        with risky(engine, f"ran {named(policy.bundle.manifest)}") if engine else contextlib.nullcontext():
+    fix = OF_THE_GRAPHS if policy.bundle.manifest.parent else OF_THE_POLICY
+    for number, (observation, noise) in enumerate(samples):
+        doing = risky(engine, f"ran {named(policy.bundle.manifest)}") if engine else contextlib.nullcontext()
+        with doing, off_the_robot(f"observation {number}", fix):
             actions.append(policy.infer(observation, noise=noise))
     return actions
 
