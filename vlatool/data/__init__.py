@@ -11,6 +11,8 @@ from vlatool.data._drawn import Drawn as Drawn
 from vlatool.data._drawn import read_drawn as read_drawn
 from vlatool.data._drawn import save_drawn as save_drawn
 from vlatool.data._halves import halves as halves
+from vlatool.data._not_finite import takes_not_finite as takes_not_finite
+from vlatool.data._not_finite import with_not_finite as with_not_finite
 from vlatool.data._observations import CALIBRATION as CALIBRATION
 from vlatool.data._observations import EVALUATION as EVALUATION
 from vlatool.data._observations import Observations as Observations

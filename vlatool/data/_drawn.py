@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
+from vlatool.data._not_finite import KINDS, with_not_finite
 from vlatool.data._recording import Recording
 from vlatool.errors import DataError
 from vlatool.runtime.statistics import Normaliser, load_normaliser
@@ -58,7 +59,8 @@ class Drawer:
     """
 
     def __init__(self, bundle: Bundle, recordings: Sequence[Recording] = ()) -> None:
-        self._inputs = bundle.manifest.spec.inputs
+        self._spec = bundle.manifest.spec
+        self._inputs = self._spec.inputs
         self._recordings = [recording for recording in recordings if len(recording)]
         assets = bundle.path / "assets"
         texts = [tensor for tensor in self._inputs if tensor.kind == "text"]
@@ -87,7 +89,10 @@ class Drawer:
 
     def _drawn(self, random: np.random.Generator, structured: Structures) -> dict[str, Any]:
         like = self._recorded(random) if self._recordings else {}
-        return {tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs}
+        values = {
+            tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs
+        }
+        return with_not_finite(self._spec, [values], int(random.integers(len(KINDS))))[0]
 
     def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator, structured: Structures) -> Any:
         if tensor.kind == "text":
@@ -217,6 +222,9 @@ def _physical(values: Array, normaliser: Normaliser | None, like: Any) -> Array:
     if like is None:
         return values
     recorded = np.asarray(like, np.float64)
+    recorded = recorded[np.isfinite(recorded)] if recorded.size else recorded
+    if not recorded.size:
+        return values
     return np.asarray(values * (recorded.std() or 1.0) + recorded.mean())
 
 

@@ -223,7 +223,8 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
             f"it would fit '{others[0]}'; are the names swapped?" if others else RECORD_ALL,
         )
     _check_type(where, tensor, values)
-    _check_finite(where, values)
+    if tensor.finite:
+        _check_finite(where, values)
     return values
 
 
@@ -317,5 +318,5 @@ def _check_finite(where: str, values: Values) -> None:
     if bad:
         raise DataError(
             f"{where} is not finite in {len(bad)} of {len(values)} samples; the first is sample {bad[0]}.",
-            "remove those samples, or repair the recording",
+            "remove those samples, or repair the recording; where the policy handles them: finite: false in its spec",
         )

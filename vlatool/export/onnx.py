@@ -32,9 +32,9 @@ from vlatool.module.to_onnx import (
     weight_bytes,
 )
 from vlatool.module.torch_policy import TorchSession, load_modules
-from vlatool.runtime.contract import OF_THE_GRAPHS, OF_THE_POLICY, Outputs, check_chunk, off_the_robot
+from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, Outputs, check_chunk, off_the_robot
 from vlatool.runtime.engine import engine_class
-from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.observation import ObservationEncoder, not_finite_text
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context, Transform, source_of
@@ -139,9 +139,10 @@ class ExportOnnx(Transform):
             return outputs(values, "The torch module")[spec.action.name]
 
         def run(number: int, observation: dict[str, Any]) -> Any:
-            encoded = encode(observation)
+            encoded, held = encode(observation), not_finite_text(spec, observation)
+            answered = f"observation {number}{f', which holds {held}' if held else ''}"
             try:
-                with off_the_robot(f"observation {number}", OF_THE_POLICY):
+                with off_the_robot(answered, OF_NOT_FINITE if held else OF_THE_POLICY):
                     return program.run(encoded, finish=action)
             except SourceError as error:
                 texts = [f"{name} {shown(value)}" for name, value in observation.items() if isinstance(value, str)]

@@ -24,6 +24,7 @@ from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import FLOATS
+from vlatool.quantize._not_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
@@ -160,7 +161,14 @@ class Quantization(Transform):
             with foreign_errors(name):
                 layers[name] = find_layers(read(bundle.file(bundle.manifest.graphs[name].file)), ops, **kinds)
         selected = self.selected([layer.name for graph in layers.values() for layer in graph], bundle)
-        return {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
+        chosen = {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
+        finite = finite_layers(bundle, chosen)
+        if not any(finite.values()):
+            raise RecipeError(
+                f"Every layer of {bundle.path} that was chosen reads NaN or infinity, which an input of it takes.",
+                "choose others with --include, or quantize the weights alone: vlatool quantize weight-only",
+            )
+        return finite
 
     def selected(self, names: Iterable[str], bundle: Bundle) -> set[str]:
         """Return which of those nodes are quantized, by include, exclude and parts.

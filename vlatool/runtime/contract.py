@@ -23,8 +23,12 @@ OF_THE_POLICY = (
     "correct the policy: by itself it gives NaN or infinity there; look for a division by zero, log or sqrt of what is "
     "not positive, and a softmax over nothing"
 )
+OF_NOT_FINITE = (
+    "its spec says finite: false: let the policy replace such values before it computes with them (torch.nan_to_num, "
+    "or torch.where with torch.isfinite), or leave that out of the spec"
+)
 OF_THE_GRAPHS = (
-    "leave layers out with --exclude, or use another method or --opset: what the graphs were made from answers finitely"
+    "leave layers out with --exclude, or use another method or --opset: what it was made from answers finite values"
 )
 AGAIN = "declare in the spec what the policy gives, or fix the policy, and export it again"
 BASE_MB = 2000.0
