@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from tests._raised import made, made_in
 from vlatool import errors
-from vlatool.errors import MissingExtra, VlatoolError, nearest, require
+from vlatool.errors import MissingExtra, VlatoolError, instead, nearest, require
 
 EXIT_CODES = {
     "VlatoolError": 70,
@@ -46,6 +47,48 @@ def test_an_error_crosses_a_process_border_whole(kind):
 
 def test_an_error_without_a_fix_is_its_message():
     assert str(VlatoolError("it broke")) == "it broke"
+
+
+def test_an_error_without_a_fix_of_its_own_has_that_of_its_class():
+    assert errors.BundleError("it is half").fix == errors.BundleError.remedy != ""
+    assert errors.BundleError("it is half", "mend it").fix == "mend it"
+
+
+def test_every_error_says_what_to_do():
+    found = list(made())
+    assert len(found) > 700
+    assert [each.where for each in found if each.without_remedy] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "without"),
+    [
+        ('raise DataError("it broke")', True),
+        ('raise DataError("it broke", "mend it")', False),
+        ('raise DataError("it broke", fix="")', True),
+        ('raise errors.DataError("it broke", FIX)', False),
+        ('raise BundleError("it broke")', False),
+        ('raise DataError("it broke", "mend it" if broken else "")', True),
+        ('raise DataError("it broke", remedy_of(error) or "mend it")', False),
+        ('fix = ""\nraise DataError("it broke", fix)', True),
+        ('def remedy(x):\n    return "mend it" if x else ""\nraise DataError("it broke", remedy(1))', True),
+        ('def broken(error: type[InputError]):\n    return error("it broke")', True),
+        ('def broken(error: type[BundleError]):\n    return error("it broke")', False),
+        ('class Lost(DataError):\n    pass\nraise Lost("it broke")', True),
+        ('raise type(error)(error.message)', True),
+        ('from vlatool.module.failures import remedy_for\nraise DataError("it broke", remedy_for(error))', True),
+    ],
+)  # fmt: skip
+def test_an_error_without_a_remedy_is_found(source, without):
+    (only,) = made_in(source, "here.py")
+    assert only.without_remedy is without
+
+
+def test_instead_names_what_is_near_or_says_what_there_is():
+    assert instead("proprioo", ["image", "proprio"]) == "write 'proprio'"
+    assert instead("xyz", ["proprio"]) == "write 'proprio'"
+    assert instead("xyz", ["proprio", "image"]) == "choose one of those that are known"
+    assert instead("xyz", []) == "leave it out: there is none to choose from"
 
 
 def test_nearest_puts_the_likely_name_first():

@@ -29,6 +29,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
+from typing import ClassVar
 
 HERE = Path(__file__).parent
 DISTRIBUTION = "vlatool" if (HERE / "cli").is_dir() else "vlatool-runtime"
@@ -40,15 +41,17 @@ class VlatoolError(Exception):
 
     Args:
         message: What was wrong, what was got and what is allowed; one or two sentences.
-        fix: What the person can do next; empty when the message already says so.
+        fix: What the person can do next; the remedy of the class when empty.
     """
 
     exit_code = 70
+    remedy: ClassVar[str] = ""
+    """What helps wherever an error of this class is raised; empty where that depends on the place, which says it."""
 
     def __init__(self, message: str, fix: str = "") -> None:
         super().__init__(message)
         self.message = message
-        self.fix = fix
+        self.fix = fix or self.remedy
 
     def __str__(self) -> str:
         return f"{self.message}\n  fix: {self.fix}" if self.fix else self.message
@@ -73,9 +76,13 @@ class InputError(VlatoolError):
 class BundleError(InputError):
     """A bundle directory is missing, corrupt, incomplete or too new."""
 
+    remedy = "copy the bundle again from where it was made, or make it again"
+
 
 class SpecError(InputError):
     """A policy spec names something impossible, or statistics do not fit it."""
+
+    remedy = "correct it in policy.yaml; where a bundle says it, make the bundle again"
 
 
 class SourceError(InputError):
@@ -150,9 +157,29 @@ def nearest(name: str, known: Iterable[str]) -> str:
         "did you mean 'raspberry-pi-5'? known: jetson-orin-nano, raspberry-pi-5"
     """
     names = sorted(known)
-    hits = difflib.get_close_matches(name, names, n=1)
+    hit = _near(name, names)
     listing = "known: " + (", ".join(names) if names else "none")
-    return f"did you mean '{hits[0]}'? {listing}" if hits else listing
+    return f"did you mean '{hit}'? {listing}" if hit else listing
+
+
+def instead(name: str, known: Iterable[str]) -> str:
+    """Return what to do about a name that is not known, beside a message with what ``nearest`` says of it.
+
+    Example:
+        >>> instead("rasberry-pi-5", ["raspberry-pi-5", "jetson-orin-nano"])
+        "write 'raspberry-pi-5'"
+    """
+    names = sorted(known)
+    if hit := _near(name, names):
+        return f"write '{hit}'"
+    if len(names) == 1:
+        return f"write '{names[0]}'"
+    return "choose one of those that are known" if names else "leave it out: there is none to choose from"
+
+
+def _near(name: str, names: list[str]) -> str:
+    """Return the name that is most like another one, empty where none is."""
+    return next(iter(difflib.get_close_matches(name, names, n=1)), "")
 
 
 def install(extra: str, distribution: str = DISTRIBUTION) -> str:

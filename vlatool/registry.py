@@ -16,7 +16,7 @@ import traceback
 from importlib import metadata
 from types import ModuleType
 
-from vlatool.errors import PluginError, UsageError, VlatoolError, nearest
+from vlatool.errors import PluginError, UsageError, VlatoolError, instead, nearest
 
 PACKAGES = {
     "engines": "vlatool.runtime.engines", "commands": "vlatool.cli", "render": "vlatool.render.formats",
@@ -73,7 +73,9 @@ def module(kind: str, name: str) -> ModuleType:
     if own_name in _own(kind):
         return importlib.import_module(f"{package_of(kind)}.{own_name}")
     if own_name not in plugins(kind):
-        raise UsageError(f"Unknown {noun_of(kind)} '{name}'; {nearest(own_name, names(kind))}.")
+        raise UsageError(
+            f"Unknown {noun_of(kind)} '{name}'; {nearest(own_name, names(kind))}.", instead(own_name, names(kind))
+        )
     entry = plugins(kind)[own_name]
     try:
         return importlib.import_module(entry.module)

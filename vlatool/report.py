@@ -201,7 +201,9 @@ class Report:
             values["findings"] = tuple(Finding(**item) for item in data.get("findings", ()))
             return cls(**values)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise DataError(f"This is not a vlatool report: {error}.") from error
+            raise DataError(
+                f"This is not a vlatool report: {error}.", "name a report.json that vlatool wrote, or measure again"
+            ) from error
 
 
 def read_report(path: Path) -> Report:
@@ -215,7 +217,10 @@ def read_report(path: Path) -> Report:
             try:
                 return Report.from_json(candidate.read_text(encoding="utf-8"))
             except (OSError, UnicodeDecodeError) as error:
-                raise DataError(f"The report {candidate} cannot be read: {error}.") from error
+                raise DataError(
+                    f"The report {candidate} cannot be read: {error}.",
+                    "check that the file is there and readable, or measure again",
+                ) from error
     raise DataError(f"No report at {path}.", "name a report.json, or a directory that holds one")
 
 

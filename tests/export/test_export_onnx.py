@@ -512,3 +512,11 @@ def test_a_part_may_name_either_of_them(normalised, part, layer):
 def test_a_pattern_that_meets_neither_is_refused_with_the_near_names(normalised):
     with pytest.raises(RecipeError, match=r"No node matches 'cnn.conf1'; did you mean 'cnn.conv1/Conv'\?"):
         StaticInt8(exclude=("cnn.conf1",)).selected(["cnn.conv1/Conv", "head/Gemm"], normalised)
+
+
+@pytest.mark.parametrize("body", ["x / (x - x)", "torch.log(-x.abs() - 1)", "x * float('nan')", "x.exp() * 1e39"])
+def test_a_policy_that_answers_nan_at_export_is_blamed_itself(plain, tmp_path: Path, body: str):
+    with pytest.raises(GraphError, match=r"The output 'y' is not finite \(the answer to observation 0\)\.") as caught:
+        export(plain(f"return ({body})[:, :2]"), tmp_path / "out")
+    assert caught.value.fix.startswith("correct the policy: ")
+    assert "do not execute" not in caught.value.fix

@@ -126,12 +126,26 @@ def test_a_recording_without_an_input_is_named_as_the_user_knows_it(policy_dir: 
         copy_assets(described, tmp_path / "out")
     assert caught.value.fix.startswith("record every input of the spec under its name")
     (policy_dir / "evaluation.npz").write_bytes(b"PK")
-    copy_assets(described, tmp_path / "broken")
+    with pytest.raises(DataError, match=rf"^{policy_dir}/evaluation.npz cannot be read: "):
+        copy_assets(described, tmp_path / "broken")
     data = bytearray((policy_dir / "calibration.npz").read_bytes())
     at = data.rindex(b"PK\x01\x02")  # the last entry of the directory: a version that nobody reads yet
     data[at + 6 : at + 8] = b"\xff\xff"
     (policy_dir / "evaluation.npz").write_bytes(data)
-    copy_assets(described, tmp_path / "other")  # whoever reads it says what is wrong
+    with pytest.raises(DataError, match=rf"^{policy_dir}/evaluation.npz cannot be read: "):
+        copy_assets(described, tmp_path / "other")
+
+
+@pytest.mark.parametrize("key", ["calibration", "evaluation"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_sample_that_is_not_finite_is_named_in_the_file_of_the_user(policy_dir: Path, tmp_path: Path, key, value):
+    with np.load(policy_dir / f"{key}.npz") as stored:
+        arrays = dict(stored)
+    arrays["proprio"][[2, 4], 1] = value
+    np.savez(policy_dir / f"{key}.npz", **arrays)
+    message = rf"^'proprio' in {policy_dir}/{key}.npz is not finite in 2 of \d+ samples; the first is sample 2\.$"
+    with pytest.raises(DataError, match=message.removesuffix("$")):
+        copy_assets(read_description(policy_dir), tmp_path / "out")
 
 
 def test_text_that_is_no_utf8(tmp_path: Path):

@@ -21,7 +21,7 @@ from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.rebuild.differences import compare_bundles, explain, listed
+from vlatool.rebuild.differences import Compared, compare_bundles, explain, listed
 from vlatool.rebuild.rebuild import Rebuilt, build_record, rebuild, version_changes
 from vlatool.report import Report
 from vlatool.sources import source_stage
@@ -427,3 +427,21 @@ def test_the_same_command_in_another_process_gives_the_same_bytes(policy_templat
         names = {path.relative_to(left) for path in left.rglob("*") if path.is_file()}
         assert names == {path.relative_to(right) for path in right.rglob("*") if path.is_file()}
         assert [name for name in names if (left / name).read_bytes() != (right / name).read_bytes()] == []
+
+
+@pytest.mark.parametrize(
+    ("differing", "first"),
+    [
+        (("golden/golden.npz", GRAPH, "manifest.json"), GRAPH),
+        ((GRAPH, "data/calibration.npz"), "data/calibration.npz"),
+        (("golden/golden.npz", "assets/statistics.json"), "assets/statistics.json"),
+        (("manifest.json", "golden/golden.npz"), "golden/golden.npz"),
+        (("manifest.json",), "manifest.json"),
+        (("graphs/main.onnx", "module/edits.json", "recipe.yaml"), "module/edits.json"),
+    ],
+)
+def test_the_file_that_others_were_made_from_is_the_first_difference(differing, first):
+    files = tuple(Compared(name, 1, False, "other") for name in sorted(differing))
+    found = Rebuilt(Bundle(Path("b"), None), "", "", files, ()).first_difference  # type: ignore[arg-type]
+    assert found is not None
+    assert found.file == first

@@ -109,7 +109,7 @@ def test_a_broken_library_file_is_a_spec_error_and_no_traceback(tmp_path: Path, 
     [
         ("{", "'instruction' is not valid JSON"),
         ([], "must be a mapping"),
-        ({}, "neither 'model' .* nor kind 'words'"),
+        ({}, "neither 'model' .* nor the kind 'words'"),
         ({"kind": "letters"}, "is not a tokenizer"),
         ({"kind": "words"}, "needs 'words'"),
         ({**WORDS, "pad": "0"}, "'pad' and 'unknown'"),

@@ -178,7 +178,10 @@ def compare_success(baseline: Row, row: Row) -> Row:
         DataError: when the two rows did not play the same seeds.
     """
     if baseline.raw["seed"] != row.raw["seed"]:
-        raise DataError("The two evaluations did not play the same episodes, so they cannot be paired.")
+        raise DataError(
+            "The two evaluations did not play the same episodes, so they cannot be paired.",
+            "play both again with the same --episodes and tasks",
+        )
     pairs = list(zip(baseline.raw["success"], row.raw["success"], strict=True))
     lost = sum(before > after for before, after in pairs)
     won = sum(before < after for before, after in pairs)

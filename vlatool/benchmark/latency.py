@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from pydantic import Field, PrivateAttr
 
 from vlatool.bundle.bundle import MANIFEST, Bundle
+from vlatool.bundle.unexported import export_command
 from vlatool.errors import BundleError, GraphError, MissingExtra, TargetError, UsageError
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import one_line
@@ -96,18 +97,31 @@ class Latency(Measure):
         """Every bundle can be opened, and the options fit each other."""
         for name in ("duration", "rate", "sustained", "memory_mb"):
             if not math.isfinite(getattr(self, name)):
-                raise UsageError(f"--{name.replace('_', '-')} is {getattr(self, name)}; allowed: a number from 0.")
+                raise UsageError(
+                    f"--{name.replace('_', '-')} is {getattr(self, name)}; allowed: a number from 0.",
+                    "give a number that is not negative",
+                )
         if self.rate and self.against:
-            raise UsageError("--rate paces one policy; measure the further ones in runs of their own.")
+            raise UsageError(
+                "--rate paces one policy; measure the further ones in runs of their own.",
+                "leave --against out, or leave --rate out to compare them back to back",
+            )
         if self.rate * self.duration > MOST:
             raise UsageError(
                 f"--rate {self.rate:g} for {self.duration:g} s are {self.rate * self.duration:,.0f} ticks; "
-                f"allowed: {MOST:,}, each of which is kept."
+                f"allowed: {MOST:,}, each of which is kept.",
+                f"give a lower --rate, or a --duration of at most {MOST / self.rate:.3g} s",
             )
         if self.rate and (self.iterations or FEWEST_TICKS) > self.rate * LONGEST_S:
-            raise UsageError(f"--rate {self.rate:g} takes more than a day for {self.iterations or FEWEST_TICKS} ticks.")
+            raise UsageError(
+                f"--rate {self.rate:g} takes more than a day for {self.iterations or FEWEST_TICKS} ticks.",
+                "give a higher --rate, or fewer --iterations",
+            )
         if self.sustained and self.rate:
-            raise UsageError("--sustained calls back to back; with --rate pass --duration.")
+            raise UsageError(
+                "--sustained calls back to back; with --rate pass --duration.",
+                "leave --sustained out, and give its seconds as --duration",
+            )
         if self.emulate and profile is None:
             raise UsageError("--emulate needs a board.", "name it: --profile NAME (see: vlatool profiles list)")
         if self.mode and not self.emulate:
@@ -128,7 +142,10 @@ class Latency(Measure):
         mode = profile.mode(self.mode or None)
         cores = int(mode.cores.get("cpu", profile.units["cpu"].cores.value if "cpu" in profile.units else 0))
         if cores and self.threads > cores:
-            raise UsageError(f"--threads is {self.threads}; {profile.name} has {cores} processors in this mode.")
+            raise UsageError(
+                f"--threads is {self.threads}; {profile.name} has {cores} processors in this mode.",
+                f"give --threads {cores} or fewer, or another --mode of the board",
+            )
         memory = 1e3 * profile.usable_memory_gb.value
         limited = self.model_copy(update={"cores": self.cores or cores, "memory_mb": self.memory_mb or memory})
         limited._board = profile.name
@@ -139,7 +156,9 @@ class Latency(Measure):
         bundles = [source, *(Bundle.open(path) for path in self.against)]
         for bundle in bundles:
             if not bundle.manifest.graphs and "factory" not in bundle.manifest.source:
-                raise BundleError(f"{bundle.path} has nothing to run.")
+                raise BundleError(
+                    f"{bundle.path} has nothing to run.", f"export it first: {export_command(bundle.path)}"
+                )
             if self.memory_mb and not bundle.manifest.graphs:
                 raise UsageError(f"The memory of eager torch is not limited: {bundle.path} has no graph.", "export it")
         job = self._job(bundles)
@@ -256,11 +275,16 @@ def processors(text: str) -> tuple[int, ...]:
     if not text:
         return ()
     if not re.fullmatch(r"\d{1,4}(-\d{1,4})?(,\d{1,4}(-\d{1,4})?)*", text):
-        raise UsageError(f"--pin is {text!r}; allowed: processors such as 0-3 or 2,4.")
+        raise UsageError(
+            f"--pin is {text!r}; allowed: processors such as 0-3 or 2,4.", "write numbers and ranges, such as --pin 0-3"
+        )
     ends = [[int(end) for end in part.split("-")] for part in text.split(",")]
     numbers = sorted({number for end in ends for number in range(end[0], end[-1] + 1)})
     if not numbers:
-        raise UsageError(f"--pin is {text!r}, which names no processor; allowed: such as 0-3 or 2,4.")
+        raise UsageError(
+            f"--pin is {text!r}, which names no processor; allowed: such as 0-3 or 2,4.",
+            "write numbers and ranges in rising order, such as --pin 0-3",
+        )
     return tuple(numbers)
 
 

@@ -13,7 +13,7 @@ from vlatool.boards.select import Choice, Wants, choose, in_the_cloud
 from vlatool.boards.simulate import Change, bounds, changes, parts_of, timeline
 from vlatool.boards.torch_workload import counted_apart
 from vlatool.bundle.bundle import MANIFEST, Bundle
-from vlatool.errors import DataError, OutputError, SourceError, UsageError, nearest
+from vlatool.errors import DataError, OutputError, SourceError, UsageError, instead, nearest
 from vlatool.export.onnx import ExportOnnx
 from vlatool.files.written import note_file
 from vlatool.graph.stored import digest, read_workload, refuse_other, write_workload
@@ -63,7 +63,9 @@ def select_boards(source: str, asked: Asked, context: Context, calibration: Path
         raise UsageError("--per-chunk asks how often the loop ticks.", "give --hz, too, or leave it out")
     for precision in asked.precisions:
         if precision not in PRECISIONS:
-            raise UsageError(f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.")
+            raise UsageError(
+                f"--precision is '{precision}'; {nearest(precision, PRECISIONS)}.", instead(precision, PRECISIONS)
+            )
     if asked.platform:
         sheet = load_platform(asked.platform)
         asked = replace(
@@ -154,7 +156,10 @@ def carry_count(source: str, context: Context) -> Path:
     bundle = opened(source, context)
     if not _may_carry(bundle):
         if bundle.manifest.graphs or "factory" not in bundle.manifest.source:
-            raise UsageError(f"{source} is counted without torch; only a policy with code carries a count.")
+            raise UsageError(
+                f"{source} is counted without torch; only a policy with code carries a count.",
+                "leave --carry-count out: it is counted wherever it is used",
+            )
         if is_changed(bundle):
             raise UsageError(f"{source} is a bundle; only a policy with code carries a count.", "leave it out")
         raise UsageError(
@@ -200,7 +205,10 @@ def simulated(
     profile.mode(name)
     asked = Candidate(profile, name, engine or profile.engine, precision)
     if precision and precision not in asked.figures.dtypes:
-        raise UsageError(f"--precision is '{precision}'; {nearest(precision, asked.figures.dtypes)}.")
+        raise UsageError(
+            f"--precision is '{precision}'; {nearest(precision, asked.figures.dtypes)}.",
+            instead(precision, asked.figures.dtypes),
+        )
     bundle = opened(source, context)
     spec, load = bundle.manifest.spec, counted(bundle, context)
     candidate = asked if engine or precision else replace(asked, engine=_engine_of(bundle, profile, load))

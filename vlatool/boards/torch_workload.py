@@ -40,7 +40,9 @@ def counted_apart(bundle: Bundle, tell: Callable[[str, float | None], None]) -> 
     values = children.call("vlatool.boards.torch_workload:count", job, tell, about, PRELOAD)
     counted = from_values(values)
     if counted is None:
-        raise SourceError(f"{about} gave a count that is not one.")
+        raise SourceError(
+            f"{about} gave a count that is not one.", "let the policy's code write to its own files alone"
+        )
     return counted
 
 

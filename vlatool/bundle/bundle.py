@@ -97,7 +97,10 @@ class Bundle:
         try:
             stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
         except OSError as error:
-            raise BundleError(f"{self.path} cannot be read: {error.strerror}.") from error
+            raise BundleError(
+                f"{self.path} cannot be read: {error.strerror}.",
+                "let this user read the directory and all that is in it",
+            ) from error
         if stranger and (self.path / stranger).is_symlink():
             raise BundleError(f"The bundle {self.path} holds {stranger}, which is a link; a bundle has none.", FIX)
         if stranger:
@@ -228,7 +231,7 @@ def hash_file(path: Path) -> str:
 
 def _read_manifest(root: Path) -> Any:
     if not root.exists():
-        raise BundleError(f"No bundle at {root}.")
+        raise BundleError(f"No bundle at {root}.", "check the path; make one with: vlatool export SOURCE -o BUNDLE")
     path = root / MANIFEST
     if not path.is_file():
         entries = ", ".join(sorted(entry.name for entry in root.iterdir())[:6]) if root.is_dir() else "a file"

@@ -45,6 +45,8 @@ class TensorSpec:
         statistics: ``file#key`` of the statistics that the normalisation needs; file relative to the assets.
         tokenizer: File of the tokenizer, relative to the assets (``kind: text``).
         max_tokens: Number of ids that the tokenizer pads or cuts to (``kind: text``).
+        finite: False for an input of floats in which the policy itself handles NaN and infinity, such as a depth image
+            without a return; everywhere else they are refused.
     """
 
     name: str
@@ -58,6 +60,7 @@ class TensorSpec:
     statistics: str = ""
     tokenizer: str = ""
     max_tokens: int = 0
+    finite: bool = True
 
     def __post_init__(self) -> None:
         self._check_words()
@@ -118,6 +121,14 @@ class TensorSpec:
             raise SpecError(
                 f"The discrete output '{self.name}' needs 'labels', one for each action.",
                 "name them, or give the last axis of 'shape' as a number: the labels are then its indices",
+            )
+
+        if not isinstance(self.finite, bool):
+            raise SpecError(f"'{self.name}' has finite {shown(self.finite)}; it must be true or false.")
+        if not self.finite and (self.kind != "tensor" or not self.dtype.startswith("float")):
+            raise SpecError(
+                f"'{self.name}' says finite: false, but is {'text' if self.kind == 'text' else self.dtype}.",
+                "leave it out: NaN and infinity are values of floats alone",
             )
 
     def assets(self) -> list[str]:
@@ -198,6 +209,12 @@ class PolicySpec:
             if names.count(name) > 1:
                 raise SpecError(
                     f"The name '{name}' occurs {names.count(name)} times; each input and output needs its own."
+                )
+        for tensor in self.outputs:
+            if not tensor.finite:
+                raise SpecError(
+                    f"The output '{tensor.name}' says finite: false; a policy answers finite values.",
+                    "leave it out there; it is for inputs",
                 )
         if not self.action.shape:
             raise SpecError(f"The action '{self.action.name}' has no axes; write its shape as [1, 1].")

@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from vlatool import registry
+from vlatool.cli._once import once
 from vlatool.cli._stages import DEFAULTS, StageGroup, built, failing
 from vlatool.errors import PluginError, UsageError, nearest
 from vlatool.stage.build import stage_kinds
@@ -63,4 +64,4 @@ def _built(source: Any, name: str) -> Any:
     source._add_completion = False
     command = typer.main.get_command(source)
     command.name = name
-    return command
+    return once(command)

@@ -181,7 +181,10 @@ def refuse_video(
     if video is None:
         return
     if out is not None and out.absolute() in (video.absolute(), *video.absolute().parents):
-        raise UsageError(f"--video {video} is in the output {out}, which appears whole or not at all.")
+        raise UsageError(
+            f"--video {video} is in the output {out}, which appears whole or not at all.",
+            "name a file beside the output",
+        )
     refuse_inputs(video, inputs)
     check_video(video, force=force)
 
@@ -265,6 +268,10 @@ def _printable(value: Any) -> Any:
     return value
 
 
+MISSED = "change the policy, the options or the limit: each limit stands above with what was measured"
+UNDECIDED = "measure more: the report says what would decide (--episodes, --samples, --iterations)"
+
+
 def raise_verdict(report: Report) -> None:
     """Raise for a verdict that is not good.
 
@@ -273,6 +280,6 @@ def raise_verdict(report: Report) -> None:
         Inconclusive: for the verdict ``inconclusive``.
     """
     if report.verdict == "fail":
-        raise GateFailed(report.summary[0] if report.summary else "The limits are not kept.")
+        raise GateFailed(report.summary[0] if report.summary else "The limits are not kept.", MISSED)
     if report.verdict == "inconclusive":
-        raise Inconclusive(report.summary[0] if report.summary else "The samples cannot decide.")
+        raise Inconclusive(report.summary[0] if report.summary else "The samples cannot decide.", UNDECIDED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,19 @@ CLICK_EXCEPTION: Any = next(base for base in typer.BadParameter.__mro__ if base.
 """The base of usage errors: from the click inside typer, or the one that it imports, depending on its version."""
 KEEPING = frozenset(("optimize", "export", "quantize"))
 """Commands whose finished stages stay in the cache when they are interrupted."""
+NO_ROBOT = (
+    "look at what it was asked for; where that is an observation, make the bundle otherwise: vlatool explain BUNDLE"
+)
+"""What helps at a command line where an answer is not finite."""
+READABLE = "see that it is there, that this user may use it, and that its disk is well"
+OF_SYSTEM = {
+    errno.ENOENT: "check the path",
+    errno.ENOSPC: "free some space",
+    errno.EDQUOT: "free some space",
+    errno.EMFILE: "raise the limit on open files (ulimit -n)",
+    errno.EFBIG: "raise the limit on file sizes (ulimit -f)",
+}
+"""What helps where the operating system refuses something."""
 TYPES = ("OSError", "MemoryError", "Interrupted", "Terminated", "InternalError")
 """Types of failures beside the classes of ``vlatool.errors``."""
 
@@ -51,7 +65,10 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
     if isinstance(error, CLICK_EXCEPTION):
         return _usage(error)
     if isinstance(error, VlatoolError):
-        return Failure(type(error).__name__, error.message, error.fix, error.exit_code)
+        from vlatool.runtime.contract import ON_A_ROBOT
+
+        fix = NO_ROBOT if error.fix.startswith(ON_A_ROBOT) else error.fix
+        return Failure(type(error).__name__, error.message, fix, error.exit_code)
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         kept = "; finished stages are kept" if KEEPING.intersection(words) else ""
         return Failure("Interrupted", f"interrupted{kept}", "", INTERRUPTED)
@@ -59,7 +76,9 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
         return Failure("OSError", "the reader of the output is gone.", "", OK)
     if isinstance(error, OSError):
         where = error.filename or ("standard output" if _printing(error) else "a file")
-        return Failure("OSError", f"{where}: {error.strerror or error}.", "", INPUT)
+        return Failure(
+            "OSError", f"{where}: {error.strerror or error}.", OF_SYSTEM.get(error.errno or 0, READABLE), INPUT
+        )
     if isinstance(error, MemoryError):
         return Failure("MemoryError", "out of memory.", "use a machine with more memory, or a smaller policy", INPUT)
     if isinstance(error, SystemExit):

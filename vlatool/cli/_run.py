@@ -97,7 +97,10 @@ def transform(
     bundle: Bundle | None
     refuse_existing(out, force, source, file_or_none(profile), *named_files(stage), kind=BUNDLE)
     if events is not None and out.absolute() in (events.absolute(), *events.absolute().parents):
-        raise UsageError(f"--events {events} is in the output {out}, which appears whole or not at all.")
+        raise UsageError(
+            f"--events {events} is in the output {out}, which appears whole or not at all.",
+            "name a directory beside the output",
+        )
     board = load_profile(profile) if profile else None
     stage = stage.on(board) if board else stage.on_this_host()
     then = following(stage, board)

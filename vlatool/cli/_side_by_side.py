@@ -32,17 +32,23 @@ def read_reports(paths: Sequence[Path]) -> list[Report]:
         places = (path, path / REPORT, path / "reports" / REPORT)
         file = next((place for place in places if place.is_file()), path).resolve()
         if file in seen:
-            raise UsageError(f"{seen[file]} and {path} are the same report; compare takes each once.")
+            raise UsageError(
+                f"{seen[file]} and {path} are the same report; compare takes each once.", "name each report once"
+            )
         seen[file] = path
     reports = [_read(path) for path in paths]
     for path, report in zip(paths, reports, strict=True):
         if report.kind not in COMPARABLE:
             raise UsageError(
                 f"{path} is a report of the kind {report.kind!r}, which compare cannot put beside another; "
-                f"allowed: {', '.join(COMPARABLE)}."
+                f"allowed: {', '.join(COMPARABLE)}.",
+                "name reports of one of these kinds",
             )
         if not report.rows:
-            raise DataError(f"The report {path} has no rows, so there is nothing to compare.")
+            raise DataError(
+                f"The report {path} has no rows, so there is nothing to compare.",
+                "measure again, and name the new report",
+            )
     first = _measured(reports[0])
     for path, report in zip(paths[1:], reports[1:], strict=True):
         if not first & _measured(report):

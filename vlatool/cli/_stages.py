@@ -17,7 +17,8 @@ from pydantic_core import PydanticUndefined
 from vlatool import registry
 from vlatool.cli import _complete, _run, _torchrun
 from vlatool.cli._default import DefaultGroup
-from vlatool.errors import PluginError, UsageError, nearest
+from vlatool.cli._once import once
+from vlatool.errors import PluginError, UsageError, instead, nearest
 from vlatool.stage.base import Measure, Stage, Transform
 from vlatool.stage.build import validated
 
@@ -54,7 +55,10 @@ class StageGroup(DefaultGroup):
         known = self.list_commands(ctx)
         other = "" if self.names_command(ctx, args) or ctx.resilient_parsing else args[0]
         if difflib.get_close_matches(other, known, n=1) and not Path(other).exists():
-            raise UsageError(f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.")
+            raise UsageError(
+                f"Unknown {registry.noun_of(self.name or '')} '{other}'; {nearest(other, known)}.",
+                instead(other, known),
+            )
         return super().parse_args(ctx, args)
 
 
@@ -64,7 +68,7 @@ def built(function: Callable[..., Any], name: str, text: str | None = None, **se
     single.command(name, help=text, context_settings=settings)(function)
     command = typer.main.get_command(single)
     command.name = name
-    return command
+    return once(command)
 
 
 def failing(name: str, error: PluginError) -> Any:

@@ -112,13 +112,16 @@ def _amount(option: str, text: str, units: dict[str, int], example: str) -> floa
     """Return what a person wrote as a number and a unit, in the smallest unit."""
     match = re.fullmatch(r"\s*(\d{1,15}(?:\.\d{1,9})?)\s*([A-Za-z]+)\s*", text)
     if match is None:
-        raise UsageError(f"{option} is '{text[:40]}'; it must be a number and a unit, such as {example}.")
+        raise UsageError(
+            f"{option} is '{text[:40]}'; it must be a number and a unit, such as {example}.",
+            f"write it as {option} {example}",
+        )
     unit = next((name for name in units if name.lower() == match[2].lower()), None)
     if unit is None:
-        raise UsageError(f"{option} is '{text[:40]}'; {nearest(match[2], units)}.")
+        raise UsageError(f"{option} is '{text[:40]}'; {nearest(match[2], units)}.", f"write it as {option} {example}")
     value = float(match[1]) * units[unit]
     if not math.isfinite(value):
-        raise UsageError(f"{option} is '{text[:40]}', which is too large.")
+        raise UsageError(f"{option} is '{text[:40]}', which is too large.", f"give less, such as {option} {example}")
     return value
 
 

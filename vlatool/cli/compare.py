@@ -38,11 +38,17 @@ def compare(
     from vlatool.benchmark.latency import Latency
 
     if len(paths) < 2:
-        raise UsageError("compare needs two or more bundles, or two or more reports.")
+        raise UsageError(
+            "compare needs two or more bundles, or two or more reports.",
+            "name them one after the other: vlatool compare ONE OTHER",
+        )
     refuse_existing(output, force, *paths)
     for path in paths:
         if not path.exists():
-            raise DataError(f"No report or bundle at {path}.")
+            raise DataError(
+                f"No report or bundle at {path}.",
+                "check the path; a report is report.json or the directory that holds it",
+            )
     bundles = [(path / MANIFEST).is_file() for path in paths]
     if all(bundles):
         with progress() as context:
@@ -50,7 +56,10 @@ def compare(
             stage.check(None, None)
             report = replace(stage.run(Bundle.open(paths[0]), context), kind="compare")
     elif any(bundles):
-        raise UsageError("compare takes bundles or reports, not both at once.")
+        raise UsageError(
+            "compare takes bundles or reports, not both at once.",
+            "measure the bundles first (vlatool benchmark latency -o DIR); or name bundles alone",
+        )
     else:
         report = side_by_side(paths, read_reports(paths))
     show(report, as_json=as_json, out=output, force=force, raw=raw)

@@ -169,7 +169,10 @@ def _place(junit: Path, *inputs: str | Path | None) -> None:
         raise OutputError(f"--junit {junit} is a directory.", "name a file")
     above = next(folder for folder in junit.absolute().parents if folder.exists())
     if not (above.is_dir() and os.access(above, os.W_OK)):
-        raise OutputError(f"--junit {junit} cannot be written: {above} is not a writable directory.")
+        raise OutputError(
+            f"--junit {junit} cannot be written: {above} is not a writable directory.",
+            "name a file in a directory that exists and may be written to",
+        )
     refuse_inputs(junit, inputs)
     if os.path.lexists(junit):
         refuse_file(junit, force=True)

@@ -115,17 +115,24 @@ def _check(asked: Asked) -> None:
     }  # fmt: skip
     for name, value in above_zero.items():
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise UsageError(f"--{name} is {value:g}; allowed: a number above 0.")
+            raise UsageError(
+                f"--{name} is {value:g}; allowed: a number above 0.", "give a number above 0, or leave the option out"
+            )
     if not (math.isfinite(asked.network_ms) and asked.network_ms >= 0):
-        raise UsageError(f"--network-ms is {asked.network_ms:g}; allowed: 0 or more.")
+        raise UsageError(
+            f"--network-ms is {asked.network_ms:g}; allowed: 0 or more.", "give a time that is not negative"
+        )
     if asked.hours_a_day > 24:
-        raise UsageError(f"--hours is {asked.hours_a_day:g}; a day has 24.")
+        raise UsageError(f"--hours is {asked.hours_a_day:g}; a day has 24.", "give a number above 0, at most 24")
 
 
 def _finite(**numbers: float) -> None:
     for name, value in numbers.items():
         if not math.isfinite(value):
-            raise UsageError(f"--{name} is {value:g}; allowed: a number from 0.")
+            raise UsageError(
+                f"--{name} is {value:g}; allowed: a number from 0.",
+                "give a number that is not negative, or leave the option out",
+            )
 
 
 @app.command("score")

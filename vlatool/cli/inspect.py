@@ -115,7 +115,14 @@ def _tensor(tensor: TensorSpec) -> str:
     shape = "x".join(str(axis) for axis in tensor.shape)
     unit = _units(tensor.units()) if tensor.unit else ""
     rest = " ".join(
-        part for part in (unit and f"[{unit}]", tensor.mode, tensor.normalisation.replace("none", "")) if part
+        part
+        for part in (
+            unit and f"[{unit}]",
+            tensor.mode,
+            tensor.normalisation.replace("none", ""),
+            "" if tensor.finite else "takes NaN and infinity",
+        )
+        if part
     )
     labels = f" ({', '.join(tensor.labels)})" if tensor.labels else ""
     kind = "text -> " if tensor.kind == "text" else ""

@@ -144,7 +144,10 @@ def _limits(
     limits |= {name: share(text, f"--{name.replace('_', '-')}") for name, text in shares.items() if text is not None}
     for name, value in numbers.items():
         if value is not None and not math.isfinite(value):
-            raise UsageError(f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.")
+            raise UsageError(
+                f"--{name.replace('_', '-')} is {value}; allowed: a number above 0.",
+                "give a number above 0, or leave the option out",
+            )
         limits |= {} if value is None else {name: value}
     return limits | ({"accept": tuple(accept)} if accept else {})
 
@@ -178,7 +181,10 @@ def _pruning(pruning: Pruning, trials: int | None, steps: int | None, study: str
         recover = [{name: {**(options or {}), "steps": steps} if name == TRAINS else options}
                    for stage in pruning.recover for name, options in stage.items()]  # fmt: skip
         if not any(TRAINS in stage for stage in recover):
-            raise UsageError(f"--train-steps is of {TRAINS}, which the recipe does not name under pruning.recover.")
+            raise UsageError(
+                f"--train-steps is of {TRAINS}, which the recipe does not name under pruning.recover.",
+                "leave --train-steps out, or name one of them under pruning.recover",
+            )
         update["recover"] = tuple(recover)
     return pruning.model_copy(update={name: value for name, value in update.items() if value is not None})
 
@@ -218,6 +224,7 @@ def share(text: str, option: str = "--max-drop") -> float:
         more = ", METRIC=VALUE such as relative_error=0.04, or an action error such as 0.002m"
         raise UsageError(
             f"{option} is '{text}'; allowed: a percentage such as 1%, a share from 0 to 1 such as 0.01"
-            f"{more if option == '--max-drop' else ''}."
+            f"{more if option == '--max-drop' else ''}.",
+            f"write it as {option} 1%",
         )
     return value

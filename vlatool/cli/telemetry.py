@@ -31,9 +31,11 @@ def telemetry(
 
     for name, value in (("seconds", seconds), ("period", period)):
         if not (math.isfinite(value) and 0 < value <= LONGEST_S):
-            raise UsageError(f"--{name} is {value:g}; allowed: above 0, up to {LONGEST_S:g}.")
+            raise UsageError(
+                f"--{name} is {value:g}; allowed: above 0, up to {LONGEST_S:g}.", f"give seconds up to {LONGEST_S:g}"
+            )
     if not root.is_dir():
-        raise DataError(f"No such directory: {root}.")
+        raise DataError(f"No such directory: {root}.", "check the path; leave --root out to read this machine")
     with Recorder(open_all(root), period) as recorder:
         time.sleep(seconds)
     recorded = recorder.recorded

@@ -11,6 +11,8 @@ from vlatool.data._drawn import Drawn as Drawn
 from vlatool.data._drawn import read_drawn as read_drawn
 from vlatool.data._drawn import save_drawn as save_drawn
 from vlatool.data._halves import halves as halves
+from vlatool.data._not_finite import takes_not_finite as takes_not_finite
+from vlatool.data._not_finite import with_not_finite as with_not_finite
 from vlatool.data._observations import CALIBRATION as CALIBRATION
 from vlatool.data._observations import EVALUATION as EVALUATION
 from vlatool.data._observations import Observations as Observations
@@ -29,4 +31,5 @@ from vlatool.data._played import played_observations as played_observations
 from vlatool.data._recording import RECORD_ALL as RECORD_ALL
 from vlatool.data._recording import Moment as Moment
 from vlatool.data._recording import Recording as Recording
+from vlatool.data._recording import checked as checked
 from vlatool.data._recording import read_recording as read_recording

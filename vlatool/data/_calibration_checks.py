@@ -102,7 +102,7 @@ def _of_channels(where: str, tensor: TensorSpec, values: Array) -> Iterator[str]
     if len(values) < 2 or not values.size:
         return
     rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values.reshape(-1, 1)
-    constant = np.flatnonzero(rows.min(0) == rows.max(0)).tolist()
+    constant = np.flatnonzero(rows.min(0) == rows.max(0)).tolist()  # never where one is NaN
     if constant:
         named = ", ".join(
             f"{channel}{f' ({tensor.labels[channel]})' if tensor.labels else ''} = {float(rows[0, channel]):g}"
@@ -123,6 +123,7 @@ def _of_distance(where: str, tensor: TensorSpec, values: Array, numbers: Sequenc
     distances = np.abs((values.astype(np.float64) - normaliser.offset) / normaliser.scale).reshape(
         len(values), -1, values.shape[-1]
     )
+    distances[~np.isfinite(distances)] = 0
     if not (distances > FAR).any():
         return
     far = np.flatnonzero((distances > FAR).any(axis=(1, 2)))

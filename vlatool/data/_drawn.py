@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
+from vlatool.data._not_finite import KINDS, with_not_finite
 from vlatool.data._recording import Recording
 from vlatool.errors import DataError
 from vlatool.runtime.statistics import Normaliser, load_normaliser
@@ -58,7 +59,8 @@ class Drawer:
     """
 
     def __init__(self, bundle: Bundle, recordings: Sequence[Recording] = ()) -> None:
-        self._inputs = bundle.manifest.spec.inputs
+        self._spec = bundle.manifest.spec
+        self._inputs = self._spec.inputs
         self._recordings = [recording for recording in recordings if len(recording)]
         assets = bundle.path / "assets"
         texts = [tensor for tensor in self._inputs if tensor.kind == "text"]
@@ -87,7 +89,10 @@ class Drawer:
 
     def _drawn(self, random: np.random.Generator, structured: Structures) -> dict[str, Any]:
         like = self._recorded(random) if self._recordings else {}
-        return {tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs}
+        values = {
+            tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs
+        }
+        return with_not_finite(self._spec, [values], int(random.integers(len(KINDS))))[0]
 
     def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator, structured: Structures) -> Any:
         if tensor.kind == "text":
@@ -122,9 +127,15 @@ def words_of(path: Path) -> list[str]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError(f"The vocabulary {path} cannot be read: {error}.") from error
+        raise DataError(
+            f"The vocabulary {path} cannot be read: {error}.",
+            "copy the bundle again from where it was made, or make it again",
+        ) from error
     if not isinstance(data, dict) or not isinstance(data.get("model", {}), dict):
-        raise DataError(f"The vocabulary {path} is not a mapping of words or tokens.")
+        raise DataError(
+            f"The vocabulary {path} is not a mapping of words or tokens.",
+            "export the policy again: the vocabulary in the bundle is not what a policy can be asked with",
+        )
     listed = data.get("words") if data.get("kind") == "words" else data.get("model", {}).get("vocab", ())
     tokens = [item[0] if isinstance(item, list) else item for item in listed or ()]
     if data.get("kind") == "words":
@@ -211,6 +222,9 @@ def _physical(values: Array, normaliser: Normaliser | None, like: Any) -> Array:
     if like is None:
         return values
     recorded = np.asarray(like, np.float64)
+    recorded = recorded[np.isfinite(recorded)] if recorded.size else recorded
+    if not recorded.size:
+        return values
     return np.asarray(values * (recorded.std() or 1.0) + recorded.mean())
 
 

@@ -12,6 +12,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data._drawn import sentence, words_of
 from vlatool.data._halves import LEAST, halves
+from vlatool.data._not_finite import with_not_finite
 from vlatool.data._recording import Moment, Recording, read_recording
 from vlatool.errors import DataError
 
@@ -115,9 +116,12 @@ def recorded_observations(source: Bundle, count: int, path: Path | None = None) 
 
 
 def observations_for(source: Bundle, count: int, path: Path | None = None) -> list[dict[str, Any]]:
-    """Return recorded observations, in memory, or synthetic ones when the bundle carries none."""
+    """Return recorded observations, in memory, or synthetic ones when the bundle carries none.
+
+    Three in four hold NaN and infinity in inputs that take them, whatever was recorded.
+    """
     observations = list(recorded_observations(source, count, path))
-    return observations or synthetic_observations(source, count)
+    return with_not_finite(source.manifest.spec, observations) or synthetic_observations(source, count)
 
 
 def synthetic_observations(source: Bundle, count: int, seed: int = 0) -> list[dict[str, Any]]:
@@ -135,7 +139,8 @@ def random_observations(
 ) -> list[dict[str, Any]]:
     """Return seeded random observations that fit a spec; its instructions are of ``words``: input -> vocabulary."""
     random = np.random.default_rng(seed)
-    return [{each.name: _synthetic(each, random, words or {}) for each in spec.inputs} for _ in range(count)]
+    drawn = [{each.name: _synthetic(each, random, words or {}) for each in spec.inputs} for _ in range(count)]
+    return with_not_finite(spec, drawn)
 
 
 def _words(source: Bundle, tensor: TensorSpec) -> list[str]:

@@ -31,6 +31,9 @@ class Encoded(dict[str, Array]):
     """Whether an episode begins with it, or nothing before it is known."""
 
 
+AGAIN = "train again: quantize qat writes it"
+
+
 def kept_rows(most: int, row_bytes: int) -> int:
     """Return how many observations of a size are kept."""
     return min(most, max(LEAST, BYTES // max(1, row_bytes)))
@@ -45,7 +48,7 @@ def played_observations(source: Bundle) -> list[Encoded]:
     if PLAYED not in source.manifest.files:
         return []
     path = source.file(PLAYED)
-    arrays = open_npz(path)
+    arrays = open_npz(path, fix=AGAIN)
     for tensor in source.manifest.spec.inputs:
         _check(path, tensor, arrays.get(tensor.name))
     names = [tensor.name for tensor in source.manifest.spec.inputs]
@@ -64,9 +67,9 @@ def _check(path: Path, tensor: TensorSpec, array: Array | None) -> None:
     if array.shape[1:] != tensor.shape[1:] or array.dtype != np.dtype(tensor.dtype) or not array.ndim:
         wanted = f"{tensor.dtype} (N, {', '.join(map(str, tensor.shape[1:]))})"
         raise _broken(path, f"'{name}' is {array.dtype} {array.shape}; wanted {wanted}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    if array.dtype.kind == "f" and tensor.finite and not np.isfinite(array).all():
         raise _broken(path, f"'{name}' has values that are not finite")
 
 
 def _broken(path: Path, why: str) -> DataError:
-    return DataError(f"{path} does not fit the policy: {why}.", "train again: quantize qat writes it")
+    return DataError(f"{path} does not fit the policy: {why}.", AGAIN)

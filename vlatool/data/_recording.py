@@ -143,11 +143,14 @@ def read_recording(path: Path, spec: PolicySpec) -> Recording:
         DataError: when the file is missing, of an unknown format, corrupt, or does not fit the spec.
     """
     if not path.exists():
-        raise DataError(f"Data file {path} not found.")
+        raise DataError(f"Data file {path} not found.", "check the path, and record the file if there is none")
     known = registry.names("data")
     suffix = path.suffix.removeprefix(".")
     if suffix not in known:
-        raise DataError(f"{path} is of an unknown format; {nearest(suffix, known)}.")
+        raise DataError(
+            f"{path} is of an unknown format; {nearest(suffix, known)}.",
+            "store it as .npz: np.savez(FILE, NAME=values)",
+        )
     reader: Any = registry.load("data", suffix)
     return checked(path, reader.read(path), spec)
 
@@ -171,9 +174,12 @@ def checked(path: Path, arrays: Mapping[str, Values], spec: PolicySpec) -> Recor
     if len(set(lengths.values())) != 1:
         raise DataError(f"{path} has different numbers of samples: {lengths}.", "each array needs one row a sample")
     if not next(iter(lengths.values())):
-        raise DataError(f"{path} holds no samples.")
+        raise DataError(f"{path} holds no samples.", RECORD_ALL)
     if episodes is not None and episodes.dtype.kind not in "iu":
-        raise DataError(f"'episode' in {path} is {episodes.dtype}; wanted whole numbers.")
+        raise DataError(
+            f"'episode' in {path} is {episodes.dtype}; wanted whole numbers.",
+            "store the number of the episode that each sample is of, as int64",
+        )
     known = {*inputs, *EXPERT, *(tensor.name for tensor in spec.outputs)}
     ignored = tuple(name for name in arrays if name not in known)
     action = None if actions is None else _checked_action(path, spec, actions)
@@ -188,7 +194,9 @@ def _in_memory(arrays: Mapping[str, Values], *names: str) -> Array | None:
 
 def _length(path: Path, name: str, values: Values) -> int:
     if not values.ndim:
-        raise DataError(f"'{name}' in {path} is a single value; wanted one row a sample.")
+        raise DataError(
+            f"'{name}' in {path} is a single value; wanted one row a sample.", "store it with a first axis of samples"
+        )
     return len(values)
 
 
@@ -196,9 +204,15 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
     where = f"'{tensor.name}' in {path}"
     if tensor.kind == "text":
         if isinstance(values, Rows) or values.dtype.kind != "U":
-            raise DataError(f"{where} is {values.dtype}; a text input needs unicode strings.")
+            raise DataError(
+                f"{where} is {values.dtype}; a text input needs unicode strings.",
+                "store it with np.array(TEXTS), a str for each sample",
+            )
         if values.size != _length(path, tensor.name, values):
-            raise DataError(f"{where} has the shape {list(values.shape)}; a text input has one string a sample.")
+            raise DataError(
+                f"{where} has the shape {list(values.shape)}; a text input has one string a sample.",
+                "store a one-dimensional array, a str for each sample",
+            )
         return values.reshape(-1)
     if values.ndim == max(1, len(tensor.shape)) + 1 and values.shape[1] == 1:
         values = values.without_second_axis() if isinstance(values, Rows) else values[:, 0]
@@ -206,10 +220,11 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
         others = [other.name for other in spec.inputs if other.kind != "text" and _fits(other, values)]
         raise DataError(
             f"{where} has the shape {list(values.shape)}; wanted [N, {', '.join(map(str, tensor.shape[1:]))}].",
-            f"it would fit '{others[0]}'; are the names swapped?" if others else "",
+            f"it would fit '{others[0]}'; are the names swapped?" if others else RECORD_ALL,
         )
     _check_type(where, tensor, values)
-    _check_finite(where, values)
+    if tensor.finite:
+        _check_finite(where, values)
     return values
 
 
@@ -264,7 +279,7 @@ def _checked_action(path: Path, spec: PolicySpec, values: Array) -> Array:
 def _numbers(where: str, values: Array, spec: PolicySpec) -> Array:
     width, got = spec.action.width, list(values.shape)
     if values.dtype.kind not in "iuf":
-        raise DataError(f"{where} is {values.dtype}; wanted numbers in physical units.")
+        raise DataError(f"{where} is {values.dtype}; wanted numbers in physical units.", "store it as float32")
     if values.ndim < 2 or got[-1] != width:
         last = got[-1] if values.ndim > 1 else 1
         raise DataError(
@@ -277,7 +292,10 @@ def _numbers(where: str, values: Array, spec: PolicySpec) -> Array:
 
 def _indices(where: str, values: Array, labels: int) -> Array:
     if values.dtype.kind not in "iu":
-        raise DataError(f"{where} must be indices from 0 to {labels - 1}; got {values.dtype}.")
+        raise DataError(
+            f"{where} must be indices from 0 to {labels - 1}; got {values.dtype}.",
+            "store the place of each action in the spec's labels, as int64",
+        )
     wrong = (values < 0) | (values >= labels)
     if wrong.any():
         sample, step = (int(index) for index in np.argwhere(wrong)[0])
@@ -300,5 +318,5 @@ def _check_finite(where: str, values: Values) -> None:
     if bad:
         raise DataError(
             f"{where} is not finite in {len(bad)} of {len(values)} samples; the first is sample {bad[0]}.",
-            "remove those samples, or repair the recording",
+            "remove those samples, or repair the recording; where the policy handles them: finite: false in its spec",
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import RecipeError, instead, nearest
 
 DEPTH = "prune.depth"
 MADE_BY = {"depth": DEPTH, "width": "prune.structured"}
@@ -34,10 +34,11 @@ def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
         name, equals, value = (each.strip() for each in part.partition("="))
         if not (name and equals and value):
             raise RecipeError(
-                f"--student says how much stays, such as {EXAMPLE} (of the blocks, and of the work); got '{text}'."
+                f"--student says how much stays, such as {EXAMPLE} (of the blocks, and of the work); got '{text}'.",
+                f"write it as {EXAMPLE}",
             )
         if name not in MADE_BY:
-            raise RecipeError(f"--student knows no '{name}'; {nearest(name, MADE_BY)}.")
+            raise RecipeError(f"--student knows no '{name}'; {nearest(name, MADE_BY)}.", instead(name, MADE_BY))
         if name in shares:
             raise RecipeError(f"--student names {name} twice: '{text}'.", "name it once")
         shares[name] = _share(name, value)
@@ -53,5 +54,8 @@ def _share(name: str, value: str) -> float:
     except ValueError:
         share = math.nan
     if not 0 < share <= 1:
-        raise RecipeError(f"--student {name}={value}: what stays is a share above 0, at most 1, such as 0.5.")
+        raise RecipeError(
+            f"--student {name}={value}: what stays is a share above 0, at most 1, such as 0.5.",
+            f"write it as {EXAMPLE}",
+        )
     return share

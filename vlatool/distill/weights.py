@@ -36,7 +36,7 @@ class Weights(ModuleStage):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file is there."""
         if not self.file.is_file():
-            raise SourceError(f"No such file: {self.file}.")
+            raise SourceError(f"No such file: {self.file}.", "check the path of the state_dict")
         super().check(source, profile)
 
     def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:

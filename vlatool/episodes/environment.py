@@ -10,7 +10,7 @@ import numpy as np
 
 from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
-from vlatool.errors import DataError, nearest
+from vlatool.errors import DataError, instead, nearest
 
 GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
 
@@ -105,7 +105,10 @@ class World:
         """
         known = self.disturbances()
         if kind not in known:
-            raise DataError(f"{self._name.capitalize()} offers no disturbance '{kind}'; {nearest(kind, known)}.")
+            raise DataError(
+                f"{self._name.capitalize()} offers no disturbance '{kind}'; {nearest(kind, known)}.",
+                instead(kind, known),
+            )
         self._own("disturb")(kind, strength, seed)
 
     def _own(self, name: str) -> Any:

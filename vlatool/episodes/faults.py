@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from vlatool.episodes.disturbed import OWN
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import exits_caught
+from vlatool.module.factory import RAISED, exits_caught
 
 
 def under_way(task: str, seed: int) -> str:
@@ -65,7 +65,7 @@ def locate(
     if words:
         start = " ".join(words)
         error.message = f"{start[:1].upper()}{start[1:]}: {message}"
-    if not error.fix and isinstance(error, DataError | SourceError):
+    if error.fix in ("", RAISED) and isinstance(error, DataError | SourceError):
         error.fix = _remedy(task, seed, under)
 
 

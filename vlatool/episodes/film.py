@@ -14,6 +14,8 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.episodes.environment import GUIDE, World
 from vlatool.errors import DataError
 
+AGAIN = "run the command again for the video; its episodes count as they are"
+
 Picture = NDArray[np.uint8]
 RENDERS = "rgb_array"
 """The ``render_mode`` of an environment whose ``render()`` gives an array."""
@@ -94,7 +96,10 @@ class Camera:
         if self._renders:
             picture = np.asarray(self._environment.render())
             if not is_picture(picture):
-                raise DataError(f"{self._name} renders {_told(picture)} after it rendered pictures.")
+                raise DataError(
+                    f"{self._name} renders {_told(picture)} after it rendered pictures.",
+                    "let render() give pictures of one size and type at each step, or leave --video out",
+                )
             return fitted(picture)
         if not self._images:
             raise DataError(
@@ -189,7 +194,7 @@ class Film:
         files = tuple(sorted(folder.glob("*.npy")))
         shapes = [_read(file).shape for file in files]
         if not shapes or len({shape[1:] for shape in shapes}) != 1:
-            raise DataError("The process that played the episode has left no pictures of it.")
+            raise DataError("The process that played the episode has left no pictures of it.", AGAIN)
         return cls(files, sum(shape[0] for shape in shapes), (shapes[0][1], shapes[0][2]))
 
     def __iter__(self) -> Iterator[Picture]:
@@ -202,9 +207,9 @@ def _read(file: Path) -> NDArray[np.uint8]:
     try:
         pictures = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{file.name}, pictures of an episode, cannot be read: {error}.") from error
+        raise DataError(f"{file.name}, pictures of an episode, cannot be read: {error}.", AGAIN) from error
     if not isinstance(pictures, np.ndarray) or pictures.ndim != 4 or not len(pictures) or not is_picture(pictures[0]):
-        raise DataError(f"{file.name} holds no pictures of an episode.")
+        raise DataError(f"{file.name} holds no pictures of an episode.", AGAIN)
     return pictures
 
 

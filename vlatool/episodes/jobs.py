@@ -24,6 +24,8 @@ from vlatool.module.factory import factory_file
 from vlatool.stage.base import Context
 from vlatool.workers import PROCESSES, Folder, Work, launcher
 
+OWN_FILES = "let the environment write to its own files alone, and run the command again"
+
 HERE = play.__name__
 Outcomes = tuple[Outcome, ...]
 
@@ -134,7 +136,9 @@ def disturbances_of(bundle: Bundle, job: EpisodesJob, context: Context) -> tuple
     who = launcher(context.launcher, context.workers)
     (own,) = who.answers(work, context.tell, lambda _number, _answer: None, context.notes.append)
     if not isinstance(own, list) or not all(isinstance(kind, str) for kind in own):
-        raise DataError("The process that asked the environment for its disturbances did not answer with names.")
+        raise DataError(
+            "The process that asked the environment for its disturbances did not answer with names.", OWN_FILES
+        )
     return (*OWN, *(kind for kind in own if kind not in OWN))
 
 
@@ -189,12 +193,16 @@ def outcomes_of(answer: Any, job: EpisodesJob) -> Outcomes:
     try:
         outcomes = from_json(Played, answer).outcomes
     except ValueError as error:
-        raise DataError(f"The process that played '{job.task}' did not answer with episodes: {error}.") from error
+        raise DataError(
+            f"The process that played '{job.task}' did not answer with episodes: {error}.", OWN_FILES
+        ) from error
     if [(outcome.task, outcome.seed) for outcome in outcomes] != [(job.task, seed) for seed in job.seeds]:
-        raise DataError(f"The process that played '{job.task}' answered with other episodes.")
+        raise DataError(f"The process that played '{job.task}' answered with other episodes.", OWN_FILES)
     for outcome in outcomes:
         if why := _impossible(outcome, job):
-            raise DataError(f"The process that played '{job.task}' answered with what no episode is like: {why}.")
+            raise DataError(
+                f"The process that played '{job.task}' answered with what no episode is like: {why}.", OWN_FILES
+            )
     return outcomes
 
 

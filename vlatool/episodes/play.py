@@ -314,5 +314,7 @@ def _acted(queue: Actor, observation: Mapping[str, Any], where: str) -> Array:
     try:
         return queue.act(observation)
     except DataError as error:
-        raise DataError(f"The environment, in {where} gives what the policy does not take: {error.message}",
-                        error.fix or f"let it give what the policy was trained on; {GUIDE}") from error  # fmt: skip
+        raise DataError(
+            f"The environment, in {where} gives what the policy does not take: {error.message}",
+            f"let it give what the policy was trained on ({error.fix}); {GUIDE}",
+        ) from error

@@ -20,7 +20,7 @@ from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
-from vlatool.errors import DataError, SourceError, UsageError, nearest
+from vlatool.errors import DataError, SourceError, UsageError, instead, nearest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
 from vlatool.evaluate._names import BASELINE, names_of
@@ -226,7 +226,10 @@ class ClosedLoop(Measure):
             return ()
         known = disturbances_of(source, job, context)
         if unknown := [kind for kind in self.disturb if kind not in (*known, ALL)]:
-            raise UsageError(f"There is no disturbance '{unknown[0]}'; {nearest(unknown[0], (*known, ALL))}.")
+            raise UsageError(
+                f"There is no disturbance '{unknown[0]}'; {nearest(unknown[0], (*known, ALL))}.",
+                instead(unknown[0], (*known, ALL)),
+            )
         return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
 
     def _whose(self, names: Sequence[str]) -> list[str]:
@@ -336,6 +339,6 @@ class ClosedLoop(Measure):
             )
         for task in self.tasks:
             if known and task not in known and not self.environment:
-                raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.")
+                raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.", instead(task, known))
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control)
         return jobs_for(job, tasks, self.episodes, self.first_seed)

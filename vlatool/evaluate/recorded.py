@@ -24,6 +24,7 @@ from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._names import names_of
 from vlatool.machine.host import fingerprint
 from vlatool.report import Measurement, Report, Row
+from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 from vlatool.stage.base import Context, Measure
 from vlatool.stage.tried import try_out
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
 
 Array = NDArray[Any]
+MAKE_OTHERWISE = (
+    "make the bundle otherwise (vlatool explain says where it differs), or remove that sample if it is no observation"
+)
 KEPT = 4
 NEVER_VARIES = {
     "expert": "the expert's action never varies, so no error relative to its spread",
@@ -159,7 +163,8 @@ def run_recorded(bundle: Bundle, recording: Recording, indices: Sequence[int], e
             context.tell("running recorded observations", len(chunks) / len(indices))
         if moment.begins:
             policy.reset()
-        with policy.stopped_after(FIRST_RUN_S):
+        answered = off_the_robot(f"sample {moment.number} of {recording.path}", MAKE_OTHERWISE)
+        with answered, policy.stopped_after(FIRST_RUN_S):
             chunk = policy.infer(moment.observation).chunk
         chunks += [chunk] if moment.counts else []
     return np.stack(chunks)

@@ -32,9 +32,9 @@ from vlatool.module.to_onnx import (
     weight_bytes,
 )
 from vlatool.module.torch_policy import TorchSession, load_modules
-from vlatool.runtime.contract import Outputs, check_chunk
+from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, Outputs, check_chunk, off_the_robot
 from vlatool.runtime.engine import engine_class
-from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.observation import ObservationEncoder, not_finite_text
 from vlatool.runtime.policy import Policy, relative_error
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context, Transform, source_of
@@ -138,16 +138,18 @@ class ExportOnnx(Transform):
         def action(values: dict[str, Any]) -> Any:
             return outputs(values, "The torch module")[spec.action.name]
 
-        def run(observation: dict[str, Any]) -> Any:
-            encoded = encode(observation)
+        def run(number: int, observation: dict[str, Any]) -> Any:
+            encoded, held = encode(observation), not_finite_text(spec, observation)
+            answered = f"observation {number}{f', which holds {held}' if held else ''}"
             try:
-                return program.run(encoded, finish=action)
+                with off_the_robot(answered, OF_NOT_FINITE if held else OF_THE_POLICY):
+                    return program.run(encoded, finish=action)
             except SourceError as error:
                 texts = [f"{name} {shown(value)}" for name, value in observation.items() if isinstance(value, str)]
                 asked = f" The policy was asked with {', '.join(texts)}." if texts else ""
                 raise SourceError(error.message + asked, error.fix) from error
 
-        return [run(observation) for observation in observations]
+        return [run(number, observation) for number, observation in enumerate(observations)]
 
     def _export(self, name: str, session: TorchSession, out: Path, beside: bool) -> Graph:
         torch = require("torch", "build")
@@ -175,7 +177,8 @@ class ExportOnnx(Transform):
         largest = 0.0
         policy = Policy.open(exported, threads=1, seed=0)
         for number, (observation, reference) in enumerate(zip(observations, expected, strict=True)):
-            with risky(engine_class(policy.engine), f"ran {named(exported.manifest)}"):
+            doing = risky(engine_class(policy.engine), f"ran {named(exported.manifest)}")
+            with doing, off_the_robot(f"observation {number}", OF_THE_GRAPHS):
                 got = policy.infer(observation).outputs[exported.manifest.spec.action.name]
             error = relative_error(got, reference)
             largest = max(largest, error)

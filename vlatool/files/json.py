@@ -40,7 +40,7 @@ def parse_json(content: bytes, *, strict: bool = False) -> Any:
     return value
 
 
-def read_json(content: bytes, where: str, error: type[VlatoolError], fix: str = "", *, strict: bool = False) -> Any:
+def read_json(content: bytes, where: str, error: type[VlatoolError], fix: str, *, strict: bool = False) -> Any:
     """Return what a JSON text says; see ``parse_json``.
 
     Raises:

@@ -9,7 +9,7 @@ import math
 import os
 from dataclasses import dataclass
 
-from vlatool.errors import UsageError, VlatoolError, nearest
+from vlatool.errors import UsageError, VlatoolError, instead, nearest
 
 VARIABLE = "VLATOOL_LIMITS"
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
@@ -108,7 +108,9 @@ def _told(text: str) -> dict[str, int]:
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = part.partition("=")
         if name not in LIMITS:
-            raise UsageError(f"{VARIABLE} names the unknown limit '{name}'; {nearest(name, LIMITS)}.")
+            raise UsageError(
+                f"{VARIABLE} names the unknown limit '{name}'; {nearest(name, LIMITS)}.", instead(name, LIMITS)
+            )
         limits[name] = _whole(name, value)
     return limits
 
@@ -120,6 +122,7 @@ def _whole(name: str, value: str) -> int:
         number = math.nan
     if not 0 <= number < 2**63:
         raise UsageError(
-            f"{VARIABLE} sets {name} to '{value[:40]}'; it must be a number of {LIMITS[name].unit} from 0."
+            f"{VARIABLE} sets {name} to '{value[:40]}'; it must be a number of {LIMITS[name].unit} from 0.",
+            f"write it as {VARIABLE}={name}={LIMITS[name].default}, or leave it out",
         )
     return int(value) if value.isdigit() else int(number)

@@ -31,6 +31,7 @@ HEADER = re.compile(
     r"\s*'shape':\s*\((?P<shape>(?:\d{1,18},?\s*){0,64})\),?\s*\}\s*"
 )
 BLOCK = MIB
+SAVE = "write it again with np.savez"
 IN_MEMORY = 16 * MIB
 FOREIGN = (
     OSError, ValueError, TypeError, KeyError, EOFError, NotImplementedError, RuntimeError, MemoryError,
@@ -45,6 +46,7 @@ def open_npz(
     *,
     where: str = "",
     error: type[VlatoolError] = DataError,
+    fix: str = SAVE,
 ) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` file by name.
 
@@ -53,6 +55,7 @@ def open_npz(
         allowed: Name of the limit (``vlatool.files.limits``) on the bytes of all arrays together.
         where: What the file is called in messages; its path when empty.
         error: Type of the error that is raised.
+        fix: What is done about a file that cannot be read.
 
     Raises:
         DataError: (or ``error``) when the file cannot be read, is no archive of arrays, holds Python objects, or would
@@ -66,8 +69,8 @@ def open_npz(
         [0, 1, 2]
     """
     where = where or ("the archive" if isinstance(source, bytes) else str(Path(source)))
-    with _foreign_errors(where, error), _archive(source) as archive:
-        members = _members(archive, allowed, where, error)
+    with _foreign_errors(where, error, fix), _archive(source) as archive:
+        members = _members(archive, allowed, where, error, fix)
         return {name: _array(archive, member, name) for name, member in members.items()}
 
 
@@ -92,9 +95,9 @@ def open_rows(
         DataError: as ``open_npz`` does, and when the memory does not suffice.
     """
     where = str(Path(path))
-    with _foreign_errors(where, DataError), _archive(path) as archive:
+    with _foreign_errors(where), _archive(path) as archive:
         file = OpenFile.at(path, where)
-        members = _members(archive, allowed, where, DataError)
+        members = _members(archive, allowed, where)
         stay = {name: _stays(archive, member, name, in_memory) for name, member in members.items()}
         _refuse_beyond(where, sum(member.file_size for name, member in members.items() if not stay[name]), free)
         return {
@@ -118,7 +121,7 @@ def _archive(source: bytes | str | os.PathLike[str]) -> Iterator[zipfile.ZipFile
 
 
 @contextlib.contextmanager
-def _foreign_errors(where: str, error: type[VlatoolError]) -> Iterator[None]:
+def _foreign_errors(where: str, error: type[VlatoolError] = DataError, fix: str = SAVE) -> Iterator[None]:
     """Map what zipfile, zlib and numpy raise into one sentence for the person."""
     try:
         yield
@@ -126,7 +129,7 @@ def _foreign_errors(where: str, error: type[VlatoolError]) -> Iterator[None]:
         raise
     except FOREIGN as foreign:
         reason = f"{foreign.strerror}" if isinstance(foreign, OSError) and foreign.strerror else _told(foreign)
-        raise error(f"{where} cannot be read: {reason}.", "write it again with np.savez") from foreign
+        raise error(f"{where} cannot be read: {reason}.", fix) from foreign
 
 
 def _told(error: BaseException) -> str:
@@ -176,7 +179,7 @@ def _all(text: bytes, part: bytes) -> Iterator[int]:
 
 
 def _members(
-    archive: zipfile.ZipFile, allowed: str, where: str, error: type[VlatoolError]
+    archive: zipfile.ZipFile, allowed: str, where: str, error: type[VlatoolError] = DataError, fix: str = SAVE
 ) -> dict[str, zipfile.ZipInfo]:
     """Return array name -> entry, once the declared sizes are within the limits."""
     entries = archive.infolist()
@@ -186,9 +189,9 @@ def _members(
     for entry in entries:
         name = entry.filename.removesuffix(".npy")
         if name == entry.filename or name in members:
-            raise error(f"{where} has the entry '{entry.filename[:80]}' twice, or it is not an array (NAME.npy).")
+            raise error(f"{where} has the entry '{entry.filename[:80]}' twice, or it is not an array (NAME.npy).", fix)
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or entry.flag_bits & 1:
-            raise error(f"{where} has '{name[:80]}' encrypted or packed in a way that numpy does not write.")
+            raise error(f"{where} has '{name[:80]}' encrypted or packed in a way that numpy does not write.", fix)
         members[name] = entry
     return members
 

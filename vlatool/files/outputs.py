@@ -17,6 +17,8 @@ WRITTEN = (LEDGER, "manifest.json", "report.json")
 BUNDLE, REPORT = "a bundle", "a report"
 KINDS = {BUNDLE: ("manifest.json", "manifest.sha256"), REPORT: ("report.json",)}
 """What a directory that vlatool wrote is -> the files that all of its kind hold; the first that fits it is."""
+ELSEWHERE = "keep the cache elsewhere: VLATOOL_CACHE=DIR"
+PRUNE = "free some space there (vlatool cache prune)"
 EXISTS = "choose another output, or pass --force to replace it"
 
 
@@ -99,8 +101,13 @@ def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) 
 
 
 @contextlib.contextmanager
-def output_errors(final: Path) -> Iterator[None]:
-    """Map the operating system's refusals to write into one sentence for the person."""
+def output_errors(final: Path, *, cache: bool = False) -> Iterator[None]:
+    """Map the operating system's refusals to write into one sentence for the person.
+
+    Args:
+        final: What is written.
+        cache: Whether it is an entry of the cache, whose place nobody has named on the command line.
+    """
     try:
         yield
     except OSError as error:
@@ -121,4 +128,12 @@ def output_errors(final: Path) -> Iterator[None]:
         ours = drafts or named.is_relative_to(final) or final.is_relative_to(named)
         if reason is None or not (full or ours):
             raise
-        raise OutputError(f"Cannot write {final}: {reason[0]}.", reason[1]) from error
+        what, fix = ("an entry of the cache, ", _of_cache(error)) if cache else ("", "")
+        raise OutputError(f"Cannot write {what}{final}: {reason[0]}.", fix or reason[1]) from error
+
+
+def _of_cache(error: OSError) -> str:
+    """Return what helps where the cache cannot be written; nothing where it is the same as elsewhere."""
+    if error.errno == errno.EFBIG:
+        return ""
+    return f"{PRUNE}, or {ELSEWHERE}" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ELSEWHERE

@@ -7,11 +7,13 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vlatool.errors import VlatoolError, nearest
+from vlatool.errors import BundleError, SpecError, nearest
 
 STRANGE = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|\ud800-\udfff]')
 """Characters that no file of a bundle has in its name: they mean something else on some system or in some engine."""
 WHOLE = 2**63
+Kind = type[BundleError] | type[SpecError]
+"""Classes of errors whose own remedy helps with every mistake in such a value."""
 LONG = 120
 
 
@@ -27,11 +29,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= LONG else f"{text[:LONG]}..."
 
 
-def mapping(value: Any, where: str, error: type[VlatoolError]) -> dict[str, Any]:
+def mapping(value: Any, where: str, error: Kind) -> dict[str, Any]:
     """Return a mapping whose keys are text.
 
     Raises:
-        VlatoolError: of the given type.
+        BundleError, SpecError: as given.
     """
     if not isinstance(value, Mapping):
         raise error(f"{where} must be a mapping; got {shown(value)}.")
@@ -40,7 +42,7 @@ def mapping(value: Any, where: str, error: type[VlatoolError]) -> dict[str, Any]
     return dict(value)
 
 
-def known(value: Mapping[str, Any], keys: Iterable[str], where: str, error: type[VlatoolError]) -> None:
+def known(value: Mapping[str, Any], keys: Iterable[str], where: str, error: Kind) -> None:
     """Refuse a key that has no meaning."""
     keys = list(keys)
     for key in value:
@@ -49,7 +51,7 @@ def known(value: Mapping[str, Any], keys: Iterable[str], where: str, error: type
             raise error(f"{where} has the unknown key {shown(key)}; {hint}.")
 
 
-def text(value: Any, where: str, error: type[VlatoolError], *, empty: bool = True) -> str:
+def text(value: Any, where: str, error: Kind, *, empty: bool = True) -> str:
     """Return text that can be written as UTF-8."""
     if not isinstance(value, str) or not (value or empty):
         raise error(f"{where} must be text{'' if empty else ' that is not empty'}; got {shown(value)}.")
@@ -58,28 +60,28 @@ def text(value: Any, where: str, error: type[VlatoolError], *, empty: bool = Tru
     return value
 
 
-def whole(value: Any, where: str, error: type[VlatoolError], low: int = 0) -> int:
+def whole(value: Any, where: str, error: Kind, low: int = 0) -> int:
     """Return a whole number from ``low``; true and false are none."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value < WHOLE:
         raise error(f"{where} must be a whole number from {low}; got {shown(value)}.")
     return value
 
 
-def finite(value: Any, where: str, error: type[VlatoolError]) -> float:
+def finite(value: Any, where: str, error: Kind) -> float:
     """Return a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
         raise error(f"{where} must be a number; got {shown(value)}.")
     return float(value)
 
 
-def listed(value: Any, where: str, error: type[VlatoolError]) -> list[Any]:
+def listed(value: Any, where: str, error: Kind) -> list[Any]:
     """Return a list."""
     if not isinstance(value, list | tuple):
         raise error(f"{where} must be a list; got {shown(value)}.")
     return list(value)
 
 
-def axes(value: Any, where: str, error: type[VlatoolError]) -> int:
+def axes(value: Any, where: str, error: Kind) -> int:
     """Return the number of elements of a shape: a list of whole numbers from 1."""
     axes = [whole(axis, f"An axis of {where}", error, 1) for axis in listed(value, where, error)]
     if not axes:

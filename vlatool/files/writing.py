@@ -26,6 +26,7 @@ from vlatool.errors import OutputError
 from vlatool.files.locks import alone
 from vlatool.files.moves import exchange, move_new
 from vlatool.files.outputs import kind_of, output_errors, refuse_replacing
+from vlatool.files.scratch import named_as
 from vlatool.files.written import note, prune
 
 MARKER = "vlatool-draft.json"
@@ -120,8 +121,8 @@ def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Itera
     Raises:
         OutputError: when ``final`` exists (and not ``force``), is not vlatool's, or the place is read-only or full.
     """
-    final = Path(os.path.abspath(final))
-    with output_errors(final):
+    typed, final = final, Path(os.path.abspath(final))
+    with output_errors(final, cache=damaged):
         if not damaged:
             refuse_replacing(final, force=force)
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -130,8 +131,14 @@ def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Itera
             draft = _Draft.make(final)
             lock = os.open(draft.place, os.O_RDONLY)
             fcntl.flock(lock, fcntl.LOCK_EX)
+    stage = f"the output of {final.name.rpartition('-')[0] or final.name}"
+    name, itself = ("", stage) if damaged else (str(typed), "")
     try:
-        with output_errors(final):
+        with (
+            named_as(draft.place, name, itself),
+            named_as(draft.content, name, itself),
+            output_errors(final, cache=damaged),
+        ):
             yield draft.content
             note(draft.content)
             _flush(draft.content)

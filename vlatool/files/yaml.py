@@ -20,6 +20,8 @@ from vlatool.files.limits import check, limit
 PLAIN = ("map", "seq", "str", "int", "float", "bool", "null", "timestamp", "merge", "value")
 """Kinds of values that are read."""
 TAG = "tag:yaml.org,2002:"
+CORRECT = "correct it in that line; text with ': ', '#' or a leading '*' needs quotes"
+PAIRS = "write it as lines of NAME: VALUE"
 SHORT = 1 << 16
 """Characters of a text that is parsed once and remembered."""
 
@@ -42,15 +44,19 @@ def read_yaml(path: Path, what: str, raised: type[InputError]) -> Any:
         parse = _remembered if len(text) <= SHORT else _parsed
         return copy.deepcopy(parse(text, what, raised, (limit("yaml_depth"), limit("yaml_nodes"))))
     except OSError as error:
-        raise raised(f"{what} cannot be read: {error.strerror or error}.") from error
+        raise raised(
+            f"{what} cannot be read: {error.strerror or error}.", "check its path, and that this user may read it"
+        ) from error
     except UnicodeDecodeError as error:
-        raise raised(f"{what} is not valid YAML: it cannot be read as UTF-8: {error}.") from error
+        raise raised(f"{what} is not valid YAML: it cannot be read as UTF-8: {error}.", "save it in UTF-8") from error
     except ValueError as error:
         if "integer string conversion" not in str(error):
-            raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.") from error
-        raise raised(f"{what} has a whole number of more than {sys.get_int_max_str_digits():,} digits.") from error
+            raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.", CORRECT) from error
+        raise raised(
+            f"{what} has a whole number of more than {sys.get_int_max_str_digits():,} digits.", "write it as 1e30"
+        ) from error
     except (yaml.YAMLError, TypeError, LookupError, AttributeError, OverflowError) as error:
-        raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.") from error
+        raise raised(f"{what} is not valid YAML: {' '.join(str(error).split())[:400]}.", CORRECT) from error
 
 
 def _parsed(text: str, what: str, raised: type[InputError], _limits: tuple[int, int]) -> Any:
@@ -79,12 +85,15 @@ def read_mapping(path: Path, what: str, raised: type[InputError]) -> dict[str, A
     """
     data = read_yaml(path, what, raised)
     if data is None:
-        raise raised(f"{what} is empty; it must be a mapping.")
+        raise raised(f"{what} is empty; it must be a mapping.", PAIRS)
     if not isinstance(data, dict):
-        raise raised(f"{what} must be a mapping; got {type(data).__name__}.")
+        raise raised(f"{what} must be a mapping; got {type(data).__name__}.", PAIRS)
     odd = [key for key in data if not isinstance(key, str)]
     if odd:
-        raise raised(f"{what} has the key {str(odd[0])[:80]!r}, a {type(odd[0]).__name__}; keys are names.")
+        raise raised(
+            f"{what} has the key {str(odd[0])[:80]!r}, a {type(odd[0]).__name__}; keys are names.",
+            "write the key in quotes",
+        )
     return data
 
 
@@ -93,7 +102,7 @@ def _text(path: Path, what: str, raised: type[InputError]) -> str:
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as stream:
         status = os.fstat(stream.fileno())
         if not stat.S_ISREG(status.st_mode):
-            raise raised(f"{what} cannot be read: it is not a regular file.")
+            raise raised(f"{what} cannot be read: it is not a regular file.", "name the file itself")
         check("yaml_bytes", status.st_size, what, raised)
         return stream.read(limit("yaml_bytes") + 1).decode("utf-8")
 
@@ -120,7 +129,9 @@ def _check_nodes(root: Any, what: str, raised: type[InputError]) -> None:
 
     def size(node: Any) -> int:
         if id(node) in open_:
-            raise raised(f"{what} has an alias inside of what it stands for{_line(node)}.")
+            raise raised(
+                f"{what} has an alias inside of what it stands for{_line(node)}.", "write the value out in its place"
+            )
         if id(node) not in sizes:
             open_.add(id(node))
             _check_node(node, what, raised)
@@ -135,7 +146,10 @@ def _check_nodes(root: Any, what: str, raised: type[InputError]) -> None:
 def _check_node(node: Any, what: str, raised: type[InputError]) -> None:
     kind = node.tag.removeprefix(TAG)
     if kind not in PLAIN or not node.tag.startswith(TAG):
-        raise raised(f"{what} has a value of the kind {node.tag[:80]!r}{_line(node)}; only plain values are read.")
+        raise raised(
+            f"{what} has a value of the kind {node.tag[:80]!r}{_line(node)}; only plain values are read.",
+            "write text, a number, a list or a mapping without a tag",
+        )
     seen = set()
     for key, _ in node.value if node.id == "mapping" else ():
         if key.id == "scalar" and key.tag != f"{TAG}merge":

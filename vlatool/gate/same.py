@@ -9,7 +9,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import TensorSpec
 from vlatool.bundle.unexported import no_graph
-from vlatool.errors import BundleError, DataError, GraphError, nearest, require
+from vlatool.errors import BundleError, DataError, GraphError, instead, nearest, require
 from vlatool.gate.claims import accuracy
 from vlatool.gate.config import Gate
 from vlatool.graph.draws import drawing
@@ -38,11 +38,16 @@ def check(candidate: Bundle, baseline: Bundle, gate: Gate) -> None:
             raise no_graph(bundle, "run")
         engine, known = bundle.manifest.engine, registry.names("engines")
         if engine and engine not in known:
-            raise BundleError(f"{bundle.path} is made for the engine '{engine}'; {nearest(engine, known)}.")
+            raise BundleError(
+                f"{bundle.path} is made for the engine '{engine}'; {nearest(engine, known)}.", instead(engine, known)
+            )
     mine, theirs = candidate.manifest, baseline.manifest
     differs = _tensors(mine, theirs) or _rates(mine, theirs) or _program(mine, theirs)
     if differs := differs or (_scene(mine, theirs) if _plays_what_bundles_name(gate) else ""):
-        raise BundleError(f"{candidate.path} and {baseline.path} are no versions of one policy: {differs}.")
+        raise BundleError(
+            f"{candidate.path} and {baseline.path} are no versions of one policy: {differs}.",
+            "name a candidate and a baseline that were made from the same policy",
+        )
     _check_golden(candidate, baseline)
     if _has_fewer_steps(mine, theirs) and gate.accuracy is None:
         raise DataError(

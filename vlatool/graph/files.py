@@ -117,4 +117,7 @@ def foreign_errors(graph: str) -> Iterator[None]:
         raise
     except Exception as error:  # the seam: onnx and ONNX Runtime raise many foreign types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:300]
-        raise GraphError(f"The graph '{graph}' cannot be quantized: {type(error).__name__}: {reason}.") from error
+        raise GraphError(
+            f"The graph '{graph}' cannot be quantized: {type(error).__name__}: {reason}.",
+            "leave layers out with --exclude, or use another method; export the policy again if it is damaged",
+        ) from error

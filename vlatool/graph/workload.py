@@ -142,7 +142,10 @@ def graph_workload(
         tensors = open_graph(onnx, path)
     except Exception as error:  # the seam: every exception type of onnx and protobuf becomes ours
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
+        raise GraphError(
+            f"{path} cannot be read as ONNX: {reason}",
+            "check that the file is whole: onnx.checker.check_model(FILE) says more; a bundle's is to be made again",
+        ) from error
     return _count(tensors, parts or {}, count_as)
 
 

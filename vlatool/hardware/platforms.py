@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
-from vlatool.errors import ProfileError, nearest
+from vlatool.errors import ProfileError, instead, nearest
 from vlatool.files.yaml import read_yaml
 from vlatool.hardware.profile import NAME, SUFFIXES, Kind, Strict
 
@@ -52,13 +52,18 @@ def load_platform(name_or_path: str | os.PathLike[str]) -> Platform:
     own = name.endswith(SUFFIXES) or os.sep in name
     path = Path(name) if own else _folder() / f"{name}.yaml"
     if not own and name not in platform_names():
-        raise ProfileError(f"Unknown platform '{name}'; {nearest(name, platform_names())}.")
+        raise ProfileError(
+            f"Unknown platform '{name}'; {nearest(name, platform_names())}.", instead(name, platform_names())
+        )
     try:
         return Platform.model_validate(read_yaml(path, f"The platform {path}", ProfileError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise ProfileError(f"The platform {path} is malformed: {where}: {first['msg']}.") from error
+        raise ProfileError(
+            f"The platform {path} is malformed: {where}: {first['msg']}.",
+            "correct it in the file; the platforms that come with vlatool show what belongs there",
+        ) from error
 
 
 def _folder() -> Path:

@@ -19,7 +19,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
 
 from vlatool import registry
-from vlatool.errors import OutputError, ProfileError, nearest
+from vlatool.errors import OutputError, ProfileError, instead, nearest
 from vlatool.files.edited import unstamped, write_own
 from vlatool.files.numbers import Numeric
 from vlatool.files.yaml import read_mapping
@@ -211,7 +211,9 @@ class Profile(Strict):
         if self.usable_memory_gb.value > self.memory_gb.value:
             problems.append("usable_memory_gb.value: is more than memory_gb")
         if problems:
-            raise ProfileError("\n".join(problems))
+            raise ProfileError(
+                "\n".join(problems), "correct it in the profile's file; docs/reference/profiles.md has each field"
+            )
         return self
 
     @property
@@ -232,7 +234,9 @@ class Profile(Strict):
         """
         chosen = self.default_mode if name is None else name
         if chosen not in self.modes:
-            raise ProfileError(f"{self.name} has no power mode '{chosen}'; {nearest(chosen, self.modes)}.")
+            raise ProfileError(
+                f"{self.name} has no power mode '{chosen}'; {nearest(chosen, self.modes)}.", instead(chosen, self.modes)
+            )
         return self.modes[chosen]
 
     def peak_tops(self, unit: str, dtype: str, mode: str | None = None) -> float | None:
@@ -290,13 +294,19 @@ def copy_profile(like: str, name: str, target: Path, *, force: bool = False) -> 
     load_profile(like)
     path = profile_file(like)
     if not re.fullmatch(NAME, name):
-        raise ProfileError(f"'{name}' is not a valid profile name; allowed: lower-case letters, digits and hyphens.")
+        raise ProfileError(
+            f"'{name}' is not a valid profile name; allowed: lower-case letters, digits and hyphens.",
+            "name it like my-robot-2",
+        )
     text = re.sub(r"(?m)^name: .*$", f"name: {name}", unstamped(path.read_text(encoding="utf-8")), count=1)
     text = re.sub(r"(?m)^aliases:.*\n(?:[ \t]+.*\n|- .*\n|\]\n)*", "", text, count=1)
     try:
         write_own(target, text, force=force)
     except OSError as error:
-        raise OutputError(f"{target} cannot be written: {error.strerror}.") from error
+        raise OutputError(
+            f"{target} cannot be written: {error.strerror}.",
+            "name another file with -o, or make its directory writable",
+        ) from error
 
 
 def profile_file(wanted: str) -> Path:

@@ -286,7 +286,10 @@ def fit_files(
     shipped = not anew and (DATA / "latency.json").is_file()
     before = read_model(DATA) if shipped else None  # and not the user's own: the search begins at what was shipped
     if not any(point.question for point in points):
-        raise DataError(f"{path} has no row to fit on: {next(point.why for point in points)}.")
+        raise DataError(
+            f"{path} has no row to fit on: {next(point.why for point in points)}.",
+            "add rows of models and devices that vlatool knows; docs/concepts/latency-model.md names the columns",
+        )
     out.mkdir(parents=True, exist_ok=True)  # before the search: its minutes are not to be lost
     model = fit(points, before, seconds, seed, tell)
     write(model, out)

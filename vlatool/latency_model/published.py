@@ -88,10 +88,16 @@ def read_points(path: Path) -> list[Point]:
             missing = [name for name in NEEDED if name not in (reader.fieldnames or ())]
             if missing:
                 known = ", ".join(reader.fieldnames or ()) or "none"
-                raise DataError(f"{path} has no column '{missing[0]}'; its columns: {known[:300]}.")
+                raise DataError(
+                    f"{path} has no column '{missing[0]}'; its columns: {known[:300]}.",
+                    f"add the column '{missing[0]}'; docs/concepts/latency-model.md names all of them",
+                )
             rows = [(reader.line_num, _stripped(row)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+        raise DataError(
+            f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.",
+            "check the path; it is a CSV file in UTF-8",
+        ) from error
     points = [_point(row, f"{path}, line {number}") for number, row in rows]
     if not points:
         fix = f"give a CSV file with a row for each figure; columns: {', '.join(NEEDED)}"
@@ -112,9 +118,13 @@ def _point(row: Mapping[str, str], where: str) -> Point:
     value = _number(row.get("value", ""), where, "value")
     kind, metric = row["device_class"], row["metric"]
     if metric not in ("latency_ms", "fps", "tokens_per_s"):
-        raise DataError(f"{where}: the metric '{metric}' is unknown; allowed: latency_ms, fps, tokens_per_s.")
+        raise DataError(
+            f"{where}: the metric '{metric}' is unknown; allowed: latency_ms, fps, tokens_per_s.", "write one of these"
+        )
     if kind not in ("cpu", "gpu", "igpu", "npu"):
-        raise DataError(f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.")
+        raise DataError(
+            f"{where}: the device class '{kind}' is unknown; allowed: cpu, gpu, igpu, npu.", "write one of these"
+        )
     board = _name(row["device"])
     blank = Point(None, math.nan, TWINS.get(board, board), kind, family(row["model"]))
     if not (value > 0 and math.isfinite(value)):
@@ -297,4 +307,7 @@ def _number(text: str, where: str, column: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise DataError(f"{where}: '{text}' in the column '{column}' is not a number.") from None
+        raise DataError(
+            f"{where}: '{text}' in the column '{column}' is not a number.",
+            "write a number with a point, such as 12.5, or leave the cell empty where it may be",
+        ) from None

@@ -46,11 +46,17 @@ def refit_points(
     """
     if held_out not in KINDS:
         got = "not given" if held_out is None else f"'{held_out}'"
-        raise UsageError(f"--held-out is {got}; with --refit, allowed: models, devices (which tells calibrated, too).")
+        raise UsageError(
+            f"--held-out is {got}; with --refit, allowed: models, devices (which tells calibrated, too).",
+            "pass --held-out models or --held-out devices",
+        )
     points = read_points(path)
     folds = dealt([point for point in points if point.question], held_out, seed)
     if len(folds) < 2:
-        raise DataError(f"{path} has fewer than two {held_out}: nothing is left to fit on.")
+        raise DataError(
+            f"{path} has fewer than two {held_out}: nothing is left to fit on.",
+            f"add rows of further {held_out}, or hold out something else",
+        )
     answered: dict[str, Answered] = {kind: [] for kind in KINDS[held_out]}
     how = {"points": str(path.absolute()), "held_out": held_out, "seed": seed, "seconds": seconds}
     jobs = [{**how, "held": sorted(held)} for held in folds]

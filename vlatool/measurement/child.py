@@ -21,6 +21,9 @@ from vlatool.machine.processes import die_with_parent
 from vlatool.measurement.jobs import Limits
 from vlatool.measurement.limited import command, ran_out
 
+REINSTALL = "see whether this Python runs vlatool at all: python -m vlatool doctor"
+CRASHES = "look for a library that crashes: an engine's other release may not; vlatool doctor lists what is installed"
+
 T = TypeVar("T")
 LAST_WORDS = 240
 """Characters of the last line of a process that a signal ended: the end of an assertion says most."""
@@ -128,7 +131,10 @@ def result_of(message: Result, kind: type[T], about: str) -> T:
     try:
         return from_json(kind, message.value, "answer")
     except ValueError as error:
-        raise GraphError(f"{about}: the process does not answer what it was asked: {error}.") from error
+        raise GraphError(
+            f"{about}: the process does not answer what it was asked: {error}.",
+            "run it again; two versions of vlatool in one environment answer like that, too",
+        ) from error
 
 
 def read_line(text: str, check: Callable[[Any], Any] = lambda value: value) -> Message | None:
@@ -169,11 +175,14 @@ def ended(about: str, code: int, log: str, limits: Limits, when: str = "in a fre
     if code < 0:
         last = log.strip().rpartition("\n")[2][-LAST_WORDS:]
         said = f" It said last: {last}" if last else ""
-        return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.{said}")
+        return GraphError(f"{about}: the process ended with {signal_name(code)} {when}.{said}", CRASHES)
     if code == 0:
-        return GraphError(f"{about}: the process ended with exit code 0 {when}, before it was done.")
+        return GraphError(
+            f"{about}: the process ended with exit code 0 {when}, before it was done.",
+            "look for code that ends the process: an engine's or a library's exit",
+        )
     last = (log.strip() or f"exit code {code}").splitlines()[-1]
-    return GraphError(f"{about} cannot be run in a fresh process: {last}")
+    return GraphError(f"{about} cannot be run in a fresh process: {last}", REINSTALL)
 
 
 def signal_name(code: int) -> str:

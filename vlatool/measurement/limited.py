@@ -119,7 +119,10 @@ def chosen(limits: Limits) -> Limits:
     usable = sorted(os.sched_getaffinity(0))
     if missing := [cpu for cpu in limits.cpus if cpu not in usable]:
         allowed = ", ".join(map(str, usable))
-        raise UsageError(f"--pin names processor {missing[0]}; this process may use {allowed}.")
+        raise UsageError(
+            f"--pin names processor {missing[0]}; this process may use {allowed}.",
+            f"name some of these with --pin: {allowed}",
+        )
     if not (limits.cpus or limits.cores):
         return limits
     cpus = limits.cpus or tuple(usable)

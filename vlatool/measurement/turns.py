@@ -86,7 +86,10 @@ class Turns:
         self._time()
         gc.enable()
         if not self.places:
-            raise GraphError(f"{self.job.baseline} answers none of the observations that were drawn for it.")
+            raise GraphError(
+                f"{self.job.baseline} answers none of the observations that were drawn for it.",
+                "see what it says of one: vlatool inspect BASELINE --probe; name a baseline that runs",
+            )
         slow, slow_input = self._confirm()
         self.policies = [None, None]
         looked, strays = self._replay(1)
@@ -167,7 +170,7 @@ class Turns:
         """
         if 0 not in failed:
             what = f"{self.job.candidate} fails where the baseline answers ({self._told(place)})"
-            raise GraphError(f"{what}: {failed[1].message}")
+            raise GraphError(f"{what}: {failed[1].message}", failed[1].fix)
         self.unusable.add(place)
         for policy in self.policies:
             policy.reset()

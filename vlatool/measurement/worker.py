@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.bundle.unexported import export_command
 from vlatool.data import observations_for
 from vlatool.errors import BundleError
 from vlatool.machine.processes import die_with_parent
@@ -143,7 +144,7 @@ def opened(path: str, job: LatencyJob) -> Contestant:
         policy = torch_policy(bundle, seed=0)
         torch.set_num_threads(job.threads)  # as many as the engine gets
     else:
-        raise BundleError(f"{bundle.path} has nothing to run.")
+        raise BundleError(f"{bundle.path} has nothing to run.", f"export it first: {export_command(bundle.path)}")
     stage = str(manifest.made_by.get("stage", "policy")).rpartition(".")[2]
     name = {"torch_module": "torch eager", "onnx": "float32"}.get(stage, stage)
     return Contestant(name, bundle, policy, observations_for(bundle, OBSERVATIONS))

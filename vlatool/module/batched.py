@@ -220,7 +220,10 @@ class BatchedProgram:
         shape = self.kept[name]["shape"]
         ones = [axis for axis, size in enumerate(shape) if size == 1]
         if not ones:
-            raise SourceError(f"The kept value '{name}' has no axis for a batch: {list(shape)}.")
+            raise SourceError(
+                f"The kept value '{name}' has no axis for a batch: {list(shape)}.",
+                "declare it under 'keep' with an axis of 1 in front",
+            )
         return next((axis for axis in ones if axis >= self._axis), ones[-1])
 
     def _scheduled(self, step: ProgramStep, turn: int, values: Mapping[str, Tensor]) -> dict[str, Tensor]:

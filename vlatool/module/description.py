@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-import struct
-import zipfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,8 +15,9 @@ from vlatool.bundle.bundle import LOCATION
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.program import ProgramStep, check_program, program_from, single_graph
 from vlatool.bundle.spec import PolicySpec
-from vlatool.data import RECORD_ALL
-from vlatool.errors import DataError, MissingExtra, SourceError, SpecError, nearest
+from vlatool.data import checked
+from vlatool.data.npz import NpzReader
+from vlatool.errors import MissingExtra, SourceError, SpecError, instead, nearest
 from vlatool.files.kept import carry
 from vlatool.files.printable import one_line, shortened
 from vlatool.files.yaml import read_mapping
@@ -105,12 +104,17 @@ def read_description(path: Path) -> Description:
     data = read_mapping(file, str(file), SourceError)
     for key in data:
         if key not in KEYS:
-            raise SourceError(f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.")
+            raise SourceError(
+                f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.", instead(str(key), KEYS)
+            )
     if data.get("schema", 1) != 1:
         raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
     for key in ("arguments", "environment", "parts"):
         if not isinstance(data.get(key) or {}, Mapping):
-            raise SourceError(f"{file}: '{key}' must be a mapping; got {data[key]!r}.")
+            raise SourceError(
+                f"{file}: '{key}' must be a mapping; got {data[key]!r}.",
+                f"write it as '{key}: {{NAME: VALUE}}', or leave it out",
+            )
     for key in ("name", "spec"):
         if key not in data:
             raise SourceError(f"{file} has no '{key}'.", "see docs/guides/your-own-policy.md for a complete example")
@@ -147,7 +151,8 @@ def _check_label(file: Path, key: str, value: Any) -> None:
     if not (0 < len(label) <= LONGEST and one_line(label, LONGEST) == label):
         raise SourceError(
             f"{file}: '{key}' must be text of 1 to {LONGEST} characters without control characters; got "
-            f"{shortened(label, 40)!r}."
+            f"{shortened(label, 40)!r}.",
+            "give it a short name in one line",
         )
 
 
@@ -168,7 +173,10 @@ def _check_labels(file: Path, spec: PolicySpec) -> None:
     for tensor in (*spec.inputs, *spec.outputs):
         label, count = next(iter(Counter(tensor.labels).most_common(1)), ("", 0))
         if count > 1:
-            raise SourceError(f"{file}: the labels of '{tensor.name}' name '{label}' {count} times; name each once.")
+            raise SourceError(
+                f"{file}: the labels of '{tensor.name}' name '{label}' {count} times; name each once.",
+                "give each element a label of its own",
+            )
 
 
 def _files(file: Path, patterns: Any) -> tuple[str, ...] | None:
@@ -177,14 +185,20 @@ def _files(file: Path, patterns: Any) -> tuple[str, ...] | None:
         return None
     globs = [patterns] if isinstance(patterns, str) else patterns
     if not isinstance(globs, list) or not all(glob and _inside(glob) for glob in globs):
-        raise SourceError(f"{file}: 'files' must be globs inside the folder, as [weights.pt]; got {patterns!r}.")
+        raise SourceError(
+            f"{file}: 'files' must be globs inside the folder, as [weights.pt]; got {patterns!r}.",
+            "name files below the folder of the policy.yaml, or leave 'files' out",
+        )
     return tuple(globs)
 
 
 def _weights(file: Path, pattern: Any) -> str:
     """A glob inside the policy's folder."""
     if not _inside(pattern):
-        raise SourceError(f"{file}: 'weights' must be a glob inside the folder, as \"*.safetensors\"; got {pattern!r}.")
+        raise SourceError(
+            f"{file}: 'weights' must be a glob inside the folder, as \"*.safetensors\"; got {pattern!r}.",
+            "write it as a glob below the folder of the policy.yaml, or leave it out",
+        )
     return str(pattern)
 
 
@@ -195,10 +209,14 @@ def _training(file: Path, named: Any) -> str:
     where, _, function = named.rpartition(":") if isinstance(named, str) else ("", "", "")
     if not (where.endswith(".py") and function.isidentifier() and _inside(where)):
         raise SourceError(
-            f"{file}: 'training' must be a function in a file of the folder, as train.py:batches; got {named!r}."
+            f"{file}: 'training' must be a function in a file of the folder, as train.py:batches; got {named!r}.",
+            "write it as FILE.py:FUNCTION, with the file beside the policy.yaml",
         )
     if not (file.parent / where).is_file():
-        raise SourceError(f"{file} names the function {named} to train with; there is no file {where}.")
+        raise SourceError(
+            f"{file} names the function {named} to train with; there is no file {where}.",
+            "correct the name, or put the file there",
+        )
     return str(named)
 
 
@@ -235,7 +253,10 @@ def _data_file(file: Path, data: Mapping[str, Any], key: str) -> Path | None:
     named = data.get(key)
     path = file.parent / str(named or f"{key}.npz")
     if named and not path.is_file():
-        raise SourceError(f"{file} names the {key} data {named}, which does not exist.")
+        raise SourceError(
+            f"{file} names the {key} data {named}, which does not exist.",
+            f"correct the path (it begins at {file.parent}), or leave '{key}' out",
+        )
     return path if path.is_file() else None
 
 
@@ -245,32 +266,23 @@ def copy_assets(described: Description, out: Path) -> None:
     Raises:
         SourceError: when a file that the spec names is missing.
         SpecError: when statistics or a vocabulary do not fit the spec; names the user's file, not the copy.
-        DataError: when a recording lacks an input; names the user's file.
+        DataError: when a recording cannot be read or does not fit the spec; names the user's file.
     """
     for file in described.assets():
         name = file.relative_to(described.folder)
         if not file.is_file():
-            raise SourceError(f"The spec names {name}, which is not in {described.folder}.")
+            raise SourceError(
+                f"The spec names {name}, which is not in {described.folder}.",
+                "put the file there, or correct its name in the spec",
+            )
         target = out / "assets" / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
     check_assets(described, out / "assets")
     for key, path in described.recordings().items():
-        _check_recording(path, described.spec)
+        checked(path, NpzReader().read(path), described.spec)  # while it has the name that the user knows
         (out / "data").mkdir(exist_ok=True)
         carry(path, out / "data" / f"{key}.npz")
-
-
-def _check_recording(path: Path, spec: PolicySpec) -> None:
-    """Refuse a recording without one of the inputs, while it has the name that the user knows; reads names alone."""
-    try:
-        with zipfile.ZipFile(path) as stored:
-            names = [name.removesuffix(".npy") for name in stored.namelist()]
-    except (OSError, EOFError, ValueError, NotImplementedError, struct.error, zipfile.BadZipFile):
-        return  # whoever reads it says what is wrong
-    for tensor in spec.inputs:
-        if tensor.name not in names:
-            raise DataError(f"{path} has no '{tensor.name}'; {nearest(tensor.name, names)}.", RECORD_ALL)
 
 
 def check_assets(described: Description, copies: Path) -> None:

@@ -239,7 +239,10 @@ def read_tensors(path: Path) -> dict[str, Any]:
     try:
         return dict(safetensors.load_file(str(path)))
     except Exception as error:  # the seam: safetensors raises its own kind
-        raise SourceError(f"{path} cannot be read as safetensors: {error}.") from error
+        raise SourceError(
+            f"{path} cannot be read as safetensors: {error}.",
+            "write it again with safetensors.torch.save_file(), or make the bundle again",
+        ) from error
 
 
 def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where: str) -> None:
@@ -256,10 +259,16 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
         value, found = held[first], (stored.get(f"{graph}.{each}", stored.get(each)) for each in names)
         tensor = next((each for each in found if each is not None), None)
         if tensor is None:
-            raise SourceError(f"No tensor of {where} is '{first}' of '{graph}'; {nearest(first, stored)}.")
+            raise SourceError(
+                f"No tensor of {where} is '{first}' of '{graph}'; {nearest(first, stored)}.",
+                "store the state_dict of the module that make() gives, with its names",
+            )
         if tensor.shape != value.shape:
             got, want = list(tensor.shape), list(value.shape)
-            raise SourceError(f"'{first}' has the shape {got} in {where}; the module's is {want}.")
+            raise SourceError(
+                f"'{first}' has the shape {got} in {where}; the module's is {want}.",
+                "store the state_dict of the module that make() gives, with its shapes",
+            )
         tensors |= dict.fromkeys(names, tensor.to(value.dtype))
     module.load_state_dict(tensors)
 

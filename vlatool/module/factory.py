@@ -12,10 +12,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, install, nearest
+from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, install, instead, nearest
 from vlatool.files.printable import message_of
 from vlatool.module.fresh import compile_afresh
 from vlatool.user_code.children import left
+
+RAISED = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
+"""What is done about code of a user that raises, where no more is known of it."""
 
 OWN_NAME = "vlatool_source_"
 """How the names begin that files of a policy are imported under."""
@@ -64,7 +67,9 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
     where, function = split_factory(factory)
     path = factory_file(factory, folder)
     if path is not None and not path.is_file():
-        raise SourceError(f"No such file: {path} (from '{factory}').")
+        raise SourceError(
+            f"No such file: {path} (from '{factory}').", "check the path, and that of the policy.yaml that names it"
+        )
     if path is None:
         _check_package(factory)
     compile_afresh(folder)
@@ -79,11 +84,15 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
             _install_hint(str(error.name)),
         ) from error
     except Exception as error:  # the seam: user code may raise anything while it is imported
-        raise SourceError(f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.") from error
+        raise SourceError(
+            f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.", RAISED
+        ) from error
     make = getattr(module, function, None)
     if not callable(make):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-        raise SourceError(f"'{where}' has no function '{function}'; {nearest(function, known)}.")
+        raise SourceError(
+            f"'{where}' has no function '{function}'; {nearest(function, known)}.", instead(function, known)
+        )
     if path is None:
         _check_own(make, factory)
     return make  # type: ignore[no-any-return]
@@ -140,7 +149,7 @@ def _running(factory: str, folder: Path, what: str) -> Iterator[None]:
         ) from error
     except Exception as error:  # the seam: user code may raise anything
         about = what[:1].upper() + what[1:]
-        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.") from error
+        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.", RAISED) from error
 
 
 @contextlib.contextmanager
@@ -160,7 +169,7 @@ def exits_caught(what: str) -> Iterator[None]:
         raise
     except VlatoolError as error:
         message = message_of(error).partition("\n")[0].rstrip(".")
-        raise SourceError(f"{about} raised {type(error).__name__}: {message}.") from error
+        raise SourceError(f"{about} raised {type(error).__name__}: {message}.", RAISED) from error
     except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything
@@ -199,7 +208,9 @@ def _import_path(path: Path) -> ModuleType:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise SourceError(f"{path} is not a Python file.")
+        raise SourceError(
+            f"{path} is not a Python file.", "name a .py file, or an importable package: package.module:make"
+        )
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:

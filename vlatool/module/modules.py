@@ -24,12 +24,18 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     modules = {}
     for name in dict.fromkeys(graphs):
         if name not in products:
-            raise SourceError(f"The program runs '{name}', which the factory does not give; {nearest(name, products)}.")
+            raise SourceError(
+                f"The program runs '{name}', which the factory does not give; {nearest(name, products)}.",
+                "name the graphs of the program as make() names its modules",
+            )
         module = products[name]
         if isinstance(module, torch.export.ExportedProgram):
             module = module.module()
         if not isinstance(module, torch.nn.Module):
-            raise SourceError(f"The factory gave a {type(module).__name__} for '{name}'; wanted a torch module.")
+            raise SourceError(
+                f"The factory gave a {type(module).__name__} for '{name}'; wanted a torch module.",
+                "return a torch.nn.Module, or a dict of them: graph name -> module",
+            )
         modules[name] = _in_eval_mode(module)
     return modules
 
@@ -42,7 +48,10 @@ def outputs_of(result: Any, step: ProgramStep) -> list[Any]:
     """
     outputs = list(result) if isinstance(result, tuple | list) else [result]
     if len(outputs) != len(step.gives):
-        raise SourceError(f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.")
+        raise SourceError(
+            f"The module gives {len(outputs)} outputs; the program says {', '.join(step.gives)}.",
+            "return as many tensors as the program's 'gives' names, in its order",
+        )
     return outputs
 
 

@@ -104,7 +104,10 @@ def origin_of(bundle: Bundle) -> Origin:
     recorded = bundle.manifest.source
     factory = recorded.get("factory")
     if not isinstance(factory, str):
-        raise SourceError(f"{bundle.path} was not made from a torch policy; it has nothing to export.")
+        raise SourceError(
+            f"{bundle.path} was not made from a torch policy; it has nothing to export.",
+            "run the bundle itself, or name the policy: its directory, or path.py:make",
+        )
     folder = read_location(bundle.path)
     where, function = split_factory(factory)
     named = trust.require(folder, f"{function}() of {where}")

@@ -23,6 +23,7 @@ from vlatool.module.faked import as_float32, run_faked
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import stored_modules, takes_shards, weights_read
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy
+from vlatool.runtime.contract import OF_THE_POLICY, off_the_robot
 from vlatool.stage.base import Context, Transform, source_of
 from vlatool.stage.finish import SEED, carry_over, history, save_npz
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 
 TRAINING = f"{FOLDER}/training.json"
+LESS = "prune less, or leave out what it names; VLATOOL_DEBUG=1 shows where it was raised"
 RUN_BELOW = 1 << 32
 """Bytes of weights in shards up to which the changed policy is run on them; above, shapes alone go through it."""
 
@@ -116,7 +118,8 @@ class ModuleStage(Transform):
             _run_once(changed)
             return changed
         changed = self._changed(bundle, out, context)
-        with _weights_blamed(lambda: load_modules(changed)):
+        answered = off_the_robot("the first observation", OF_THE_POLICY)
+        with answered, _weights_blamed(lambda: load_modules(changed)):
             torch_policy(changed, SEED).infer(observations_for(changed, 1)[0])
         return changed
 
@@ -184,7 +187,8 @@ def _run_once(bundle: Bundle) -> None:
     """
     stored = stored_modules(bundle)
     if stored.nbytes < RUN_BELOW:
-        with weights_read(stored), _weights_blamed(lambda: stored.modules):
+        answered = off_the_robot("the first observation", OF_THE_POLICY)
+        with weights_read(stored), answered, _weights_blamed(lambda: stored.modules):
             policy_of(bundle, stored.modules, SEED).infer(observations_for(bundle, 1)[0])
         return
     try:
@@ -193,7 +197,9 @@ def _run_once(bundle: Bundle) -> None:
         raise
     except Exception as error:  # the seam: the user's module may raise anything
         reason = (message_of(error).splitlines() or [""])[0]
-        raise SourceError(f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error)) from error
+        raise SourceError(
+            f"The changed policy fails: {type(error).__name__}: {reason}.", remedy_for(error) or LESS
+        ) from error
 
 
 def write_changed(

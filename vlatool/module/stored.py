@@ -112,7 +112,10 @@ def read_tensor(reader: Reader, stored: StoredTensor, dtype: Any) -> Tensor:
     torch = require("torch", "build")
     kinds = {kind: getattr(torch, name) for name, kind in NUMPY_NAMES.items()}
     if stored.dtype not in kinds:
-        raise SourceError(f"'{stored.name}' in {stored.file.name} is {stored.dtype}; torch modules cannot hold that.")
+        raise SourceError(
+            f"'{stored.name}' in {stored.file.name} is {stored.dtype}; torch modules cannot hold that.",
+            "store it as float32, float16 or bfloat16",
+        )
     whole = torch.empty(stored.shape, dtype=dtype)
     flat = whole.view(-1)
     for begin in range(0, stored.nbytes, PART_BYTES):

@@ -52,7 +52,8 @@ class Budget:
         units = {f"unit:{m.unit}" for m in row.measurements if m.name.startswith("error_baseline.")}
         raise RecipeError(
             f"--max-drop names '{self.name}', which is not measured on this policy; "
-            f"{nearest(self.name, [*known, *sorted(units)])}."
+            f"{nearest(self.name, [*known, *sorted(units)])}.",
+            "leave the name out to bound the success or the error that is measured",
         )
 
 

@@ -193,7 +193,10 @@ def _candidates(
                 raise
             failures.append(Row(name, "failed", error.message))
     if not bundles:
-        raise RecipeError("No candidate could be made: " + "; ".join(f"{row.name}: {row.reason}" for row in failures))
+        raise RecipeError(
+            "No candidate could be made: " + "; ".join(f"{row.name}: {row.reason}" for row in failures),
+            "correct what they say, or name other candidates in a recipe: --recipe FILE",
+        )
     return bundles, failures, trained
 
 

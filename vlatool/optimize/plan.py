@@ -120,7 +120,9 @@ def make_plan(source: str, profile: Profile | None, recipe: Recipe, cache: Path,
                 "put the stages of prune and distill first, and options of the export under 'export'",
             )
         if name == BASELINE or not name.replace("_", "").replace("-", "").isalnum():
-            raise RecipeError(f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.")
+            raise RecipeError(
+                f"A candidate cannot be called '{name}'; use letters, digits, '-' and '_'.", "rename it in the recipe"
+            )
     if recipe.pruning.trials:
         _check_pruning(recipe.pruning, stage)
         if recipe.pruning.study:
@@ -168,9 +170,15 @@ def transforms(stages: StageList) -> tuple[Transform, ...]:
     for name, options in stage_entries(stages):
         stage = build_stage(name, options or {})
         if stage.kind() == "sources":
-            raise RecipeError(f"The stage {name} reads a policy; the policy is named on the command line.")
+            raise RecipeError(
+                f"The stage {name} reads a policy; the policy is named on the command line.",
+                "leave the stage out of the recipe",
+            )
         if not isinstance(stage, Transform):
-            raise RecipeError(f"The stage {name} measures; a recipe lists stages that make a bundle.")
+            raise RecipeError(
+                f"The stage {name} measures; a recipe lists stages that make a bundle.",
+                "leave the stage out of the recipe: optimize measures by itself",
+            )
         built += stage.chain()
     return tuple(built)
 

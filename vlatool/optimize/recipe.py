@@ -141,13 +141,15 @@ def read_recipe(path: Path) -> Recipe:
         RecipeError: when the file is missing, is not YAML, or says something impossible; lists every problem.
     """
     if not path.exists():
-        raise RecipeError(f"There is no recipe {path}.")
+        raise RecipeError(
+            f"There is no recipe {path}.", "check the path; the output of vlatool optimize holds a recipe.yaml"
+        )
     data = read_mapping(path, f"The recipe {path}", RecipeError)
     try:
         return Recipe.model_validate(data)
     except ValidationError as error:
         problems = [f"{'.'.join(map(str, item['loc'])) or 'recipe'}: {item['msg']}" for item in error.errors()]
-        raise RecipeError(f"The recipe {path}: {'; '.join(problems)}.") from error
+        raise RecipeError(f"The recipe {path}: {'; '.join(problems)}.", "correct it in the file") from error
 
 
 def stage_entries(stages: StageList) -> list[tuple[str, dict[str, Any]]]:
@@ -159,6 +161,9 @@ def stage_entries(stages: StageList) -> list[tuple[str, dict[str, Any]]]:
     entries: list[tuple[str, dict[str, Any]]] = []
     for entry in stages:
         if len(entry) != 1:
-            raise RecipeError(f"A stage is one name with its options; got {entry}.")
+            raise RecipeError(
+                f"A stage is one name with its options; got {entry}.",
+                "write it as '- quantize.static_int8: {exclude: [head*]}', or as the name alone",
+            )
         entries.extend(entry.items())
     return entries

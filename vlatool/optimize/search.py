@@ -174,7 +174,7 @@ class Search:
             refuse_findings(bundle, self.limits.accept)
             twin = self._seen.setdefault(graphs_of(bundle), name)
             if twin != name:  # no product has enough rows to become a convolution, say
-                raise GraphError(f"It has the graphs of {twin}.")
+                raise GraphError(f"It has the graphs of {twin}.", f"look at {twin} in its place")
             engine = (bundle.manifest.engine or DEFAULT_ENGINE) if self._apart else ""
             timing = Latency(against=(bundle.path,), iterations=TIMED, threads=self.threads, engine=engine, **QUICK)
             timed = cached_measure(timing, self.baseline, self.cache, quiet).rows[-1].get("speedup")

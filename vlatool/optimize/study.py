@@ -101,7 +101,10 @@ class Study:
             agreed = {str(name): tuple(stages) for name, stages in held}
             known = quantizations(agreed)
         except (AttributeError, TypeError, ValueError, VlatoolError) as error:
-            raise DataError(f"The study says of quantization what vlatool cannot read: {error}.") from error
+            raise DataError(
+                f"The study says of quantization what vlatool cannot read: {error}.",
+                "take a study that vlatool made, or a new one: another --study",
+            ) from error
         if known != agreed or FLOAT32 in agreed:
             raise DataError("The study names stages that do not quantize.", "name another study")
         return {**agreed, FLOAT32: ()}
@@ -249,7 +252,10 @@ class Study:
             seconds = float(trial.user_attrs.get(TRAINING, 0.0))
             note, refused = (str(trial.user_attrs.get(name, ""))[:LONGEST] for name in (NOTE, REFUSED))
         except (TypeError, ValueError) as error:
-            raise DataError(f"Trial {trial.number} of the study is no trial of vlatool: {error}.") from error
+            raise DataError(
+                f"Trial {trial.number} of the study is no trial of vlatool: {error}.",
+                "take a study that vlatool made, or a new one: another --study",
+            ) from error
         if not self._space.holds(shape) or not speedup >= 0 or math.isnan(drop):
             raise DataError(
                 f"Trial {trial.number} of the study is not of this policy: {trial.params}, {trial.values}.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import RecipeError, instead, nearest
 from vlatool.graph.nodes import matches
 
 
@@ -32,7 +32,9 @@ class Selection:
         """
         for pattern in (*self.include, *self.exclude):
             if not any(matches(name, (pattern,)) for name in names):
-                raise RecipeError(f"No {what} matches '{pattern}'; {nearest(pattern, list(names))}.")
+                raise RecipeError(
+                    f"No {what} matches '{pattern}'; {nearest(pattern, list(names))}.", instead(pattern, list(names))
+                )
 
     def has(self, names: Iterable[str]) -> bool:
         """Return whether a part with these names may go: one of them is asked for, and none is excluded."""

@@ -68,7 +68,7 @@ class Depth(ModuleStage):
         if self.keep and others:
             raise RecipeError(f"--keep says which blocks stay; {' and '.join(others)} would say so again.", "name one")
         if self.keep and len(set(self.keep)) < len(self.keep):
-            raise RecipeError(f"--keep names a block twice: {','.join(map(str, self.keep))}.")
+            raise RecipeError(f"--keep names a block twice: {','.join(map(str, self.keep))}.", "name each block once")
 
     def in_parts(self) -> bool:
         """A backward pass needs all weights; one after the other would be read very often for ``error``."""
@@ -170,7 +170,10 @@ def _listed_blocks(sizes: Mapping[Stack, int], keep: Sequence[int]) -> dict[Stac
         )
     size = next(iter(sizes.values()))
     if outside := [number for number in keep if not 0 <= number < size]:
-        raise RecipeError(f"--keep names block {outside[0]}; {_listed(sizes)} has the blocks 0 to {size - 1}.")
+        raise RecipeError(
+            f"--keep names block {outside[0]}; {_listed(sizes)} has the blocks 0 to {size - 1}.",
+            f"name blocks from 0 to {size - 1}",
+        )
     if len(keep) == size:
         raise RecipeError(f"--keep names all blocks of {_listed(sizes)}.", "leave out those that are to go")
     return {stack: sorted(keep) for stack in sizes}

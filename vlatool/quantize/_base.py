@@ -6,7 +6,6 @@ import contextlib
 import fnmatch
 import io
 import logging
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -19,11 +18,13 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.unexported import no_graph
 from vlatool.data import calibration_recording, observations_for
-from vlatool.errors import BundleError, RecipeError, nearest
+from vlatool.errors import BundleError, RecipeError, instead, nearest
+from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
 from vlatool.graph.precision import FLOATS
+from vlatool.quantize._not_finite import finite_layers
 from vlatool.runtime.arithmetic import EXACT
 from vlatool.runtime.engine import UNKNOWN
 from vlatool.stage.base import Context, Transform, source_of
@@ -69,7 +70,10 @@ class Quantization(Transform):
             raise no_graph(source, "quantize")
         for pattern in self.graphs:
             if not fnmatch.filter(source.manifest.graphs, pattern):
-                raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.")
+                raise RecipeError(
+                    f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.",
+                    instead(pattern, source.manifest.graphs),
+                )
         for name in self.chosen_graphs(source):
             graph = source.manifest.graphs[name]
             quantized = [kind.replace(" weights", " (weights)") for kind in graph.precision if kind not in FLOATS]
@@ -157,7 +161,14 @@ class Quantization(Transform):
             with foreign_errors(name):
                 layers[name] = find_layers(read(bundle.file(bundle.manifest.graphs[name].file)), ops, **kinds)
         selected = self.selected([layer.name for graph in layers.values() for layer in graph], bundle, tuple(ops))
-        return {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
+        chosen = {name: [layer for layer in graph if layer.name in selected] for name, graph in layers.items()}
+        finite = finite_layers(bundle, chosen)
+        if not any(finite.values()):
+            raise RecipeError(
+                f"Every layer of {bundle.path} that was chosen reads NaN or infinity, which an input of it takes.",
+                "choose others with --include, or quantize the weights alone: vlatool quantize weight-only",
+            )
+        return finite
 
     def selected(self, names: Iterable[str], bundle: Bundle, ops: Sequence[str] = QUANTIZED_OPS) -> set[str]:
         """Return which of those nodes are quantized, by include, exclude and parts.
@@ -183,11 +194,14 @@ class Quantization(Transform):
 
         for pattern in (*self.include, *self.exclude):
             if not any(meets(name, (pattern,)) for name in candidates):
-                raise RecipeError(f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.")
+                raise RecipeError(
+                    f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.",
+                    instead(pattern, candidates[:200]),
+                )
         parts = bundle.manifest.parts
         for part in self.parts:
             if part not in parts:
-                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.")
+                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.", instead(part, parts))
         globs = tuple(pattern for part in self.parts for pattern in parts[part])
         kept = {name for name in candidates if not self.include or meets(name, self.include)}
         if self.parts:
@@ -205,7 +219,10 @@ def check_ops(ops: Iterable[str]) -> None:
     """Raise a user error for an operator that no method quantizes."""
     for name in ops:
         if name not in QUANTIZED_OPS:
-            raise RecipeError(f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.")
+            raise RecipeError(
+                f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.",
+                instead(name, QUANTIZED_OPS),
+            )
 
 
 def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:
@@ -228,12 +245,12 @@ def quiet_quantizer() -> Iterator[Path]:
     logger.setLevel(logging.ERROR)
     try:
         with (
-            tempfile.TemporaryDirectory(prefix="vlatool-") as scratch,
+            scratch_directory() as scratch,
             contextlib.redirect_stdout(io.StringIO()),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
-            yield Path(scratch)
+            yield scratch
     finally:
         logger.setLevel(level)
 

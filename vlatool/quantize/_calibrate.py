@@ -5,7 +5,6 @@ Nothing of a sample is kept: peak memory is one session, one sample's activation
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import Moment
+from vlatool.data import Moment, takes_not_finite
 from vlatool.errors import DataError, GraphError
+from vlatool.files.scratch import scratch_directory
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._watched import SAMPLE, Watcher, run_watched
@@ -28,9 +28,15 @@ class _Calibrating(Watcher):
     """Adds chosen values to their statistics."""
 
     def __init__(
-        self, graph: str, path: Path, scratch: Path, statistics: dict[str, Statistics], spared: Collection[str]
+        self,
+        graph: str,
+        path: Path,
+        scratch: Path,
+        statistics: dict[str, Statistics],
+        spared: Collection[str],
+        ignores: bool,
     ) -> None:
-        self.graph, self.statistics, self._spared = graph, statistics, spared
+        self.graph, self.statistics, self._spared, self._ignores = graph, statistics, spared, ignores
         super().__init__(path, scratch / f"{graph}.onnx", self._show)
 
     def _show(self, graph: OnnxGraph) -> None:
@@ -45,6 +51,10 @@ class _Calibrating(Watcher):
                 if name in self._spared:
                     statistics.finite = False
                     statistics.samples += 1
+                    continue
+                if self._ignores:
+                    statistics.finite = False
+                    statistics.add(np.where(np.isfinite(array), array, 0))
                     continue
                 bad = int(np.size(array) - np.isfinite(array).sum())
                 raise DataError(
@@ -77,7 +87,8 @@ def calibrate(
         spared: Graph name -> values that may be NaN or infinite, which their statistics then say.
 
     Returns:
-        Graph name -> value name -> statistics over all runs of the graph.
+        Graph name -> value name -> statistics over all runs of the graph; where an input takes NaN and infinity, of
+        the finite values alone.
 
     Raises:
         DataError: when an observation does not fit the spec, or makes an activation that is not finite; names the
@@ -85,10 +96,11 @@ def calibrate(
         GraphError: when the program never runs a graph, whose ranges would be guesses.
     """
     statistics = {graph: {name: Statistics(channels) for name in names} for graph, names in values.items()}
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
+    ignores = bool(takes_not_finite(bundle.manifest.spec))
+    with scratch_directory() as scratch:
         files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in statistics}
         watchers = {
-            graph: _Calibrating(graph, file, Path(scratch), statistics[graph], (spared or {}).get(graph, ()))
+            graph: _Calibrating(graph, file, scratch, statistics[graph], (spared or {}).get(graph, ()), ignores)
             for graph, file in files.items()
         }
         run_watched(bundle, watchers, observations, context, "calibrating on", numbers)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
-from vlatool.data import calibration_recording
+from vlatool.data import calibration_recording, takes_not_finite
 from vlatool.errors import DataError, GraphError, require
 from vlatool.quantize._blocks import METHODS
 from vlatool.quantize._compute import figures, piece, records_of, store, stored_meaning, whole_weight
@@ -127,9 +127,13 @@ class _Walk:
             return rows @ whole_weight(self._plan.tasks[self._shared[id(layer)]], tools).T
         task = self._plan.tasks[number]
         if number < self._wanted:
-            return rows @ self._finished(task, number).T
+            with np.errstate(invalid="ignore"):
+                return rows @ self._finished(task, number).T
         weight = whole_weight(task, tools)
-        if not np.isfinite(rows).all():
+        products = rows
+        if takes_not_finite(self._bundle.manifest.spec):
+            rows = rows[np.isfinite(rows).all(axis=1)]
+        if not np.isfinite(rows).all() or not len(rows):
             raise DataError(
                 f"The calibration samples make what the layer '{layer.node.name}' reads not finite.",
                 "look at the samples and at the float32 policy: vlatool explain names where it begins",
@@ -137,7 +141,8 @@ class _Walk:
         rounded = self._round(weight, rows)
         self._store(task, rounded, self._target)
         self._note = _note(task, weight, rounded, rows, SLACK * self._stage.form.largest_error)
-        return rows @ rounded.meant.T
+        with np.errstate(invalid="ignore"):  # what is not finite stays so
+            return products @ rounded.meant.T
 
     def _round(self, weight: Array, rows: Array) -> Rounded:
         """Round by the method; to nearest where its activations make it lose more than the weights can spare."""

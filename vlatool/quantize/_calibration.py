@@ -6,12 +6,20 @@ import itertools
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.data import PLAYED, Recording, calibration_checks, calibration_recording
+from vlatool.data import (
+    PLAYED,
+    Moment,
+    Recording,
+    calibration_checks,
+    calibration_recording,
+    observations_for,
+    takes_not_finite,
+)
 from vlatool.errors import DataError
 from vlatool.quantize._base import Quantization
 from vlatool.quantize._calibrate import Values, calibrate
@@ -21,6 +29,9 @@ from vlatool.stage.base import Context, SampleSet
 
 if TYPE_CHECKING:
     from vlatool.hardware.profile import Profile
+
+REPLACED = 16
+"""Observations with NaN and infinity that calibrate, where an input takes them."""
 
 
 class Calibrated(Quantization):
@@ -85,8 +96,13 @@ class Calibrated(Quantization):
         recording, numbers = self.chosen(bundle)
         recorded = recorded_moments(bundle, recording, numbers, seen)
         played = (moment for _ in range(kept) for moment in played_moments(bundle, seen))  # after the others
-        moments = itertools.chain(recorded, played)
+        replaced = (Moment(each, 0, begins=True) for each in self._not_finite(bundle))
+        moments = itertools.chain(recorded, played, replaced)
         return calibrate(bundle, values, moments, context, numbers=numbers, spared=spared)
+
+    def _not_finite(self, bundle: Bundle) -> list[dict[str, Any]]:
+        """Return observations with NaN and infinity where an input takes them: ranges hold what becomes of these."""
+        return observations_for(bundle, REPLACED, self.calibration) if takes_not_finite(bundle.manifest.spec) else []
 
     def _missing(self, bundle: Bundle) -> DataError:
         plays = ", or quantize.qat, which plays episodes" if self.without and bundle.manifest.environment else ""

@@ -56,7 +56,9 @@ def _open(path: Path) -> Skeleton:
         raise
     except Exception as error:  # the seam: protobuf and onnx_ir raise many foreign types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise GraphError(f"{path} cannot be read as ONNX: {reason}") from error
+        raise GraphError(
+            f"{path} cannot be read as ONNX: {reason}", "check that the file is whole, or export the policy again"
+        ) from error
     return Skeleton(model, tensors, int(model.graph.opset_imports.get("", 0)))
 
 
@@ -72,7 +74,8 @@ def _stored(ir: Any, name: str, value: Any, path: Path) -> StoredTensor | None:
     if small or kind is None:
         if external and not small:
             raise GraphError(
-                f"{path} holds '{name}' as {tensor.dtype.name} outside the file, which cannot be streamed."
+                f"{path} holds '{name}' as {tensor.dtype.name} outside the file, which cannot be streamed.",
+                "export the policy again in float32, float16 or bfloat16",
             )
         if external:
             value.const_value = ir.tensor(tensor.numpy().copy(), name=name)

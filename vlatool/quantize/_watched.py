@@ -12,6 +12,7 @@ from vlatool.errors import DataError, GraphError, require
 from vlatool.graph.files import write_beside
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.machine.risky import risky
+from vlatool.runtime.contract import off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.graph_files import open_graph
 from vlatool.runtime.observation import ObservationEncoder
@@ -19,6 +20,7 @@ from vlatool.runtime.policy import Policy
 from vlatool.runtime.program import Program
 from vlatool.stage.base import Context
 
+SAMPLE_OR_POLICY = "remove that sample from the recording, or correct the policy where it may come"
 SAMPLE = "Calibration sample"
 
 
@@ -101,7 +103,8 @@ def run_watched(
         if moment.begins:
             policy.reset(number)
         try:
-            policy.infer(moment.observation)
+            with off_the_robot("what was recorded", SAMPLE_OR_POLICY):
+                policy.infer(moment.observation)
         except (GraphError, DataError) as error:
             if error.message.startswith(SAMPLE):
                 raise

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import RecipeError, instead, nearest
 from vlatool.quantize._fake_export import Skeleton
 from vlatool.quantize._records import padded
 from vlatool.quantize._rewrite import (
@@ -155,7 +155,9 @@ def _place(graph: str, source: Any) -> tuple[str, ...]:
 def _chosen(products: dict[str, list[Product]], stage: WeightOptions, bundle: Bundle) -> dict[str, list[Product]]:
     for pattern in stage.graphs:
         if not fnmatch.filter(products, pattern):
-            raise RecipeError(f"No graph matches '{pattern}'; {nearest(pattern, products)}.")
+            raise RecipeError(
+                f"No graph matches '{pattern}'; {nearest(pattern, products)}.", instead(pattern, products)
+            )
     graphs = {
         name for name in products if not stage.graphs or any(fnmatch.fnmatch(name, glob) for glob in stage.graphs)
     }

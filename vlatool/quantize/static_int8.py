@@ -236,9 +236,9 @@ def _of_sums_alone(layers: Mapping[str, list[Layer]]) -> dict[str, set[str]]:
 
 
 def _with_ranges(layers: list[Layer], statistics: Mapping[str, Statistics]) -> list[Layer]:
-    """Return the layers whose activations were finite: a mask of -infinity makes some that are not."""
+    """Return the layers whose activations were finite: a mask of -infinity, or an input that takes it, makes others."""
     infinite = {name for name, seen in statistics.items() if not seen.finite}
-    return [layer for layer in layers if layer.kind != "Add" or infinite.isdisjoint(layer.activations)]
+    return [layer for layer in layers if infinite.isdisjoint(layer.activations)]
 
 
 def _other(fits: Callable[[Int8Layout, type[Engine]], bool]) -> str:

@@ -73,7 +73,10 @@ class WeightOnly(WeightOptions):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """There is something to quantize, and calibration data for the methods that need it."""
         if self.calibration and not self.calibration.is_file():
-            raise DataError(f"The calibration file {self.calibration} does not exist.")
+            raise DataError(
+                f"The calibration file {self.calibration} does not exist.",
+                "check the path, or leave --calibration out for the bundle's own recording",
+            )
         if source is None:
             return
         if self.method in CALIBRATED and not recorded_observations(source, 1, self.calibration):

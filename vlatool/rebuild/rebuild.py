@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, get_args
 
 from vlatool.bundle.bundle import LOCATION, MANIFEST, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.files.scratch import scratch_directory
 from vlatool.files.writing import writing
 from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
@@ -25,6 +25,9 @@ from vlatool.stage.build import build_stage, stage_class
 from vlatool.stage.finish import DECIDED, FINALIZED, history, reseal
 from vlatool.stage.run import run_transform
 from vlatool.user_code import trust
+
+MADE_LAST = ("graphs", "golden", MANIFEST)
+UNUSABLE = "make the bundle again, with the command that made it"
 
 Entry = dict[str, Any]
 RECORDED_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
@@ -58,8 +61,15 @@ class Rebuilt:
 
     @property
     def first_difference(self) -> Compared | None:
-        """The first file that differs, None when none does."""
-        return next((file for file in self.files if not file.identical), None)
+        """The file that differs and that others which differ were made from, None when none does."""
+        differing = [file for file in self.files if not file.identical]
+        return min(differing, key=lambda file: _rank(file.file), default=None)
+
+
+def _rank(name: str) -> int:
+    """Return how late in the making of a bundle a file comes: what differs first may be why later ones do."""
+    folder = name.partition("/")[0]
+    return MADE_LAST.index(folder) + 1 if folder in MADE_LAST else 0
 
 
 @dataclass(frozen=True)
@@ -112,9 +122,9 @@ def build_record(bundle: Bundle) -> tuple[Entry, ...]:
         where, stage = f"Entry {number} of the build record of {bundle.path}", entry.get("stage")
         mappings = all(isinstance(entry.get(name, {}), Mapping) for name in ("options", "versions", "files", "graphs"))
         if not (isinstance(stage, str) and mappings and isinstance(entry.get("input", ""), str)):
-            raise BundleError(f"{where} is invalid: {json.dumps(entry)[:200]}.")
+            raise BundleError(f"{where} is invalid: {json.dumps(entry)[:200]}.", UNUSABLE)
         if number and stage.startswith("sources."):
-            raise BundleError(f"{where} is a source; only the first may be.")
+            raise BundleError(f"{where} is a source; only the first may be.", UNUSABLE)
     return entries
 
 
@@ -164,10 +174,10 @@ def rebuild(
     entries = build_record(bundle)
     start = _start(bundle, entries, source, files, cache)
     same: list[tuple[str, bool]] = []
-    with tempfile.TemporaryDirectory(prefix="vlatool-rebuild-") as scratch:
+    with scratch_directory("vlatool-rebuild-") as scratch:
         product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
-            before, place = product, Path(scratch) / f"{number}-{entry['stage']}"
+            before, place = product, scratch / f"{number}-{entry['stage']}"
             product = (
                 _finalized(entry, before, place) if stage is None else run_transform(stage, before, place, context)
             )
@@ -231,11 +241,13 @@ def _stage(entry: Entry, places: _Places) -> Transform:
         if key in fields and Path in (fields[key].annotation, *get_args(fields[key].annotation)) and value is not None:
             match = RECORDED_FILE.fullmatch(str(value))
             if match is None:
-                raise BundleError(f"The build record names the file '{value}' of {name} without its hash.")
+                raise BundleError(f"The build record names the file '{value}' of {name} without its hash.", UNUSABLE)
             options[key] = places.find(match["name"], match["hash"], name)
     stage = build_stage(name, options)
     if not isinstance(stage, Transform):
-        raise BundleError(f"The build record names {name}, which measures; it may only name stages that make bundles.")
+        raise BundleError(
+            f"The build record names {name}, which measures; it may only name stages that make bundles.", UNUSABLE
+        )
     return stage
 
 
@@ -263,7 +275,10 @@ def _checked_source(source: str, entry: Entry, bundle: Bundle) -> Transform:
     """
     stage = source_stage(source)
     if stage.name() != entry["stage"]:
-        raise SourceError(f"{source} is read by {stage.name()}; {bundle.path} was made by {entry['stage']}.")
+        raise SourceError(
+            f"{source} is read by {stage.name()}; {bundle.path} was made by {entry['stage']}.",
+            f"pass what {entry['stage']} reads: --source",
+        )
     stage = stage.as_recorded(entry, bundle)
     stage.check(None, None)
     got, recorded = stage.input_hashes(), entry.get("files", {})

@@ -17,7 +17,7 @@ import vlatool
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import OutputError, TargetError, UsageError, VlatoolError
 from vlatool.files.printable import one_line
-from vlatool.measurement.child import Progress, Raised, Result, error_of, read_line, signal_name
+from vlatool.measurement.child import CRASHES, Progress, Raised, Result, error_of, read_line, signal_name
 from vlatool.remote import _probe, _push
 from vlatool.remote._connection import AGAIN, Connection
 from vlatool.remote._heard import Ended, NoRoom, Python, nonsense, parsed, python_of, sane, told
@@ -99,7 +99,10 @@ def _check(target: str, python: str) -> None:
             "give user@host, or a Host of ~/.ssh/config",
         )
     if python.startswith("-") or not python.isprintable():
-        raise UsageError(f"The remote Python {python!r} is not the path of a program.")
+        raise UsageError(
+            f"The remote Python {python!r} is not the path of a program.",
+            "name it as --remote-python ~/venv/bin/python",
+        )
 
 
 def _find_python(
@@ -211,9 +214,10 @@ def _result(target: str, answer: Result | Raised | None, ended: Ended) -> dict[s
             f"look for it with: ssh {target} dmesg; free memory there, or choose a smaller bundle",
         )
     if code < 0:
-        raise TargetError(f"The benchmark on {target} was ended by {signal_name(code)}; its last line: {last}")
+        raise TargetError(f"The benchmark on {target} was ended by {signal_name(code)}; its last line: {last}", CRASHES)
     if code or answer is None or not isinstance(answer.value, dict):
         raise TargetError(
-            f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}"
+            f"The benchmark on {target} ended with code {code} and without a result; its last line: {last}",
+            "run it on the target itself to see more: vlatool benchmark latency BUNDLE",
         )
     return {**answer.value, "log": f"{log}{answer.value.get('log', '')}"}

@@ -77,7 +77,10 @@ def format_of(path: Path) -> Format:
         said = (
             f"'{suffix}' is none; {nearest(suffix, known)}" if suffix else f"there is none; known: {', '.join(known)}"
         )
-        raise UsageError(f"{path}: the suffix says what kind of video is written, and {said}.")
+        raise UsageError(
+            f"{path}: the suffix says what kind of video is written, and {said}.",
+            "name a file that ends in .gif or .mp4",
+        )
     found: Format = registry.load("videos", suffix)()
     return found
 

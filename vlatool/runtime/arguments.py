@@ -19,7 +19,10 @@ def check_path(path: Any) -> None:
         UsageError: naming what it is.
     """
     if not isinstance(path, str | os.PathLike):
-        raise UsageError(f"The path of the bundle is a {type(path).__name__}; allowed: text or a Path.")
+        raise UsageError(
+            f"The path of the bundle is a {type(path).__name__}; allowed: text or a Path.",
+            "pass the path as a str or a pathlib.Path",
+        )
 
 
 def check_whole(name: str, value: Any, least: int, most: float = math.inf, *, optional: bool = False) -> None:
@@ -50,7 +53,9 @@ def check_positive(name: str, value: Any, unit: str, *, optional: bool = False, 
 
 
 def _refused(name: str, value: Any, allowed: str, optional: bool) -> UsageError:
-    return UsageError(f"{name} is {value!r}; allowed: {allowed}{', or None' if optional else ''}.")
+    return UsageError(
+        f"{name} is {value!r}; allowed: {allowed}{', or None' if optional else ''}.", f"pass {name}={allowed}"
+    )
 
 
 def check_load(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,19 @@ from vlatool.errors import GraphError, SpecError, nearest
 from vlatool.runtime.observation import all_finite
 
 Array = NDArray[Any]
+ON_A_ROBOT = "do not execute it; check the last observation"
+"""What helps where an answer is not finite and a robot waits for it."""
+OF_THE_POLICY = (
+    "correct the policy: by itself it gives NaN or infinity there; look for a division by zero, log or sqrt of what is "
+    "not positive, and a softmax over nothing"
+)
+OF_NOT_FINITE = (
+    "its spec says finite: false: let the policy replace such values before it computes with them (torch.nan_to_num, "
+    "or torch.where with torch.isfinite), or leave that out of the spec"
+)
+OF_THE_GRAPHS = (
+    "leave layers out with --exclude, or use another method or --opset: what it was made from answers finite values"
+)
 AGAIN = "declare in the spec what the policy gives, or fix the policy, and export it again"
 BASE_MB = 2000.0
 TIMES_GRAPHS = 8.0
@@ -187,7 +201,7 @@ def _check_total(named: Mapping[str, Port], who: str, limit_mb: float) -> None:
         raise GraphError(
             f"{who} has inputs and outputs of {total / 1e6:,.0f} MB, most of it '{largest}' ({named[largest]}); "
             f"allowed: {limit_mb:,.0f} MB.",
-            "allow more with load(..., memory_mb=...) if the policy is meant to be that large",
+            "declare smaller ones; where they are right, a robot allows more memory: load(..., memory_mb=...)",
         )
 
 
@@ -249,7 +263,23 @@ class Outputs:
 
 def not_finite(name: str, what: str = "output") -> GraphError:
     """Return the error of an output or a kept value that holds NaN or infinity."""
-    return GraphError(f"The {what} '{name}' is not finite.", "do not execute it; check the last observation")
+    return GraphError(f"The {what} '{name}' is not finite.", ON_A_ROBOT)
+
+
+@contextlib.contextmanager
+def off_the_robot(where: str, fix: str) -> Iterator[None]:
+    """Give an answer that is not finite a place and the remedy of who makes or measures a bundle: nobody executes it.
+
+    Args:
+        where: Which observation it answers, the end of a sentence: ``observation 3``.
+        fix: What helps there.
+    """
+    try:
+        yield
+    except GraphError as error:
+        if error.fix.startswith(ON_A_ROBOT):
+            error.message, error.fix = f"{error.message.rstrip('.')} (the answer to {where}).", fix
+        raise
 
 
 def _fits(array: Array, tensor: TensorSpec) -> bool:

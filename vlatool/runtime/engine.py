@@ -149,7 +149,9 @@ class Engine:
         Raises:
             GraphError: when the engine cannot be profiled, or refuses the graph.
         """
-        raise GraphError(f"The engine {cls.title} cannot be profiled.")
+        raise GraphError(
+            f"The engine {cls.title} cannot be profiled.", "see which layers are quantized instead: vlatool explain"
+        )
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
@@ -221,7 +223,9 @@ def computing(dtype: str) -> str:
     for name, library in usable_engines().items():
         if dtype in library.computes:
             return name
-    raise GraphError(f"No engine computes in {dtype}.")
+    raise GraphError(
+        f"No engine computes in {dtype}.", "install another engine: vlatool doctor lists them and what installs each"
+    )
 
 
 def installed(name: str) -> bool:

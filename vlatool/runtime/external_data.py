@@ -12,6 +12,8 @@ from pathlib import Path
 from vlatool.errors import GraphError
 from vlatool.files.limits import check, limit
 
+DAMAGED = "copy the graph again from where it was made, or make it again"
+
 LOCATION = b"location"
 VARINT, FIXED64, LENGTH, FIXED32 = 0, 1, 2, 5
 HEAD = 15
@@ -137,7 +139,7 @@ def _location(model: bytes | OpenFile, start: int, end: int) -> set[str]:
     try:
         return {value.decode("utf-8") for field, value in pairs if field == 2} or {""}
     except UnicodeDecodeError:
-        raise GraphError("The graph names external data by bytes that are not UTF-8.") from None
+        raise GraphError("The graph names external data by bytes that are not UTF-8.", DAMAGED) from None
 
 
 def parts(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, int, int]]:
@@ -156,12 +158,12 @@ def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, in
         tag, used = varint(head, 0, 5)
         field, kind = tag >> 3, tag & 7
         if not field or kind not in (VARINT, FIXED32, FIXED64, LENGTH) or tag >> 32:
-            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.")
+            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.", DAMAGED)
         if kind == LENGTH:
             size, used = varint(head, used, 10)
             at += used
             if size > end - at:
-                raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.")
+                raise GraphError("The graph is not an ONNX model: a part of it is longer than the whole.", DAMAGED)
             yield field, at, at + size, -1
             at += size
         elif kind == VARINT:
@@ -171,7 +173,7 @@ def fields(model: bytes | OpenFile, at: int, end: int) -> Iterator[tuple[int, in
         else:
             at += used + (4 if kind == FIXED32 else 8)
         if at > end:
-            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.")
+            raise GraphError("The graph is not an ONNX model: it has a field of an unknown kind.", DAMAGED)
 
 
 def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
@@ -179,10 +181,10 @@ def varint(head: bytes, at: int, longest: int) -> tuple[int, int]:
     value = 0
     for number in range(longest):
         if at >= len(head):
-            raise GraphError("The graph is not an ONNX model: it ends within a number.")
+            raise GraphError("The graph is not an ONNX model: it ends within a number.", DAMAGED)
         byte = head[at]
         at += 1
         value |= (byte & 0x7F) << (7 * number)
         if byte < 0x80:
             return value, at
-    raise GraphError("The graph is not an ONNX model: a number in it is too long.")
+    raise GraphError("The graph is not an ONNX model: a number in it is too long.", DAMAGED)

@@ -13,6 +13,8 @@ from vlatool.errors import DataError, nearest
 from vlatool.files.limits import check
 from vlatool.files.npz import open_npz
 
+AGAIN = "copy the bundle again from where it was made, or make it again"
+
 GOLDEN_STEPS = 2
 """Golden observations in a row that a program with kept values needs: the first alone does not show what was kept."""
 Array = NDArray[Any]
@@ -44,7 +46,9 @@ def golden_arrays(bundle: Bundle) -> Mapping[str, Array]:
     name = bundle.manifest.golden
     if not name:
         return {}
-    return open_npz(bundle.read(name, "golden_bytes"), "golden_bytes", where=f"The golden file {bundle.path / name}")
+    return open_npz(
+        bundle.read(name, "golden_bytes"), "golden_bytes", where=f"The golden file {bundle.path / name}", fix=AGAIN
+    )
 
 
 def golden_steps(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
@@ -62,13 +66,13 @@ def golden_steps(bundle: Bundle, stored: Mapping[str, Array]) -> list[Golden]:
     needed = [*(f"in.{tensor.name}" for tensor in spec.inputs), *noise, action]
     for key in needed:
         if key not in stored:
-            raise DataError(f"{where} cannot be read: it has no '{key}'; {nearest(key, stored)}.")
+            raise DataError(f"{where} cannot be read: it has no '{key}'; {nearest(key, stored)}.", AGAIN)
         numbers = stored[key].dtype.kind in "fiu" or (key not in noise and key != action)
         if not stored[key].ndim or not len(stored[key]) or not numbers:
-            raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.")
+            raise DataError(f"{where} cannot be read: '{key}' has no steps, or no numbers.", AGAIN)
     counts = {len(stored[key]) for key in needed}
     if len(counts) > 1:
-        raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.")
+        raise DataError(f"{where} cannot be read: its arrays have {sorted(counts)} steps.", AGAIN)
     check("golden_steps", max(counts), where, DataError)
     return [
         (

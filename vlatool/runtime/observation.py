@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,11 @@ from vlatool.runtime.statistics import load_normaliser
 from vlatool.runtime.tokenizer import Tokenizer
 
 FEW = 256
+NOT_FINITE = (
+    "check where it comes from: a sensor, a recording, an environment; a policy that handles such values is exported "
+    "with finite: false in its spec"
+)
+MISSING = "put the file there, or correct its name in the spec"
 Array = NDArray[Any]
 Encoder = Callable[[Any], Array]
 
@@ -43,8 +48,8 @@ class ObservationEncoder:
             observation: Input name -> value in physical units, with or without the batch axis of 1; text as ``str``.
 
         Raises:
-            DataError: when an input is missing or has another shape or dtype, or holds NaN, infinity or what its dtype
-                cannot hold.
+            DataError: when an input is missing or has another shape or dtype, or holds what its dtype cannot hold, or
+                NaN or infinity where its spec does not say ``finite: false``.
         """
         values = {}
         with np.errstate(over="raise"):
@@ -61,12 +66,13 @@ class ObservationEncoder:
 
     def _too_large(self, name: str, value: Any) -> DataError:
         """Return the error for finite values that the dtype cannot hold, as they are or once they are normalised."""
-        dtype, largest = self._dtypes[name], np.nanmax(np.abs(np.asarray(value, np.float64)))
+        dtype, sizes = self._dtypes[name], np.abs(np.asarray(value, np.float64))
+        largest = sizes[np.isfinite(sizes)].max(initial=0)
         limit = f" (beyond {np.finfo(dtype).max:.2g})" if np.dtype(dtype).kind == "f" else ""
         return DataError(
             f"The input '{name}' has values that are too large for {dtype}{limit}, as they are or normalised: up to "
             f"{largest:.3g}.",
-            "check the sensor or the recording, and its unit",
+            "check where it comes from, and its unit",
         )
 
     def _missing_input(self, observation: Any, name: str) -> DataError:
@@ -77,7 +83,7 @@ class ObservationEncoder:
                 self._example(),
             )
         has = ", ".join(map(str, observation)) or "nothing"
-        return DataError(f"The observation has no '{name}' (it has: {has}); {takes}")
+        return DataError(f"The observation has no '{name}' (it has: {has}); {takes}", self._example())
 
     def _example(self) -> str:
         """Return how an observation is written."""
@@ -91,7 +97,7 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         return _text_encoder(tensor, assets)
     dtype = np.dtype(tensor.dtype)
     normaliser = load_normaliser(tensor, assets)
-    floating = dtype.kind == "f"
+    checked = dtype.kind == "f" and tensor.finite
     batched, single = tensor.shape, tensor.shape[1:]
     vector = normaliser is not None and len(single) == 1 and tensor.width in range(1, FEW) and dtype == np.float32
 
@@ -99,7 +105,10 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         try:
             array = value if isinstance(value, np.ndarray) else np.asarray(value)
         except ValueError as error:
-            raise DataError(f"The input '{tensor.name}' is not an array: its rows have different lengths.") from error
+            raise DataError(
+                f"The input '{tensor.name}' is not an array: its rows have different lengths.",
+                "give rows of one length",
+            ) from error
         except Exception as error:  # the seam: numpy asks the object for an array, a tensor on a GPU has none
             raise DataError(
                 f"The input '{tensor.name}' is a {type(value).__name__}, which cannot be converted to a numpy array.",
@@ -114,10 +123,8 @@ def _encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
                 return normaliser.forward_row(values)
         if shape != batched:
             array = array[None] if shape == single else _batched(array, tensor)
-        if floating and not all_finite(array):
-            raise DataError(
-                f"The input '{tensor.name}' holds {_not_finite(array)}.", "check the sensor or the recording"
-            )
+        if checked and not all_finite(array):
+            raise DataError(f"The input '{tensor.name}' holds {_not_finite(array)}.", NOT_FINITE)
         if normaliser is None:
             return array
         normalised = normaliser.forward(array)
@@ -131,7 +138,7 @@ def _text_encoder(tensor: TensorSpec, assets: Assets) -> Encoder:
         content = read_asset(assets, tensor.tokenizer, "tokenizer_bytes")
     except OSError as error:
         where = f"{asset_path(assets, tensor.tokenizer)} ({error.strerror})"
-        raise SpecError(f"The tokenizer of '{tensor.name}' cannot be read: {where}.") from error
+        raise SpecError(f"The tokenizer of '{tensor.name}' cannot be read: {where}.", MISSING) from error
     tokenizer = Tokenizer(asset_path(assets, tensor.tokenizer), tensor.max_tokens, tensor.name, content)
 
     def encode(value: Any) -> Array:
@@ -165,7 +172,8 @@ def _batched(array: Array, tensor: TensorSpec) -> Array:
     if not fits:
         raise DataError(
             f"The input '{tensor.name}' has the shape {list(array.shape)}; the policy takes {list(tensor.shape)} "
-            "(the first axis may be left out)."
+            "(the first axis may be left out).",
+            f"give it as {list(tensor.shape[1:])} or {list(tensor.shape)}",
         )
     return array
 
@@ -184,3 +192,23 @@ def all_finite(array: Array) -> bool:
 def _not_finite(array: Array) -> str:
     nans = int(np.isnan(array).sum())
     return f"{nans} NaN of {array.size} values" if nans else f"infinity in {int(np.isinf(array).sum())} of {array.size}"
+
+
+def not_finite_text(spec: PolicySpec, observation: Mapping[str, Any]) -> str:
+    """Return what an observation holds beside finite values, in words; nothing where it holds none.
+
+    Example:
+        >>> spec = PolicySpec((TensorSpec("x", (1, 4), finite=False),), (TensorSpec("y", (1, 1)),), 10)
+        >>> not_finite_text(spec, {"x": [1, math.nan, math.inf, math.nan]})
+        "2 NaN and 1 inf in the 4 values of 'x'"
+    """
+    return " and ".join(_texts(spec, observation))
+
+
+def _texts(spec: PolicySpec, observation: Mapping[str, Any]) -> Iterator[str]:
+    for tensor in (each for each in spec.inputs if not each.finite):
+        array = np.asarray(observation[tensor.name], np.float64)
+        counts = {"NaN": np.isnan(array).sum(), "inf": (array == math.inf).sum(), "-inf": (array == -math.inf).sum()}
+        parts = [f"{count} {name}" for name, count in counts.items() if count]
+        if parts:
+            yield f"{' and '.join(parts)} in the {array.size} values of '{tensor.name}'"

@@ -192,7 +192,7 @@ class Policy:
         except TimeoutError as error:
             raise GraphError(
                 f"{self.bundle.path}: an inference takes longer than {seconds:g} s, so it was stopped{error}.",
-                "allow a slow policy more with load(..., first_run_s=...); else its graph loops without end",
+                "look for a loop without end in its graph; a robot allows more: load(..., first_run_s=...)",
             ) from None
         finally:
             for session in limited:
@@ -210,6 +210,15 @@ class Policy:
             BundleError: when a program that keeps values has but one golden step.
             DataError: when the golden file cannot be read.
             GraphError: when the difference is larger or not a number, or an inference takes longer.
+        """
+        self.replay_golden(inferences, first_run_s)
+        self.check_golden(tolerance)
+
+    def replay_golden(self, inferences: int, first_run_s: float = FIRST_RUN_S) -> None:
+        """Run the golden observations as ``warm_up`` does, and note how far the actions are from the recorded ones.
+
+        Raises:
+            BundleError, DataError, GraphError: as ``warm_up`` does, but for no difference.
         """
         stored = golden_arrays(self.bundle)
         steps = golden_steps(self.bundle, stored)
@@ -234,7 +243,6 @@ class Policy:
                 of_chunks.append(self.chunk_error(action.chunk, chunks[number % len(steps)]))
         self.reset()
         self.golden_error, self.golden_chunk_error = _worst(errors), _worst(of_chunks)
-        self.check_golden(tolerance)
 
     def check_golden(self, tolerance: float | None = None) -> None:
         """Check the differences of the warm-up against what is allowed.

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import resource
+import shlex
 import signal
 import subprocess
 import sys
@@ -88,7 +89,7 @@ def main() -> None:
 
 def _run(path: str, engine: str, threads: int | None, first_run_s: float, memory_mb: float) -> dict[str, Any]:
     policy = Policy.open(Bundle.open(path), engine=engine, threads=threads, seed=0, memory_mb=memory_mb)
-    policy.warm_up(1, float("inf"), first_run_s)
+    policy.replay_golden(1, first_run_s)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     refused = None
     try:
@@ -125,7 +126,10 @@ def _answer(path: Path, done: subprocess.CompletedProcess[str], allowed: float) 
         raise GraphError(f"{path}: the first run ends its process with {_signal(-done.returncode)}.", "do not load it")
     if done.returncode or not answer:
         last = (message.strip() or f"exit code {done.returncode}").splitlines()[-1]
-        raise GraphError(f"{path} cannot be run in a process of its own: {last}")
+        raise GraphError(
+            f"{path} cannot be run in a process of its own: {last}",
+            f"read what it says, and see what is installed: {shlex.quote(sys.executable)} -m pip list",
+        )
     return answer
 
 

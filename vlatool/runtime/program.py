@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import DataError, GraphError, VlatoolError, nearest
+from vlatool.errors import DataError, GraphError, VlatoolError, instead, nearest
 from vlatool.runtime.contract import not_finite
 from vlatool.runtime.observation import all_finite
 
@@ -146,16 +146,24 @@ class Program:
         """Return the noise of the caller as float32."""
         known = {name: entry for step in self.steps for name, entry in step.noise.items()}
         if not isinstance(noise, Mapping):
-            raise DataError(f"The noise is a {type(noise).__name__}; it must be a mapping of names to arrays.")
+            raise DataError(
+                f"The noise is a {type(noise).__name__}; it must be a mapping of names to arrays.",
+                "pass noise={NAME: array}, or leave it out: the program draws its own",
+            )
         arrays = {}
         for name, value in noise.items():
             if name not in known:
-                raise DataError(f"The program draws no noise '{name}'; {nearest(str(name), known)}.")
+                raise DataError(
+                    f"The program draws no noise '{name}'; {nearest(str(name), known)}.", instead(str(name), known)
+                )
             array, shape = np.asarray(value), tuple(known[name]["shape"])
             if array.dtype.kind != "f":
                 raise DataError(f"The noise '{name}' is {array.dtype}; wanted float32.", "cast it to float32")
             if array.shape != shape:
-                raise DataError(f"The noise '{name}' has the shape {list(array.shape)}; wanted {list(shape)}.")
+                raise DataError(
+                    f"The noise '{name}' has the shape {list(array.shape)}; wanted {list(shape)}.",
+                    f"pass np.random.standard_normal({list(shape)}).astype(np.float32), or leave it out",
+                )
             arrays[name] = array.astype(np.float32, copy=False)
         return arrays
 

@@ -109,11 +109,19 @@ def _checked(values: object, tensor: TensorSpec, where: str) -> Array:
         with np.errstate(all="ignore"):
             row = np.asarray(values, np.float32)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise SpecError(f"{where} is not a list of numbers.") from error
+        raise SpecError(
+            f"{where} is not a list of numbers.", "store a list of numbers, one for each element"
+        ) from error
     if row.shape != (tensor.width,):
-        raise SpecError(f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {tensor.width} elements.")
+        raise SpecError(
+            f"{where} has the shape {list(row.shape)}; '{tensor.name}' has {tensor.width} elements.",
+            f"store one number for each of the {tensor.width} elements",
+        )
     if not np.all(np.isfinite(row)):
-        raise SpecError(f"{where} has values that are not finite.")
+        raise SpecError(
+            f"{where} has values that are not finite.",
+            "leave NaN and infinity out when the statistics are computed (np.nanmean)",
+        )
     return row
 
 

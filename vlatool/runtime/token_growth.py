@@ -74,7 +74,10 @@ def _steps(step: Any, where: str) -> Iterator[Mapping[str, Any]]:
         seen += 1
         check("steps", seen, where, SpecError)
         if not isinstance(step, dict):
-            raise SpecError(f"{where} is not a file of the tokenizers library: one of its steps is not a mapping.")
+            raise SpecError(
+                f"{where} is not a file of the tokenizers library: one of its steps is not a mapping.",
+                "save it again with tokenizer.save(FILE) of the tokenizers library",
+            )
         if step.get("type") == "Sequence":
             for inner in (step.get(key) for key in INNER):
                 pending += reversed(inner) if isinstance(inner, list) else []

@@ -17,6 +17,9 @@ from vlatool.files.limits import check
 from vlatool.runtime.assets import read_asset
 from vlatool.runtime.token_growth import growth
 
+SAVE = "save it with tokenizer.save(FILE) of the tokenizers library, or write a vocabulary: kind: words"
+VOCABULARY = "write the id of each word under 'words', and the ids 'pad' and 'unknown'"
+
 Encode = Callable[[str], list[int]]
 
 
@@ -42,9 +45,9 @@ class Tokenizer:
         self._growth = 1
         self._cache: dict[str, NDArray[np.int64]] = {}
         content = _content(path, name) if content is None else content
-        data = read_json(content, f"The tokenizer {path} of '{name}'", SpecError)
+        data = read_json(content, f"The tokenizer {path} of '{name}'", SpecError, SAVE)
         if not isinstance(data, dict):
-            raise SpecError(f"The tokenizer of '{name}' must be a mapping: {path}.")
+            raise SpecError(f"The tokenizer of '{name}' must be a mapping: {path}.", SAVE)
         if data.get("kind") == "words":
             self.pad, self._encode = _words(data, path, name)
         elif "model" in data:
@@ -52,7 +55,8 @@ class Tokenizer:
             self.pad, self._encode = _library(content, path, name)
         else:
             raise SpecError(
-                f"{path} is not a tokenizer: it has neither 'model' (tokenizers library) nor kind 'words' (vocabulary)."
+                f"{path} is not a tokenizer: it has neither 'model' (tokenizers library) nor the kind 'words'.",
+                SAVE,
             )
 
     def __call__(self, text: str) -> NDArray[np.int64]:
@@ -86,13 +90,16 @@ def _content(path: Path, name: str) -> bytes:
     try:
         return read_asset(path.parent, path.name, "tokenizer_bytes")
     except OSError as error:
-        raise SpecError(f"The tokenizer of '{name}' cannot be read: {path} ({error.strerror}).") from error
+        raise SpecError(
+            f"The tokenizer of '{name}' cannot be read: {path} ({error.strerror}).",
+            "put the file there, or correct its name in the spec",
+        ) from error
 
 
 def _words(data: dict[str, Any], path: Path, name: str) -> tuple[int, Encode]:
     words, pad, unknown = data.get("words"), data.get("pad"), data.get("unknown")
     if not isinstance(words, dict) or not all(map(_is_id, words.values())) or not _is_id(pad) or not _is_id(unknown):
-        raise SpecError(f"The vocabulary {path} needs 'words' (a mapping), 'pad' and 'unknown' (ids).")
+        raise SpecError(f"The vocabulary {path} needs 'words' (a mapping), 'pad' and 'unknown' (ids).", VOCABULARY)
     ids: dict[str, int] = words
     other, filler = int(str(unknown)), int(str(pad))
 
@@ -114,7 +121,7 @@ def _is_id(value: object) -> bool:
 
 def _library(content: bytes, path: Path, name: str) -> tuple[int, Encode]:
     library = require("tokenizers", "text")
-    with _foreign(SpecError, f"{path} is not a file of the tokenizers library"):
+    with _foreign(SpecError, f"{path} is not a file of the tokenizers library", SAVE):
         tokenizer = library.Tokenizer.from_buffer(content)
         tokenizer.no_truncation()
         padding = tokenizer.padding or {}
@@ -122,18 +129,18 @@ def _library(content: bytes, path: Path, name: str) -> tuple[int, Encode]:
         pad = int(padding.get("pad_id", 0))
 
     def encode(text: str) -> list[int]:
-        with _foreign(DataError, f"The {name} cannot be turned into tokens"):
+        with _foreign(DataError, f"The {name} cannot be turned into tokens", "give another text"):
             return list(tokenizer.encode(text).ids)
 
     return pad, encode
 
 
 @contextlib.contextmanager
-def _foreign(error: type[VlatoolError], what: str) -> Iterator[None]:
+def _foreign(error: type[VlatoolError], what: str, fix: str) -> Iterator[None]:
     """The seam: the library raises plain Exception, and where it panics, something that is not even that."""
     try:
         yield
     except BaseException as foreign:
         if isinstance(foreign, Exception) or type(foreign).__name__ == "PanicException":
-            raise error(f"{what}: {str(foreign)[:300]}.") from foreign
+            raise error(f"{what}: {str(foreign)[:300]}.", fix) from foreign
         raise

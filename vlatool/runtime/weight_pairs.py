@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from vlatool.errors import GraphError
-from vlatool.runtime.external_data import OpenFile, asked_of, fields, messages, varint
+from vlatool.runtime.external_data import DAMAGED, OpenFile, asked_of, fields, messages, varint
 from vlatool.weights import pairs
 
 UINT8, INT8 = 2, 3
@@ -271,4 +271,4 @@ def _text(model: bytes | OpenFile, start: int, end: int) -> str:
     try:
         return model[start:end].decode("utf-8")
     except UnicodeDecodeError:
-        raise GraphError("The graph is not an ONNX model: a name in it is not UTF-8.") from None
+        raise GraphError("The graph is not an ONNX model: a name in it is not UTF-8.", DAMAGED) from None

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, instead, nearest, require
 
 Shapes = Mapping[str, tuple[int | str, ...]]
 INFERRED_BYTES = 1_500_000_000
@@ -85,7 +85,8 @@ def shapes_from(texts: Iterable[str]) -> dict[str, tuple[int | str, ...]]:
         if not equals or not name or not right:
             raise SourceError(
                 f"--shape {text!r} is no shape of an input; wanted NAME=1,3,224,224: each axis a whole number from 1, "
-                "or a name for one that stays free."
+                "or a name for one that stays free.",
+                "write it like --shape image=1,3,224,224",
             )
         shapes[name] = tuple(int(axis) if axis.isdecimal() else axis for axis in axes)
     return shapes
@@ -153,7 +154,9 @@ def _check_given(inputs: list[Any], shapes: Shapes) -> None:
     known = {value.name: value for value in inputs}
     for name, given in shapes.items():
         if name not in known:
-            raise SourceError(f"--shape names '{name}', which is no input of the file; {nearest(name, known)}.")
+            raise SourceError(
+                f"--shape names '{name}', which is no input of the file; {nearest(name, known)}.", instead(name, known)
+            )
         own = [_length(axis, place) for place, axis in enumerate(_axes(known[name]))]
         fits = len(own) == len(given) and all(
             isinstance(axis, str) or axis == length for axis, length in zip(own, given, strict=True)

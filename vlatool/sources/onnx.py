@@ -22,7 +22,7 @@ from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.files import save
 from vlatool.graph.layers import LOWEST_OPSET
 from vlatool.graph.onnx_graph import type_name
-from vlatool.machine.risky import risky
+from vlatool.machine.risky import REMEDY, risky
 from vlatool.module.description import FILE, Description, copy_assets, description_file, read_description
 from vlatool.runtime.engine import engine_class
 from vlatool.runtime.observation import ObservationEncoder
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from vlatool.hardware.profile import Profile
+
+WHERE_MADE = "fix the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
 
 TOLERANCE = 1e-3
 """Largest relative L2 difference between a file and what it was converted to."""
@@ -84,7 +86,7 @@ class OnnxFile(Source):
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """The file exists."""
         if not self.model.is_file():
-            raise SourceError(f"No such ONNX file: {self.model}.")
+            raise SourceError(f"No such ONNX file: {self.model}.", "check the path")
 
     def inputs(self) -> tuple[Path, ...]:
         """The model, its external data and what the description names."""
@@ -240,9 +242,9 @@ def _load(path: Path) -> Any:
         model = onnx.load(str(path))
     except Exception as error:  # the seam: protobuf and onnx raise many foreign types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise SourceError(f"{path} is not a readable ONNX file: {reason}.") from error
+        raise SourceError(f"{path} is not a readable ONNX file: {reason}.", WHERE_MADE) from error
     if not model.graph.node:
-        raise SourceError(f"{path} is not an ONNX model: its graph has no nodes.")
+        raise SourceError(f"{path} is not an ONNX model: its graph has no nodes.", WHERE_MADE)
     return model
 
 
@@ -269,7 +271,8 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
         for tensor in tensors:
             if tensor.name not in names:
                 raise SourceError(
-                    f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}."
+                    f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}.",
+                    "name inputs and outputs in policy.yaml as the file does",
                 )
 
 
@@ -280,8 +283,8 @@ def _named_after(model: Path, copy: Path) -> Iterator[None]:
         yield
     except InputError as error:
         error.message = error.message.replace(str(copy), str(model))
-        if isinstance(error, GraphError) and not error.fix:
-            error.fix = "fix the file where it was made; onnx.checker.check_model(FILE, full_check=True) may say more"
+        if error.fix == REMEDY.format(package=engine_class().package):  # it was not made by vlatool
+            error.fix = WHERE_MADE
         raise
 
 

@@ -47,18 +47,24 @@ class TorchModule(Source):
         if not where.endswith(".py") or not function:
             return None
         if not Path(where).is_file():
-            raise SourceError(f"No such file: {where} (from '{typed}').")
+            raise SourceError(f"No such file: {where} (from '{typed}').", "check the path")
         return cls(policy=Path(where).parent, factory=f"{Path(where).name}:{function}").named()
 
     def as_recorded(self, entry: Mapping[str, Any], bundle: Bundle) -> Self:
         """Take the factory of the record: a function in the policy's own files, or what its description names."""
         factory = entry.get("factory", "")
         if self.factory and self.factory != factory:
-            raise SourceError(f"{self.policy} names the factory {self.factory}; {bundle.path} was made by {factory}.")
+            raise SourceError(
+                f"{self.policy} names the factory {self.factory}; {bundle.path} was made by {factory}.",
+                f"name the policy alone, or path.py:make of {factory}",
+            )
         described = read_description(self.policy)
         file = factory_file(factory, described.folder)
         if factory != described.factory and (file is None or not file.is_relative_to(described.folder.resolve())):
-            raise SourceError(f"The build record of {bundle.path} names the factory {factory}; {self.policy} does not.")
+            raise SourceError(
+                f"The build record of {bundle.path} names the factory {factory}; {self.policy} does not.",
+                f"pass --source DIR of the policy that has {factory}",
+            )
         return self.model_copy(update={"factory": factory})
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
@@ -104,7 +110,9 @@ class TorchModule(Source):
         split_factory(factory)
         path = factory_file(factory, described.folder)
         if path is not None and not path.is_file():
-            raise SourceError(f"No such file: {path} (from '{factory}').")
+            raise SourceError(
+                f"No such file: {path} (from '{factory}').", "put the file there, or correct 'source' in policy.yaml"
+            )
         return factory
 
     def _code(self, described: Description) -> list[Path]:

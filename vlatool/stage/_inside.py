@@ -40,11 +40,7 @@ def run_apart(stage: Transform, source: Bundle | None, draft: Path, context: Con
     """
     job, whose = {**_job(stage, source, context), "out": str(draft)}, stage.runs(source)
     about, preload = whose or stage.name(), (*PRELOAD, *stage.imports) if whose else needed(stage)
-    try:
-        answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
-    except VlatoolError as error:  # the draft is gone when a person reads it
-        error.message = error.message.replace(f"{draft}/", "")
-        raise
+    answer = children.call("vlatool.stage._inside:run", job, context.tell, about, preload, own=not whose)
     said = answer.get("said") if isinstance(answer, Mapping) else None
     context.said.extend(map(str, said if isinstance(said, list) else ()))  # a policy may have answered
     return Bundle.open(draft, verify=bool(whose))
@@ -64,7 +60,7 @@ def run(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> di
     """Run the stage of a job in this process; return the hash of the bundle that it made, and what is said of it."""
     stage = build_stage(job["stage"], job["options"])
     if not isinstance(stage, Transform):
-        raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.")
+        raise RecipeError(f"The stage {job['stage']} measures; it makes no bundle.", "name a stage that makes a bundle")
     source = Bundle.open(Path(job["source"]), verify=False) if job["source"] else None
     context = _context(job, tell)
     with _blamed():
@@ -93,7 +89,9 @@ def measure(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -
     """Run the measuring stage of a job in this process; return its report as JSON, and what it kept and noted."""
     stage = build_stage(job["stage"], job["options"])
     if not isinstance(stage, Measure):
-        raise RecipeError(f"The stage {job['stage']} makes a bundle; it measures nothing.")
+        raise RecipeError(
+            f"The stage {job['stage']} makes a bundle; it measures nothing.", "name a stage that measures"
+        )
     source = Bundle.open(Path(job["source"]), verify=False)
     unfinished: list[Path] = []
     context = replace(_context(job, tell), unfinished=unfinished if job["keeps"] else None)

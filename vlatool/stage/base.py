@@ -297,7 +297,10 @@ def source_of(source: Bundle | None, stage: str) -> Bundle:
         RecipeError: when there is none.
     """
     if source is None:
-        raise RecipeError(f"{stage} needs a bundle to start from; begin the recipe with a sources stage.")
+        raise RecipeError(
+            f"{stage} needs a bundle to start from; begin the recipe with a sources stage.",
+            "name a bundle, or the policy that it is made from",
+        )
     return source
 
 

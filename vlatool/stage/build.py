@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from vlatool import registry
-from vlatool.errors import RecipeError, nearest
+from vlatool.errors import RecipeError, instead, nearest
 from vlatool.stage.base import Stage
 
 AnyStage = TypeVar("AnyStage", bound=Stage)
@@ -25,7 +25,7 @@ def stage_class(name: str) -> type[Stage]:
     kind, _, entry = name.partition(".")
     known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
-        raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.")
+        raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.", instead(name, known))
     stage: type[Stage] = registry.load(kind, entry)
     return stage
 
@@ -50,7 +50,10 @@ def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> A
         return kind.model_validate(dict(options))
     except ValidationError as error:
         problems = [_problem(item, kind) for item in error.errors()]
-        raise RecipeError(f"{where}: " + "; ".join(problems) + ".") from error
+        raise RecipeError(
+            f"{where}: " + "; ".join(problems) + ".",
+            "correct what is named; docs/reference/stages.md has every option",
+        ) from error
 
 
 def _problem(item: Mapping[str, Any], kind: type[Stage]) -> str:

@@ -18,9 +18,11 @@ from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.files.kept import carry
 from vlatool.machine.risky import risky
 from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
+from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, off_the_robot
 from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class
 from vlatool.runtime.engines import reference
 from vlatool.runtime.graph_files import open_graph
+from vlatool.runtime.observation import not_finite_text
 from vlatool.runtime.policy import Action, Policy, relative_error
 from vlatool.runtime.program import Program, draw
 
@@ -332,8 +334,12 @@ def _outputs(
     """Return the action of each observation; ``engine`` is told where it runs these graphs for the first time."""
     policy.reset()
     actions = []
-    for observation, noise in samples:
-        with risky(engine, f"ran {named(policy.bundle.manifest)}") if engine else contextlib.nullcontext():
+    fix = OF_THE_GRAPHS if policy.bundle.manifest.parent else OF_THE_POLICY
+    for number, (observation, noise) in enumerate(samples):
+        doing = risky(engine, f"ran {named(policy.bundle.manifest)}") if engine else contextlib.nullcontext()
+        held = not_finite_text(policy.spec, observation)
+        remedy = OF_NOT_FINITE if held and not policy.bundle.manifest.parent else fix
+        with doing, off_the_robot(f"observation {number}{f', which holds {held}' if held else ''}", remedy):
             actions.append(policy.infer(observation, noise=noise))
     return actions
 

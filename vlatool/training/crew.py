@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import RecipeError, SourceError, VlatoolError
-from vlatool.training.group import LOST, Group, joined_group
+from vlatool.training.group import AGAIN, LOST, Group, joined_group
 from vlatool.training.torchrun import MEETING, PRELOAD, Follower, Launch, launched, meeting_of, shown
 from vlatool.user_code.children import Apart
 
 HERE = "vlatool.training.peer"
 GRACE_S = 5.0
 """Seconds in which a process that was lost says how, before the others are ended."""
-AGAIN = "run the same command again: it goes on from the last checkpoint"
 
 
 class Crew:
@@ -93,7 +92,7 @@ class Crew:
         first = next((each for each in self._errors if LOST not in str(each)), error)
         if not isinstance(first, VlatoolError) or "(SIG" not in first.message:
             return first
-        return type(first)(first.message, "; ".join(filter(None, (first.fix, AGAIN))))
+        return type(first)(first.message, "; ".join(filter(None, dict.fromkeys((first.fix, AGAIN)))))
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 LOST = "Another process of the training is gone."
+AGAIN = "run the same command again: it goes on from the last checkpoint"
 INTERFACE = "GLOO_SOCKET_IFNAME"
 BACKENDS = {"cpu": "gloo", "cuda": "cpu:gloo,cuda:nccl"}
 """Device -> what adds up: counts and losses on the processor in any case."""
@@ -66,7 +67,7 @@ def lost_told() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        raise SourceError(LOST) from error
+        raise SourceError(LOST, AGAIN) from error
 
 
 def _summed(loss: float, weights: Sequence[Tensor]) -> float:

@@ -58,7 +58,7 @@ def load(job: Mapping[str, Any], _tell: Tell) -> None:
     """Load the student; ``join`` follows."""
     stage, place = build_stage(job["stage"], job["options"]), Path(job["place"])
     if not isinstance(stage, TrainingStage):
-        raise RecipeError(f"The stage {job['stage']} trains nothing.")
+        raise RecipeError(f"The stage {job['stage']} trains nothing.", "name a stage that trains")
     check_shared(job)
     require("torch", "build").set_num_threads(job["threads"])
     source, opened = Bundle.open(Path(job["source"]), verify=False), contextlib.ExitStack()

@@ -285,7 +285,12 @@ def _answer(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
     except VlatoolError as error:
         return _told(error)
     except (OSError, MemoryError) as error:
-        return _told(SourceError(f"{type(error).__name__}: {one_line(message_of(error))}"))
+        return _told(
+            SourceError(
+                f"{type(error).__name__}: {one_line(message_of(error))}",
+                "run it there with VLATOOL_DEBUG=1 to see where it was raised",
+            )
+        )
     return None
 
 

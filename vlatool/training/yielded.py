@@ -182,7 +182,8 @@ class _Rows:
             )
         if not 1 <= (count := next(iter(rows.values()))) <= self._size:
             raise DataError(
-                f"Batch {place} has {count} rows; allowed: 1 to {self._size}, the 'size' that it was asked for."
+                f"Batch {place} has {count} rows; allowed: 1 to {self._size}, the 'size' that it was asked for.",
+                "yield batches of 'size' rows or fewer, and none that is empty",
             )
         return columns
 

@@ -113,7 +113,7 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
         if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra):
             raise kind(shortened(answer["message"], LONGEST), shortened(answer["fix"], LONGEST))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
-        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}")
+        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", shortened(answer["fix"], LONGEST))
     if "errno" in answer:
         raise OSError(answer["errno"], message, answer["file"] and shortened(answer["file"], LONGEST))
     name = plain(answer["raised"])

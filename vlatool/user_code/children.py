@@ -229,7 +229,10 @@ class Apart:
             self._open.remove(self._talk)
         self._received += more
         if len(self._received) > LONGEST_ANSWER:
-            raise SourceError(f"{self.about}: the process that runs it answers more than {LONGEST_ANSWER:,} bytes.")
+            raise SourceError(
+                f"{self.about}: the process that runs it answers more than {LONGEST_ANSWER:,} bytes.",
+                "let it answer less: fewer episodes or samples at a time, and its own files alone",
+            )
         return bool(more)
 
     def _print(self, last: bool = False) -> None:

@@ -67,7 +67,9 @@ def verify(bundle: Bundle, options: Options, context: Context) -> Report:
 def check(options: Options) -> None:
     """Raise a usage error for options that make no sense."""
     if not 0 <= options.tolerance < 1:
-        raise UsageError(f"--tolerance is {options.tolerance:g}; allowed: from 0, below 1.")
+        raise UsageError(
+            f"--tolerance is {options.tolerance:g}; allowed: from 0, below 1.", "give a share such as --tolerance 0.001"
+        )
 
 
 def _report(bundle: Bundle, options: Options, comparison: Mapping[str, Any]) -> Report:

@@ -73,7 +73,11 @@ class Original:
                 f"{', '.join(names)}.",
                 "return what the network takes, by the names in policy.yaml",
             )
-        return {name: self._array(value, f"preprocess()['{name}']", number) for name, value in answer.items()}
+        open_ = {tensor.name for tensor in self._spec.inputs if not tensor.finite}
+        return {
+            name: self._array(value, f"preprocess()['{name}']", number, finite=name not in open_)
+            for name, value in answer.items()
+        }
 
     def raw(self, observation: Mapping[str, Any], noise: Mapping[str, Array], number: int) -> Array | None:
         """Return what its network gives, before it is un-normalised; None when it has no function for that."""
@@ -95,10 +99,13 @@ class Original:
         except (VlatoolError, MemoryError):
             raise
         except Exception as error:  # the seam: user code may raise anything
-            raise SourceError(f"{where} failed: {type(error).__name__}: {message_of(error)}.") from error
+            raise SourceError(
+                f"{where} failed: {type(error).__name__}: {message_of(error)}.",
+                "call it with that observation yourself, and correct what fails; VLATOOL_DEBUG=1 shows where",
+            ) from error
 
-    def _array(self, value: Any, what: str, number: int) -> Array:
-        """Return an array of finite numbers, of a tensor as well."""
+    def _array(self, value: Any, what: str, number: int, *, finite: bool = True) -> Array:
+        """Return an array of numbers, finite ones unless others are taken there, of a tensor as well."""
         try:
             for step in ("detach", "cpu", "numpy"):
                 value = getattr(value, step)() if callable(getattr(value, step, None)) else value
@@ -109,9 +116,15 @@ class Original:
                 "return a numpy array, or a tensor of float32",
             ) from error
         if array.dtype.kind not in "biuf" or not array.size:
-            raise SourceError(f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.")
-        if not np.isfinite(array).all():
-            raise SourceError(f"{what} of '{self._name}' gives NaN or infinity on observation {number}.")
+            raise SourceError(
+                f"{what} of '{self._name}' gives {_described(value, array)}; wanted an array of numbers.",
+                "return a numpy array, or a tensor of float32",
+            )
+        if finite and not np.isfinite(array).all():
+            raise SourceError(
+                f"{what} of '{self._name}' gives NaN or infinity on observation {number}.",
+                "see what its code computes from that observation; actions and inputs must be finite",
+            )
         return array
 
     def _chunk(self, answer: Any, number: int) -> Array:

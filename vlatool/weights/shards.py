@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from vlatool.errors import SourceError
 
+READABLE = "see that this user may read it, and that its disk is well"
+
 Array = NDArray[Any]
 ITEM_BYTES = {
     "BOOL": 1, "U8": 1, "I8": 1, "F8_E4M3": 1, "F8_E5M2": 1, "I16": 2, "U16": 2, "F16": 2, "BF16": 2,
@@ -158,7 +160,7 @@ def _header_bytes(file: Path) -> tuple[bytes, int, int]:
                 )
             return stream.read(length), 8 + length, size
     except OSError as error:
-        raise SourceError(f"{file} cannot be read: {error.strerror}.") from error
+        raise SourceError(f"{file} cannot be read: {error.strerror}.", READABLE) from error
 
 
 def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTensor:
@@ -168,7 +170,9 @@ def _entry(file: Path, name: str, entry: Any, start: int, size: int) -> StoredTe
     except (KeyError, TypeError, ValueError) as error:
         raise SourceError(f"{file} has a damaged safetensors header at '{name}': {error!r}.", AGAIN) from error
     if dtype not in ITEM_BYTES:
-        raise SourceError(f"{file} holds '{name}' as {dtype}; known dtypes: {', '.join(ITEM_BYTES)}.")
+        raise SourceError(
+            f"{file} holds '{name}' as {dtype}; known dtypes: {', '.join(ITEM_BYTES)}.", "store it in one of these"
+        )
     tensor = StoredTensor(name, file, start + begin, dtype, shape)
     if min((0, *shape)) < 0 or begin < 0 or end - begin != tensor.nbytes:
         raise SourceError(
@@ -229,7 +233,7 @@ class Reader:
         try:
             got = self._fill(tensor.file, memoryview(buffer)[:length], aligned, start + size - aligned)
         except OSError as error:
-            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.") from error
+            raise SourceError(f"{tensor.file} cannot be read: {error.strerror}.", READABLE) from error
         if got < start + size - aligned:
             raise SourceError(f"{tensor.file} is cut off: it ends within '{tensor.name}'.", AGAIN)
         return np.frombuffer(buffer, np.uint8, size, start - aligned)

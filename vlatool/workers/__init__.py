@@ -106,7 +106,10 @@ def asked_for(text: str) -> tuple[str, int]:
     """
     name, _, count = text.partition(":") if not text.isdecimal() else (PROCESSES, "", text)
     if name not in registry.names(KIND):
-        raise UsageError(f"--workers is '{text}'; it takes a number of processes, or {nearest(name, _others())}.")
+        raise UsageError(
+            f"--workers is '{text}'; it takes a number of processes, or {nearest(name, _others())}.",
+            "write --workers 4, or --workers ray:4",
+        )
     if ":" in text or count:
         if not count.isdecimal() or int(count) < 1:
             raise UsageError(f"--workers is '{text}'; the number of workers is 1 or more.",

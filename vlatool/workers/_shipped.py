@@ -22,6 +22,8 @@ from vlatool.machine.host import cache_directory
 from vlatool.user_code.walk import files_below
 from vlatool.workers import Folder
 
+READABLE = "see that this user may read it, and that its disk is well"
+
 BLOCK = 1 << 26
 """Bytes that are sent at a time."""
 READ = 1 << 20
@@ -78,7 +80,9 @@ def parcel_of(folder: Folder) -> Parcel:
         paths = [root / name for name in folder.names] or list(_few(root))
         files = tuple(_sent(path, path.relative_to(root).as_posix()) for path in paths)
     except OSError as error:
-        raise SourceError(f"{error.filename or root} cannot be sent to the workers: {error.strerror}.") from error
+        raise SourceError(
+            f"{error.filename or root} cannot be sent to the workers: {error.strerror}.", READABLE
+        ) from error
     check("shipped_bytes", sum(file.size for file in files), f"{root}, which is sent to the workers,", SourceError)
     return Parcel(folder.path, files)
 
@@ -113,7 +117,7 @@ def blocks(parcel: Parcel) -> Iterator[bytes]:
                         yield bytes(waiting)
                         waiting.clear()
         except OSError as error:
-            raise SourceError(f"{path} cannot be sent to the workers: {error.strerror}.") from error
+            raise SourceError(f"{path} cannot be sent to the workers: {error.strerror}.", READABLE) from error
         if left:
             raise SourceError(f"{path} has changed while it was sent to the workers.", "run the command again")
     yield bytes(waiting)

@@ -288,7 +288,10 @@ class _Crew:
         if self._attempts[HELLO] < ATTEMPTS * ATTEMPTS:
             self._hire()
         elif not self._busy and not self._idle:
-            raise TargetError(f"The workers of the Ray cluster end before they begin: {why}.")
+            raise TargetError(
+                f"The workers of the Ray cluster end before they begin: {why}.",
+                "install vlatool with its extras, the same version, where ray runs on each machine",
+            )
 
     def _again(self, number: int, why: str, fix: str) -> None:
         """Let a job be done again, unless it took so many workers with it that the fault is its own."""

@@ -184,7 +184,7 @@ def test_a_file_that_is_no_graph_is_refused(tmp_path: Path, monkeypatch) -> None
     with pytest.raises(GraphError, match=r"OpenVINO .* refuses .*bad.onnx: ") as caught:
         OpenvinoSession(path)
     assert len(caught.value.message.splitlines()) == 1
-    assert not caught.value.fix, "what confines OpenVINO has nothing to do with it"
+    assert "ONEDNN_MAX_CPU_ISA" not in caught.value.fix, "what confines OpenVINO has nothing to do with it"
 
 
 BLOCKED = """g (float[1,8] x) => (float[1,4] y) <int8[8,4] w = {1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,1,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vlatool.errors import GraphError
+from vlatool.machine.risky import REMEDY
 from vlatool.runtime.engine import BFLOAT16, FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
 
 
@@ -24,7 +25,9 @@ class OpenvinoProfiled:
             self._request = self._compiled.create_infer_request()
             self._fused = fused_names(self._compiled, known)
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
-            raise GraphError(f"OpenVINO cannot profile {path.name}: {str(error)[:200]}") from error
+            raise GraphError(
+                f"OpenVINO cannot profile {path.name}: {str(error)[:200]}", REMEDY.format(package="openvino")
+            ) from error
         self._outputs = [output.get_any_name() for output in self._compiled.outputs]
         self._runs: list[dict[Node, float]] = []
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import GraphError
+from vlatool.machine.risky import REMEDY
 from vlatool.runtime.engine import FLOAT32, INT8, MOVES, MOVING, QUANTIZES, QUANTIZING, Node
 
 INTEGER = ("MatMulInteger", "QLinear", "QGemm", "ConvInteger", "DynamicQuantize", "QAttention", "QEmbed")
@@ -28,7 +29,9 @@ class OrtProfiled:
                 str(path), options, providers=["CPUExecutionProvider"], disabled_optimizers=left_out
             )
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-            raise GraphError(f"ONNX Runtime cannot profile {path.name}: {str(error)[:200]}") from error
+            raise GraphError(
+                f"ONNX Runtime cannot profile {path.name}: {str(error)[:200]}", REMEDY.format(package="onnxruntime")
+            ) from error
         self._outputs = [node.name for node in self._session.get_outputs()]
 
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:

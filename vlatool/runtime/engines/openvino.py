@@ -14,8 +14,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import GraphError, nearest, require
+from vlatool.errors import GraphError, instead, nearest, require
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
+from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port
 from vlatool.runtime.engine import INT8, Engine, Int8Layout, Node, Profiled, Stages
@@ -23,6 +24,7 @@ from vlatool.runtime.engines._openvino_profile import OpenvinoProfiled, precisio
 from vlatool.runtime.engines._sequences import joins_a_sequence
 from vlatool.runtime.stored_types import has_float8
 
+FEEDS = "give every input of the graph, of the shape and type that the graph declares"
 DEVICE = "CPU"
 AMX, BF16 = ("amx_tile", "amx_int8"), ("amx_bf16", "avx512_bf16")
 INT8_VARIANTS: Mapping[str, Mapping[str, Any]] = {
@@ -85,7 +87,9 @@ class OpenvinoSession(Engine):
             self._request = self._compiled.create_infer_request()
         except Exception as error:  # the seam: every exception type of OpenVINO becomes ours
             words = f"OpenVINO {self.version()} refuses {path}: {_last_line(error)}"
-            raise GraphError(words, _remedy(error) or _without_float8(content)) from error
+            raise GraphError(
+                words, _remedy(error) or _without_float8(content) or REMEDY.format(package="openvino")
+            ) from error
         self.path = path
         self.precision = str(self._compiled.get_property("INFERENCE_PRECISION_HINT").get_type_name())
         if self.precision != HINTS[compute]:
@@ -123,7 +127,9 @@ class OpenvinoSession(Engine):
         except (GraphError, TimeoutError):
             raise
         except Exception as error:
-            raise GraphError(f"OpenVINO failed in {self.path.name}: {_last_line(error)}") from error
+            raise GraphError(
+                f"OpenVINO failed in {self.path.name}: {_last_line(error)}", REMEDY.format(package="openvino")
+            ) from error
 
     def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> None:
         """Run, but do not wait beyond the deadline.
@@ -182,10 +188,14 @@ class OpenvinoSession(Engine):
             value = feeds.get(name)
             if not isinstance(value, np.ndarray) or value.dtype != dtype:
                 got = "missing" if value is None else str(getattr(value, "dtype", type(value).__name__))
-                raise GraphError(f"OpenVINO failed in {self.path.name}: the input '{name}' is {got}; wanted {dtype}.")
+                raise GraphError(
+                    f"OpenVINO failed in {self.path.name}: the input '{name}' is {got}; wanted {dtype}.", FEEDS
+                )
             actual, expected = Port(value.shape, str(dtype)), self.takes[name]
             if not actual.fits(expected):
-                raise GraphError(f"OpenVINO failed in {self.path.name}: '{name}' is {actual}; wanted {expected}.")
+                raise GraphError(
+                    f"OpenVINO failed in {self.path.name}: '{name}' is {actual}; wanted {expected}.", FEEDS
+                )
 
     @staticmethod
     def arithmetic() -> str:
@@ -299,7 +309,10 @@ def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
         GraphError: when OpenVINO does not compute in that dtype.
     """
     if compute not in HINTS:
-        raise GraphError(f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}.")
+        raise GraphError(
+            f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}.",
+            instead(compute, filter(None, HINTS)),
+        )
     return {
         "INFERENCE_PRECISION_HINT": HINTS[compute],
         "INFERENCE_NUM_THREADS": threads or len(os.sched_getaffinity(0)),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vlatool.errors import GraphError, require
 from vlatool.machine.host import VNNI
+from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
 from vlatool.runtime.contract import Port, port
 from vlatool.runtime.engine import Engine, Int8Layout, Node, Profiled, Stages
@@ -80,11 +81,17 @@ class OrtCpuSession(Engine):
         try:
             self._session = self._open(ort, path if opened is None else opened, threads)
         except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-            raise GraphError(f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}") from error
+            raise GraphError(
+                f"ONNX Runtime {ort.__version__} refuses {path}: {_first_line(error)}",
+                REMEDY.format(package="onnxruntime"),
+            ) from error
         self._session.disable_fallback()
         self.providers = list(self._session.get_providers())
         if self.providers != [PROVIDER]:
-            raise GraphError(f"{path} was opened on {', '.join(self.providers)}; wanted {PROVIDER}.")
+            raise GraphError(
+                f"{path} was opened on {', '.join(self.providers)}; wanted {PROVIDER}.",
+                "install onnxruntime alone: another package of it (onnxruntime-gpu) may be in its place",
+            )
         self.path = path
         self.deadline: float | None = None
         self._run = self._session.run
@@ -110,7 +117,9 @@ class OrtCpuSession(Engine):
         except TimeoutError:
             raise
         except Exception as error:
-            raise GraphError(f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}") from error
+            raise GraphError(
+                f"ONNX Runtime failed in {self.path.name}: {_first_line(error)}", REMEDY.format(package="onnxruntime")
+            ) from error
 
     def _run_until(self, deadline: float, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run, and let another thread tell ONNX Runtime to stop before its next node at the deadline."""

@@ -1,0 +1,144 @@
+"""No message names a place that a person never sees: a draft beside the output or in the cache, or a scratch folder."""
+
+import errno
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from vlatool.data.npz import NpzReader
+from vlatool.errors import BundleError, GraphError, OutputError, VlatoolError
+from vlatool.files import scratch
+from vlatool.files.scratch import scratch_directory
+from vlatool.files.writing import writing
+from vlatool.measurement.child import ended
+from vlatool.measurement.jobs import Limits
+from vlatool.runtime.engines.openvino import OpenvinoSession
+from vlatool.runtime.engines.ort_cpu import OrtCpuSession
+from vlatool.user_code.children import call
+
+
+def refused_by_onnxruntime(place: Path) -> None:
+    (place / "graphs").mkdir()
+    (place / "graphs/main.onnx").write_bytes(b"no graph")
+    OrtCpuSession(place / "graphs/main.onnx")
+
+
+def refused_by_openvino(place: Path) -> None:
+    (place / "graphs").mkdir()
+    (place / "graphs/main.onnx").write_bytes(b"no graph")
+    OpenvinoSession(place / "graphs/main.onnx")
+
+
+def corrupt(place: Path) -> None:
+    (place / "graphs").mkdir()
+    (place / "graphs/main.onnx").write_bytes(b"PK not an archive")
+    NpzReader().read(place / "graphs/main.onnx")
+
+
+def last_words(place: Path) -> None:
+    code = "import sys; sys.exit(f'cannot map {sys.argv[1]}/graphs/main.onnx')"
+    done = subprocess.run([sys.executable, "-c", code, str(place)], capture_output=True, text=True, check=False)
+    raise ended("the policy", done.returncode, done.stderr, Limits())
+
+
+def a_child(place: Path) -> None:
+    file = str(place / "graphs/main.onnx")
+    call("vlatool.stage._inside:run", {"stage": "sources.onnx", "options": {"model": file}, "source": ""}, print, file)
+
+
+def named_in_the_fix(place: Path) -> None:
+    raise BundleError("It is wrong.", f"remove {place}/graphs/main.onnx")
+
+
+KINDS = (refused_by_onnxruntime, refused_by_openvino, corrupt, last_words, a_child, named_in_the_fix)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("out", ["out", "deep/run[1]"])
+def test_an_error_about_a_draft_names_the_output(tmp_path: Path, monkeypatch, kind: Callable[[Path], None], out: str):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(VlatoolError) as caught, writing(Path(out)) as draft:
+        kind(draft)
+    told = str(caught.value)
+    assert f"{out}/graphs/main.onnx" in told
+    assert ".tmp-" not in told
+    assert "/content" not in told
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_an_error_about_a_draft_in_the_cache_names_the_file_alone(tmp_path: Path, kind: Callable[[Path], None]):
+    with pytest.raises(VlatoolError) as caught, writing(tmp_path / "stages/export.onnx-0a1b", damaged=True) as draft:
+        kind(draft)
+    told = str(caught.value)
+    assert "graphs/main.onnx" in told
+    assert str(tmp_path) not in told
+
+
+def test_an_error_about_a_draft_in_the_cache_as_a_whole_names_its_stage(tmp_path: Path):
+    place = tmp_path / "stages/export.onnx-0a1b"
+    with pytest.raises(BundleError) as caught, writing(place, damaged=True) as draft:
+        raise BundleError(f"{draft} is half.")
+    assert caught.value.message == "the output of export.onnx is half."
+
+
+def test_a_link_on_the_way_to_a_draft_hides_it_from_nobody(tmp_path: Path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with pytest.raises(GraphError) as caught, writing(tmp_path / "link/out") as draft:
+        raise GraphError(f"the library refuses {os.path.realpath(draft)}/main.onnx")
+    assert caught.value.message == f"the library refuses {tmp_path}/link/out/main.onnx"
+
+
+def test_an_error_of_the_system_names_the_output(tmp_path: Path):
+    with pytest.raises(FileNotFoundError) as caught, writing(tmp_path / "out") as draft:
+        (draft / "graphs/main.onnx").read_bytes()
+    assert caught.value.filename == str(tmp_path / "out/graphs/main.onnx")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_of_the_cache_says_where_the_cache_could_be(tmp_path: Path, number: int):
+    with pytest.raises(OutputError) as caught, writing(tmp_path / "stages/x-1", damaged=True) as draft:
+        raise OSError(number, os.strerror(number), str(draft / "a"))
+    assert "VLATOOL_CACHE=DIR" in caught.value.fix
+    assert "vlatool cache prune" in caught.value.fix
+    assert "an entry of the cache" in caught.value.message
+    assert ".tmp-" not in caught.value.message
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
+def test_a_cache_that_may_not_be_written_says_where_it_could_be(tmp_path: Path, monkeypatch, number: int):
+    def refuse(path: Path, *_args, **_options):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(OutputError) as caught, writing(tmp_path / "stages/x-1", damaged=True):
+        pytest.fail("the block must not run")
+    assert caught.value.fix == "keep the cache elsewhere: VLATOOL_CACHE=DIR"
+
+
+def test_a_cache_below_a_file_says_where_it_could_be(tmp_path: Path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError) as caught, writing(tmp_path / "file/stages/x-1", damaged=True):
+        pytest.fail("the block must not run")
+    assert "VLATOOL_CACHE=DIR" in caught.value.fix
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+def test_an_error_about_a_scratch_folder_names_the_file_alone(kind: Callable[[Path], None]):
+    with pytest.raises(VlatoolError) as caught, scratch_directory() as place:
+        kind(place)
+    told = str(caught.value)
+    assert "graphs/main.onnx" in told
+    assert str(place) not in told
+    assert not place.exists()
+
+
+def test_a_full_disk_of_scratch_folders_says_where_they_could_be(monkeypatch):
+    monkeypatch.setattr(scratch.os, "statvfs", lambda _path: os.statvfs_result((4096, 4096, 9, 0, 0, 9, 9, 9, 0, 255)))
+    with pytest.raises(OutputError, match="temporary files") as caught, scratch_directory():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert "TMPDIR=DIR" in caught.value.fix
