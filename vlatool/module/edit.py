@@ -17,7 +17,8 @@ class Edit:
         module: Its name, as ``named_modules`` gives it.
         axis: ``outputs`` (rows of the weight, the bias), ``inputs`` (columns of the weight) or ``blocks`` (the modules
             of an ``nn.ModuleList`` or ``nn.Sequential``); ``units A.P`` (then ``module`` names a weight) is factor P of
-            its axis A, as ``vlatool.module.axes`` finds it, with all that goes along.
+            its axis A, as ``vlatool.module.axes`` finds it, with all that goes along; ``units A.P.S.Q`` is factor Q of
+            segment S, where that factor is a concatenation.
         keep: Indices of what stays, in the order in which it stays.
     """
 

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
 CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
-AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d+")
+AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d(?:\.\d+\.\d+)*\.\d+")
 FORM = (
-    "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with digits) and keep (different whole "
+    "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with numbers) and keep (different whole "
     "numbers from 0)"
 )
 MOST_KNOWN = 20
