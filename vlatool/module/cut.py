@@ -72,7 +72,8 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
     _run(kept, feeds)
 
     def retrace(size: int) -> nn.Module:
-        other = _cut(module, _repeated(feeds, size), wanted)
+        again = getattr(module, RETRACE, None)  # of one that lost units before
+        other = _cut(again(size) if again else module, _repeated(feeds, size), wanted)
         _share(kept, other)
         return other
 
@@ -139,7 +140,7 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     Raises:
         SourceError: when there is none, or it is smaller.
     """
-    axis, *path = (int(number) for number in edit.axis.removeprefix("units ").split("."))
+    axis, *path = edit.path
     shape = walk.weights.get(edit.module, [])
     atoms = {atom.path: atom.leaf for atom in walk.factors.atoms(shape[axis])} if axis < len(shape) else {}
     leaf = atoms.get(tuple(path))
