@@ -166,10 +166,100 @@ def padded(rng: random.Random, c: int) -> Block:
     return Block(lambda s, x: functional.elu(s.a(x)), c, a=nn.Conv2d(c, c, 3, padding=1, padding_mode=mode))
 
 
+def parts(rng: random.Random, c: int) -> Block:
+    """Branches side by side, some of them twice, as they are, or of one number."""
+    h, k, o, form = (
+        _width(rng),
+        rng.choice((3, 5, 6)),
+        _width(rng),
+        rng.choice(("plain", "twice", "nested", "constant")),
+    )
+    more = {"plain": 0, "twice": h, "nested": c + h, "constant": 2}[form]
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        one, other = functional.relu(s.a(x)), s.b(x)
+        last = {"plain": [], "twice": [-one], "constant": [x.new_ones(x.shape[0], 2, *x.shape[2:])],
+                "nested": [torch.cat([x, one], 1)]}[form]  # fmt: skip
+        return functional.relu(s.c(torch.cat([other, one, *last], 1)))
+
+    layers = {"a": nn.Conv2d(c, h, 3, padding=1), "b": nn.Conv2d(c, k, 1), "c": nn.Conv2d(h + k + more, o, 1)}
+    return Block(call, o, **layers)
+
+
+def skip_connection(rng: random.Random, c: int) -> Block:
+    h, o, form = _width(rng), _width(rng), rng.choice(("transposed", "bilinear"))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        deep = functional.silu(s.n(s.a(functional.max_pool2d(x, 2, ceil_mode=True))))
+        deep = s.u(deep) if form == "transposed" else deep
+        deep = functional.interpolate(deep, size=x.shape[2:], mode="bilinear")
+        return functional.relu(s.b(torch.cat((deep, x), 1)))
+
+    up = nn.ConvTranspose2d(h, h, 4, 2, 1) if form == "transposed" else nn.Identity()
+    layers = {"a": nn.Conv2d(c, h, 3, padding=1), "n": nn.GroupNorm(_divisor(rng, h), h), "u": up}
+    return Block(call, o, **layers, b=nn.Conv2d(c + h, o, 3, padding=1))
+
+
+def dense_growth(rng: random.Random, c: int) -> Block:
+    g, count = rng.choice((4, 6)), rng.choice((2, 3))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        for norm, layer in zip(s.n, s.a, strict=True):
+            x = torch.cat([x, layer(functional.relu(norm(x)))], 1)
+        return x
+
+    widths = [c + g * number for number in range(count)]
+    norms = nn.ModuleList(nn.BatchNorm2d(width) for width in widths)
+    growing = nn.ModuleList(nn.Conv2d(width, g, 3, padding=1) for width in widths)
+    o = _width(rng)
+    return Block(lambda s, x: s.b(call(s, x)), o, n=norms, a=growing, b=nn.Conv2d(c + g * count, o, 1))
+
+
+def norm_of_parts(rng: random.Random, c: int) -> Block:
+    h, o = _width(rng), _width(rng)
+    norm = rng.choice((
+        nn.BatchNorm2d(c + h), nn.GroupNorm(_divisor(rng, c + h), c + h), nn.PReLU(c + h),
+        nn.Conv2d(c + h, c + h, 3, padding=1, groups=_divisor(rng, c + h)), nn.Conv2d(c + h, c + h, 1, groups=c + h),
+    ))  # fmt: skip
+    layers = {"a": nn.Conv2d(c, h, 1), "n": norm, "b": nn.Conv2d(c + h, o, 1)}
+    return Block(lambda s, x: s.b(functional.silu(s.n(torch.cat([s.a(x), x], 1)))), o, **layers)
+
+
+def sliced(rng: random.Random, c: int) -> Block:
+    h = rng.choice((12, 16, 24))
+    call: Call = rng.choice((
+        lambda s, x: s.b(s.a(x)[:, : h // 2] * s.a(x)[:, -(h // 2) :]),
+        lambda s, x: s.b(torch.cat([s.a(x)[:, 5:], x[:, :2]], 1)[:, : h // 2]),
+        lambda s, x: s.b(s.a(x)[:, ::2] + s.a(x)[:, 1::2]), lambda s, x: s.b(s.a(x).narrow(1, 3, h // 2)),
+    ))  # fmt: skip
+    return Block(call, c, a=nn.Conv2d(c, h, 1), b=nn.Conv2d(h // 2, c, 3, padding=1))
+
+
+def crossing_stages(rng: random.Random, c: int) -> Block:
+    h, first = _width(rng), rng.choice((c // 2, 3))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        one, other = x.split([first, c - first], 1)
+        y = torch.cat([functional.relu(s.a(other)), one], 1)
+        return s.b(functional.channel_shuffle(y, 2) if c % 2 == 0 else y)
+
+    return Block(call, h, a=nn.Conv2d(c - first, c - first, 3, padding=1), b=nn.Conv2d(c, h, 1))
+
+
+def added_channels(rng: random.Random, c: int) -> Block:
+    o, before = c + rng.choice((4, 6)), rng.choice((0, 2))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        return functional.relu(s.a(x) + functional.pad(x, (0, 0, 0, 0, before, o - c - before)))
+
+    return Block(lambda s, x: s.b(call(s, x)), c, a=nn.Conv2d(c, o, 3, padding=1), b=nn.Conv2d(o, c, 1))
+
+
 IMAGES: tuple[Maker, ...] = (
     convolution, grouped, grouped_residual, depthwise, transposed, transposed_grouped, batch_norm, group_norm,
     instance_norm, pooling, interpolation, residual, shared, concatenation, uneven_split, squeezed_gate, clamped,
-    pixel_shuffle, channel_shuffle, padded,
+    pixel_shuffle, channel_shuffle, padded, parts, skip_connection, dense_growth, norm_of_parts, sliced,
+    crossing_stages, added_channels,
 )  # fmt: skip
 
 
@@ -334,6 +424,105 @@ def weight_norm(rng: random.Random, c: int) -> Block:
     return Block(lambda s, x: s.b(functional.relu(s.a(x))), c, a=a, b=nn.Linear(h, c))
 
 
+def joined(rng: random.Random, c: int) -> Block:
+    h, k, form = _width(rng), rng.choice((3, 5)), rng.choice(("state", "added", "global", "turned"))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        one, other = torch.tanh(s.a(x)), s.d(x)
+        if form == "added":
+            return s.b(torch.cat([one, other], -1) + torch.cat([other, one], -1))
+        if form == "turned":
+            return s.b(torch.cat([*torch.cat([one, other], -1).split([k + 1, h - 1], -1)[::-1]], -1))
+        if form == "global":
+            other = other.amax(1, keepdim=True).expand(-1, x.shape[1], -1)
+        return s.b(torch.cat([other, one], -1))
+
+    return Block(call, c, a=nn.Linear(c, h), d=nn.Linear(c, k), b=nn.Linear(h + k, c))
+
+
+def grouped_queries(rng: random.Random, c: int) -> Block:
+    pairs, each, d, up = 2, rng.choice((1, 2, 3)), 4, rng.choice((6, 8))
+    sizes = [pairs * each * d, pairs * d, pairs * d, up, up]
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        q, k, v, gate, y = s.a(x).split(sizes, -1)
+        q, k, v = (part.unflatten(-1, (-1, d)).transpose(1, 2) for part in (q, k, v))
+        mixed = functional.scaled_dot_product_attention(q, k, v, enable_gqa=True).transpose(1, 2).flatten(2)
+        return x + s.b(torch.cat([mixed, functional.silu(gate) * y], -1))
+
+    return Block(call, c, a=nn.Linear(c, sum(sizes)), b=nn.Linear(pairs * each * d + up, c))
+
+
+def gates(rng: random.Random, c: int) -> Block:
+    h = _width(rng)
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        state = memory = torch.zeros(x.shape[0], h)
+        for step in range(2):
+            one, two, three, four = s.a(torch.cat([x[:, step], state], -1)).chunk(4, -1)
+            memory = torch.sigmoid(two) * memory + torch.sigmoid(one) * torch.tanh(three)
+            state = torch.sigmoid(four) * torch.tanh(memory)
+        return x + s.b(state)[:, None]
+
+    return Block(call, c, a=nn.Linear(c + h, 4 * h), b=nn.Linear(h, c))
+
+
+def rotated(rng: random.Random, c: int) -> Block:
+    heads, d, form = rng.choice((2, 3)), 4, rng.choice(("halves", "slices", "pairs"))
+
+    def turned(x: Tensor) -> Tensor:
+        if form == "pairs":
+            return torch.stack([-x[..., 1::2], x[..., ::2]], -1).flatten(-2)
+        one, other = x.chunk(2, -1) if form == "halves" else (x[..., : d // 2], x[..., d // 2 :])
+        return torch.cat([-other, one], -1)
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        q, k, v = (each.unflatten(-1, (heads, d)).transpose(1, 2) for each in s.a(x).chunk(3, -1))
+        q, k = (each * s.cos + turned(each) * s.sin for each in (q, k))
+        return x + s.b((torch.softmax(q @ k.mT * 0.4, -1) @ v).transpose(1, 2).flatten(2))
+
+    angles = torch.arange(6.0)[:, None] * torch.tensor([1.0, 0.1, 1.0, 0.1])
+    parts = {"a": nn.Linear(c, 3 * heads * d), "b": nn.Linear(heads * d, c), "cos": angles.cos(), "sin": angles.sin()}
+    return Block(lambda s, x: call(s, x) if x.shape[1] == 6 else x + s.b(s.a(x)[..., : heads * d]), c, **parts)
+
+
+def along_time(rng: random.Random, c: int) -> Block:
+    extra, form = rng.choice((1, 2)), rng.choice(("tokens", "shift", "window"))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        y = s.a(x)
+        if form == "tokens":
+            return s.b(torch.cat([s.t.expand(x.shape[0], -1, -1), y], 1))[:, extra:]
+        if form == "shift":
+            moved = [functional.pad(y[:, 1:, :3], (0, 0, 0, 1)), functional.pad(y[:, :-1, 3:5], (0, 0, 1, 0))]
+            return s.b(torch.cat([*moved, y[..., 5:]], -1))
+        return s.b(functional.pad(y, (0, 0, 1, 0)).unfold(1, 2, 1).amax(-1))
+
+    return Block(call, c, a=nn.Linear(c, c), b=nn.Linear(c, c), t=torch.randn(1, extra, c))
+
+
+def written(rng: random.Random, c: int) -> Block:
+    h, k = _width(rng), rng.choice((2, 5))
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        y = torch.zeros(*x.shape[:2], h + k)
+        y[..., :k], y[..., k:] = s.d(x), torch.tanh(s.a(x))
+        return s.b(y)
+
+    return Block(call, c, a=nn.Linear(c, h), d=nn.Linear(c, k), b=nn.Linear(h + k, c))
+
+
+def heads_of_parts(rng: random.Random, c: int) -> Block:
+    h, k = rng.choice((8, 12)), rng.choice((4, 6))
+    heads = rng.choice([each for each in (2, 4, 5) if (h + k) % each == 0])
+
+    def call(s: Block, x: Tensor) -> Tensor:
+        y = torch.cat([s.d(x), s.a(x)], -1).unflatten(-1, (heads, -1)).transpose(1, 2)
+        return s.b((torch.softmax(y @ y.mT * 0.1, -1) @ y).transpose(1, 2).flatten(2))
+
+    return Block(call, c, a=nn.Linear(c, h), d=nn.Linear(c, k), b=nn.Linear(h + k, c))
+
+
 def without_rule(rng: random.Random, c: int) -> Block:
     call = rng.choice((
         lambda s, x: s.b(torch.cummax(s.a(x), 1)[0]), lambda s, x: s.b(torch.renorm(s.a(x), 2, 0, 3.0)),
@@ -345,7 +534,8 @@ def without_rule(rng: random.Random, c: int) -> Block:
 
 SEQUENCES: tuple[Maker, ...] = (
     mlp, rms_norm, gated, attention, shared_keys, torch_attention, experts, einsum, recurrent, recurrent_cell,
-    over_time, tied, tied_back, added_places, stacked, sums_so_far, weight_norm, without_rule,
+    over_time, tied, tied_back, added_places, stacked, sums_so_far, weight_norm, without_rule, joined, grouped_queries,
+    gates, rotated, along_time, written, heads_of_parts,
 )  # fmt: skip
 
 

@@ -49,7 +49,7 @@ class Attention(nn.Module):
 def units(walk: Walk) -> dict[str, int]:
     """Return first weight with axis and place -> number of units, of all that may go."""
     return {
-        f"{members[0].weight} {members[0].axis}.{members[0].place}": walk.factors.sizes[leaf]
+        f"{members[0].weight} {members[0].units.removeprefix('units ')}": walk.factors.sizes[leaf]
         for leaf, members in walk.members().items()
     }
 
@@ -63,9 +63,12 @@ def test_heads_are_found_in_reshapes(form: str):
     walk = walked(Attention(form), torch.randn(2, 5, WIDTH))
     assert units(walk) == {"joint.weight 0.1": HEADS, "joint.weight 0.2": WIDTH // HEADS}
     members = next(iter(walk.members().values()))
-    assert [(each.weight, each.axis, each.place, each.sizes) for each in members] == [
-        ("joint.weight", 0, 1, (3, 4, 6)), ("joint.bias", 0, 1, (3, 4, 6)), ("output.weight", 1, 0, (4, 6)),
-    ]  # fmt: skip
+    assert [(each.weight, each.units) for each in members] == [
+        ("joint.weight", "units 0.1"),
+        ("joint.bias", "units 0.1"),
+        ("output.weight", "units 1.0"),
+    ]
+    assert members[0].numbers.tolist() == 3 * [number for number in range(HEADS) for _ in range(WIDTH // HEADS)]
 
 
 @pytest.mark.parametrize("form", ["chunk", "split"])
@@ -104,7 +107,7 @@ def test_channels_are_coupled_through_normalisation_depth_residual_film_and_flat
     module, feeds = Conv().eval(), (torch.randn(1, 3, 6, 6), torch.randn(1, 4))
     walk = walked(module, *feeds)
     assert units(walk) == {"first.weight 0.0": 8}
-    coupled = {f"{each.weight} {each.axis}.{each.place}" for each in next(iter(walk.members().values()))}
+    coupled = {f"{each.weight} {each.units.removeprefix('units ')}" for each in next(iter(walk.members().values()))}
     assert coupled >= {"norm.running_var 0.0", "deep.weight 0.0", "second.weight 0.0", "second.weight 1.0",
                        "film.weight 0.1", "last.weight 1.0"}  # fmt: skip
     keep = (1, 2, 5)
@@ -191,8 +194,8 @@ def test_units_of_odd_operators_go_without_a_trace(make: type[nn.Module], shape:
     assert (walk.unknown, units(walk)) == (set(), wanted)
     edits, whole = [], copy.deepcopy(module)
     for members in walk.members().values():
-        first, keep = members[0], tuple(range(0, members[0].sizes[members[0].place], 2))
-        edits.append(Edit("main", first.weight, f"units {first.axis}.{first.place}", keep))
+        first, keep = members[0], tuple(range(0, max(members[0].numbers) + 1, 2))
+        edits.append(Edit("main", first.weight, first.units, keep))
         for member in members:
             silence(whole.get_parameter(member.weight), member, keep)
     small = cut(module, [feed], edits)
@@ -213,7 +216,7 @@ def test_an_operator_without_a_rule_keeps_what_touches_it_and_is_named():
     walk = walked(Blocked(), torch.randn(1, 4))
     assert walk.unknown == {"aten.cummax"}
     assert units(walk) == {"two.weight 0.0": 6}
-    assert [walk.keeps(product) for product in range(3)] == [
+    assert [set().union(*(keepers for _, keepers in walk.terms(product))) for product in range(3)] == [
         {"the policy's inputs", "aten.cummax"}, {"aten.cummax"}, {"the policy's outputs"},
     ]  # fmt: skip
 
@@ -330,12 +333,11 @@ def test_units_of_torchs_attention_go_whatever_the_batch_is(whole: bool, to_othe
     torch.manual_seed(0)
     module, feed = Sequenced(whole=whole, to_others=to_others).eval(), torch.randn(1, 4)
     groups = list(walked(module, feed).members().values())
-    assert any(member.sizes == (3, 4, 4) and member.place == 1 for members in groups for member in members), "heads"
+    assert any(member.units == "units 0.1" and not member.atom.is_fastest for members in groups for member in members)
     batch = torch.randn(5, 4)
     for members in groups:
-        first, size = members[0], members[0].sizes[members[0].place]
-        keep = tuple(range(0, size, 2))
-        units = f"units {first.axis}.{first.place}"
+        first = members[0]
+        keep, units = tuple(range(0, max(first.numbers) + 1, 2)), first.units
         whole_one = copy.deepcopy(module)
         for member in members:
             silence(whole_one.get_parameter(member.weight), member, keep)
@@ -348,11 +350,9 @@ def test_units_of_torchs_attention_go_whatever_the_batch_is(whole: bool, to_othe
 
 def silence(weight: torch.Tensor, member: Member, keep: tuple[int, ...]) -> None:
     """Let the units of one axis of a weight that are not kept do nothing."""
-    axis, gone = member.axis, [unit for unit in range(member.sizes[member.place]) if unit not in keep]
+    gone = torch.tensor([at for at, unit in enumerate(member.numbers) if unit >= 0 and unit not in keep])
     with torch.no_grad():
-        parts = weight.reshape(*weight.shape[:axis], *member.sizes, *weight.shape[axis + 1 :])
-        parts.index_fill_(axis + member.place, torch.tensor(gone), 0.0)
-        weight.copy_(parts.reshape(weight.shape))
+        weight.index_fill_(member.axis, gone.long(), 0.0)
 
 
 @pytest.mark.parametrize(("edit", "says"), [

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 import torch
@@ -12,12 +14,14 @@ from torch import nn
 
 from vlatool.bundle.bundle import Bundle, seal
 from vlatool.errors import SourceError
+from vlatool.module.cut import RETRACE
 from vlatool.module.edits import (
     EDITS,
     Edit,
     apply,
     edited,
     is_changed,
+    joined_edits,
     load_tensors,
     read_edits,
     read_tensors,
@@ -174,3 +178,45 @@ def test_a_file_that_is_not_safetensors_is_refused(changed: Bundle):
     (changed.path / "module/main.safetensors").write_bytes(b"\xff" * 64)
     with pytest.raises(SourceError, match=r"main\.safetensors cannot be read as safetensors"):
         edited({"main": mlp()}, changed)
+
+
+class Pair(nn.Module):
+    """Two heads, of which one may stay; and a part of a concatenation of which one unit may."""
+
+    def __init__(self, one: bool):
+        super().__init__()
+        self.joint, self.out, self.other, self.last = (
+            nn.Linear(6, 24),
+            nn.Linear(8, 6),
+            nn.Linear(6, 2),
+            nn.Linear(8, 3),
+        )
+        self.one = one
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        assert not self.one or len(x) in (1, 3), "sizes that the code knows"
+        query, key, value = (each.unflatten(-1, (2, 4)).transpose(1, 2) for each in self.joint(x).chunk(3, -1))
+        mixed = (torch.softmax(query @ key.mT, -1) @ value).transpose(1, 2).flatten(2)
+        return self.last(torch.cat([self.out(mixed), self.other(x)], -1)).mean(1)
+
+
+@pytest.mark.parametrize("one", [False, True])
+def test_units_of_what_is_left_are_those_of_another_trace(one: bool, monkeypatch: pytest.MonkeyPatch):
+    """One head is no axis any more, so that the same places name other units."""
+    torch.manual_seed(0)
+    module, x = Pair(one).eval(), torch.randn(1, 3, 6)
+    monkeypatch.setattr("vlatool.module.edits.first_feeds", lambda modules, bundle: {"main": [x]})
+    before = [Edit("main", "joint.weight", "units 0.1", (1,)), Edit("main", "other.weight", "units 0.0", (0,))]
+    after = [Edit("main", "joint.weight", "units 0.1", (0, 2, 3)), Edit("main", "out.weight", "units 0.0", (0, 5))]
+    joined = joined_edits(before, after)
+    assert [edit.axis for edit in joined] == ["units 0.1", "units 0.0", "units@2 0.1", "units@2 0.0"]
+    assert [edit.axis for edit in joined_edits(joined, after[:1])][4:] == ["units@3 0.1"]
+    bundle = Bundle(Path(), cast(Any, None))
+    first = apply({"main": copy.deepcopy(module)}, before, bundle)
+    wanted = apply(first, after, bundle)["main"]
+    made = apply({"main": copy.deepcopy(module)}, joined, bundle)["main"]
+    assert made.get_parameter("joint.weight").shape == (3 * 3, 6)
+    torch.testing.assert_close(made(x), wanted(x))
+    if one:
+        batch = torch.randn(3, 3, 6)
+        torch.testing.assert_close(getattr(made, RETRACE)(3)(batch), torch.cat([made(row[None]) for row in batch]))

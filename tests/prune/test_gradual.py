@@ -19,6 +19,7 @@ from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune._sparse import sparse_layers
 from vlatool.prune.gradual import Gradual
 from vlatool.prune.magnitude import Magnitude
+from vlatool.prune.structured import Structured
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime.policy import relative_error
 from vlatool.sources.torch_module import TorchModule
@@ -138,3 +139,19 @@ def test_wrong_options_are_told(source_bundle: Bundle, tmp_path: Path, options: 
 
 def test_the_class_is_the_stage():
     assert importlib.import_module("vlatool.prune.gradual").Gradual.name() == "prune.gradual"
+
+
+def test_a_policy_that_lost_units_gets_zeros_and_keeps_them(
+    source_bundle: Bundle, policy_template: Path, tmp_path: Path
+):
+    narrower = run_transform(
+        Structured(ratio=0.3, multiple=1, rank="magnitude"), source_bundle, tmp_path / "narrower", Context()
+    )
+    made = grown(narrower, tmp_path / "made", ratio=0.7)
+    tensors = [load_file(each.path / "module/main.safetensors") for each in (narrower, made)]
+    assert tensors[0][LAYER].size < 32 * 16
+    assert {name: value.shape for name, value in tensors[0].items()} == {
+        name: value.shape for name, value in tensors[1].items()
+    }
+    assert (tensors[1][LAYER] == 0).sum() == round(0.7 * tensors[1][LAYER].size)
+    assert rebuild(made, Context(), source=str(policy_template), cache=tmp_path / "cache").identical

@@ -15,9 +15,11 @@ from vlatool.errors import RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.module.torch_policy import load_modules
 from vlatool.prune._last import last_layers
-from vlatool.prune._sparse import Layers, Sparse, _rows, sparse_layers
+from vlatool.prune._products import looking
+from vlatool.prune._sparse import Layers, Sparse, sparse_layers
 from vlatool.prune.magnitude import Magnitude
 from vlatool.prune.sparsegpt import SparseGpt
+from vlatool.prune.structured import Structured
 from vlatool.prune.wanda import Wanda
 from vlatool.runtime import load
 from vlatool.stage.base import Context
@@ -69,8 +71,10 @@ def test_what_looks_at_the_inputs_loses_less_and_correcting_loses_least():
 ])  # fmt: skip
 def test_rows_are_what_the_weight_is_multiplied_with(layer: nn.Module):
     shape = {nn.Linear: (2, 5, 6), nn.Conv1d: (2, 6, 9), nn.Conv2d: (2, 6, 9, 9)}[type(layer)]
-    given = torch.randn(shape)
-    product = _rows(layer, given) @ layer.weight.detach().reshape(4, -1).T
+    given, seen = torch.randn(shape), list[torch.Tensor]()
+    with looking(lambda weight, rows: seen.append(rows @ weight.detach().reshape(4, -1).T)):
+        layer(given)
+    (product,) = seen
     wanted = layer(given) - layer.bias.reshape((4, *[1] * (len(shape) - 2)) if len(shape) > 2 and not isinstance(
         layer, nn.Linear) else (4,))  # fmt: skip
     wanted = wanted if isinstance(layer, nn.Linear) else wanted.movedim(1, -1)
@@ -138,3 +142,33 @@ def test_a_part_that_the_description_names_so_stays_dense(source_bundle: Bundle)
 def test_wrong_options_are_told(source_bundle: Bundle, options: dict[str, object], says: str):
     with pytest.raises(RecipeError, match=says):
         Magnitude(**options).change(load_modules(source_bundle), source_bundle, Context())
+
+
+@pytest.fixture(scope="module")
+def narrower(source_bundle: Bundle, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    """The tiny policy without a third of its work, and so traced; read only."""
+    stage = Structured(ratio=0.3, multiple=1, rank="magnitude")
+    return run_transform(stage, source_bundle, tmp_path_factory.mktemp("narrower") / "out", Context())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_layers_that_lost_units_are_the_same_layers(method: type[Sparse], narrower: Bundle, source_bundle: Bundle):
+    modules, whole = load_modules(narrower), sparse_layers(load_modules(source_bundle), source_bundle, (), ())
+    found = sparse_layers(modules, narrower, (), ())
+    assert (set(found.chosen), set(found.dense)) == (set(whole.chosen), set(whole.dense))
+    before = {name: layer.weight.detach().clone() for name, layer in found.chosen.items()}
+    method(samples=4).change(modules, narrower, Context())
+    shares = [float((layer.weight == 0).float().mean()) for layer in found.chosen.values()]
+    assert shares == pytest.approx([0.5] * len(shares), abs=0.2)  # of three inputs, two
+    changed = [not torch.equal(layer.weight[layer.weight != 0], before[name][layer.weight != 0])
+               for name, layer in found.chosen.items()]  # fmt: skip
+    assert any(changed) == (method is SparseGpt), "it alone corrects what stays, by what layers are given"
+
+
+def test_what_layers_are_given_is_seen_in_traced_ones_too(narrower: Bundle):
+    modules = load_modules(narrower)
+    layers = sparse_layers(modules, narrower, (), ()).chosen
+    given = Wanda(samples=4)._given(layers, modules, narrower, Context())
+    assert {name: tuple(total.shape) for name, total in given.items()} == {
+        name: (layer.weight[0].numel(),) * 2 for name, layer in layers.items()
+    }

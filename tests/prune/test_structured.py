@@ -97,6 +97,20 @@ def test_pruning_again_keeps_what_both_keep(pruned: Bundle, tmp_path: Path):
     assert {(edit.module, edit.axis) for edit in after} >= {(edit.module, edit.axis) for edit in before}
     assert len({(edit.module, edit.axis) for edit in after}) == len(after)
     assert load_modules(again)["main"] is not None
+    assert {edit.trace for edit in before} == {1}
+    assert {edit.trace for edit in after[len(before) :]} == {2}
+
+
+@pytest.mark.parametrize(("stage", "says"), [
+    ("prune.depth", "lists of blocks cannot be found"), ("prune.neurons", "hidden layers of an nn.Sequential cannot"),
+])  # fmt: skip
+@pytest.mark.parametrize("include", [(), ("blocks",)])
+def test_what_looks_for_classes_is_refused_afterwards_with_the_order_that_works(
+    pruned: Bundle, tmp_path: Path, stage: str, says: str, include: tuple[str, ...]
+):
+    with pytest.raises(RecipeError, match=f"lost heads, neurons or channels before: it is a trace.*{says}") as caught:
+        run_transform(build_stage(stage, {"include": include}), pruned, tmp_path / "out", Context())
+    assert f"run vlatool {stage.replace('.', ' ')} first" in caught.value.fix
 
 
 def test_it_is_trained_further(pruned: Bundle, source_bundle: Bundle, tmp_path: Path):

@@ -16,7 +16,8 @@ class Values:
         products: Axes over which each multiply-accumulate runs.
         widths: Of each product, axes of the weights that it takes, without those of a kernel.
         reads: Factors of axes of weights over which a product sums: what reads units, where others write them.
-        counts: Node -> argument that states a number of groups, and the axis that has so many elements.
+        counts: Node -> argument that states a number, and its place in a list -> axes that have so many elements.
+        apart: Nodes whose equal parts are not the same, as they are where nothing keeps their elements.
         shapes: Node -> axes of its value, of several values, or None where it is no tensor.
         stored: Nodes whose values are weights, or weights with their axes in another order.
     """
@@ -26,7 +27,9 @@ class Values:
         self.products: list[Shape] = []
         self.widths: list[Shape] = []
         self.reads: set[int] = set()
-        self.counts: dict[Any, tuple[str, Axis]] = {}
+        self.counts: dict[Any, dict[tuple[str, int | None], list[Axis]]] = {}
+        self.apart: frozenset[Any] = frozenset()
+        self._alike: dict[Any, Axis] = {}
         self.shapes: dict[Any, Any] = {}
         self.stored: set[Any] = set()
 
@@ -73,6 +76,25 @@ class Values:
         """
         self.products.append(axes)
         self.widths.append(list(widths))
+
+    def pieces(self, node: Any, axis: Axis, sizes: Sequence[int]) -> list[Axis]:
+        """Cut an axis into pieces; of equal ones, which piece it is is a factor of its own, and all are the same."""
+        first = self.factors.leaves(axis)[:1]
+        alike = len(set(sizes)) == 1 and not (first and self.factors.inside(first[0])) and node not in self.apart
+        if not alike or self.factors.size(first) % len(sizes):
+            return self.factors.pieces(axis, sizes)
+        which, piece = self.factors.parted(axis, len(sizes))
+        self.factors.freeze(which)
+        if not self._is_stuck(piece):
+            self._alike[node] = piece
+        return [piece for _ in sizes]
+
+    def stuck(self) -> frozenset[Any]:
+        """Return the nodes with equal pieces all of whose elements stay, though some of one piece might go."""
+        return frozenset(node for node, axis in self._alike.items() if self._is_stuck(axis))
+
+    def _is_stuck(self, axis: Axis) -> bool:
+        return all(self.factors.is_frozen(leaf) for leaf in self.factors.leaves(axis))
 
     def frozen(self, sizes: Sequence[int]) -> Shape:
         """Return new axes whose elements stay."""

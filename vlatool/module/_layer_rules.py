@@ -29,7 +29,7 @@ def _in_groups(walk: Values, node: Any) -> Shape:
     for name in ("weight", "bias"):
         if argument(node, name) is not None:
             walk.factors.unite(given[1], walk.needed(argument(node, name))[0])
-    walk.counts[node] = "num_groups", groups
+    walk.counts[node] = {("num_groups", None): [groups]}
     return given
 
 
@@ -64,6 +64,12 @@ def _over_places(walk: Values, node: Any) -> Any:
     return shapes if isinstance(value, list | tuple) else shapes[0]
 
 
+def _unpooled(walk: Values, node: Any) -> Any:
+    """Put what was pooled back to its places."""
+    walk.broadcast([walk.needed(each) for each in node.args[:2]])
+    return _over_places(walk, node)
+
+
 def _rank(node: Any) -> int:
     """Return over how many axes an operator pools: the number before the 'd' in its name."""
     return next(rank for rank in (1, 2, 3) if f"{rank}d" in node.target._opname)
@@ -85,16 +91,38 @@ def _pixel_shuffle(walk: Values, node: Any) -> Shape:
     return [*given[:-3], channels, *walk.frozen(sizes[-2:])]
 
 
-def _pad(walk: Values, node: Any) -> Shape:
+def _pixel_unshuffle(walk: Values, node: Any) -> Shape:
+    """Turn places into the faster part of the channels."""
     given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    padded = len(node.args[1]) // 2
-    result = list(given)
-    for number in range(len(given) - padded, len(given)):
-        before = 2 * (len(given) - 1 - number)
-        if any(node.args[1][before : before + 2]):
-            walk.factors.freeze(given[number])
-            (result[number],) = walk.frozen(sizes[number : number + 1])
-    return result
+    return _patched(walk, given, 3, sizes[-3], sizes[-2:])
+
+
+def _unfolded(walk: Values, node: Any) -> Shape:
+    """Let the channels of the places of a patch follow each other."""
+    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
+    return _patched(walk, given, 3, sizes[-2], sizes[-1:])
+
+
+def _patched(walk: Values, given: Shape, back: int, size: int, places: list[int]) -> Shape:
+    for axis in given[-back + 1 :]:
+        walk.factors.freeze(axis)
+    channels = given[-back]
+    return [*given[:-back], (*channels, *walk.frozen([size // walk.factors.size(channels)])[0]), *walk.frozen(places)]
+
+
+def _folded(walk: Values, node: Any) -> Shape:
+    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
+    channels, inside = walk.factors.parted(given[-2], sizes[-3])
+    for axis in (inside, given[-1]):
+        walk.factors.freeze(axis)
+    return [*given[:-2], channels, *walk.frozen(sizes[-2:])]
+
+
+def _shuffled(walk: Values, node: Any) -> Shape:
+    given = walk.needed(node.args[0])
+    groups, inside = walk.factors.parted(given[1], node.args[1])
+    walk.counts[node] = {("groups", None): [groups]}
+    return [given[0], (*inside, *groups), *given[2:]]
 
 
 _POOLS = ("max_pool{}d", "avg_pool{}d", "adaptive_avg_pool{}d", "adaptive_max_pool{}d", "max_pool{}d_with_indices")
@@ -106,6 +134,7 @@ LAYERS: dict[str, Rule] = {
     **{f"upsample_{kind}": _over_places for kind in _UPSAMPLED},
     **{f"_upsample_{kind}": _over_places for kind in ("bilinear2d_aa", "bicubic2d_aa")},
     **{f"_upsample_nearest_exact{rank}d": _over_places for rank in (1, 2, 3)},
-    "grid_sampler": _grid_sample, "pixel_shuffle": _pixel_shuffle,
-    **dict.fromkeys(("pad", "constant_pad_nd"), _pad),
+    **{f"max_unpool{rank}d": _unpooled for rank in (2, 3)},
+    "grid_sampler": _grid_sample, "pixel_shuffle": _pixel_shuffle, "pixel_unshuffle": _pixel_unshuffle,
+    "im2col": _unfolded, "col2im": _folded, "channel_shuffle": _shuffled,
 }  # fmt: skip

@@ -41,6 +41,18 @@ def _added(walk: Values, node: Any) -> Shape:
     return walk.broadcast([_product(walk, *node.args[1:3]), walk.needed(node.args[0])])
 
 
+def _tensordot(walk: Values, node: Any) -> Shape:
+    one, other = (walk.needed(each) for each in node.args[:2])
+    pairs = [(left % len(one), right % len(other)) for left, right in zip(*node.args[2:4], strict=True)]
+    for left, right in pairs:
+        walk.contract(node.args[0], one[left], node.args[1], other[right])
+    rows = [axis for number, axis in enumerate(one) if number not in {left for left, _ in pairs}]
+    columns = [axis for number, axis in enumerate(other) if number not in {right for _, right in pairs}]
+    stored = [axis for each in node.args[:2] if each in walk.stored for axis in walk.needed(each)]
+    walk.multiply([*rows, *(one[left] for left, _ in pairs), *columns], stored)
+    return [*rows, *columns]
+
+
 def _bilinear(walk: Values, node: Any) -> Shape:
     one, other, weight = (walk.needed(each) for each in node.args[:3])
     for number, given in ((1, one), (2, other)):
@@ -74,7 +86,7 @@ def _grouped(walk: Values, node: Any) -> tuple[Shape, Shape, Axis, Axis]:
     number = argument(node, "groups", 1)
     groups, inside = walk.factors.parted(given[-len(weight) + 1], number)
     if number > 1:
-        walk.counts[node] = "groups", groups
+        walk.counts[node] = {("groups", None): [groups]}
     return given, weight, groups, inside
 
 
@@ -224,6 +236,7 @@ def _pairs(walk: Values, names: Sequence[list[str]], axes: dict[str, Axis], resu
 PRODUCTS: dict[str, Rule] = {
     "linear": _linear, **dict.fromkeys(("matmul", "mm", "bmm", "mv", "dot"), _matmul),
     **dict.fromkeys(("addmm", "baddbmm", "addmv"), _added), "bilinear": _bilinear, "einsum": _einsum,
+    "tensordot": _tensordot,
     **{f"conv{rank}d": _convolution for rank in (1, 2, 3)},
     **{f"conv_transpose{rank}d": _transposed for rank in (1, 2, 3)},
     "scaled_dot_product_attention": _attention,

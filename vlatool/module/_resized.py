@@ -7,7 +7,9 @@ import operator
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from vlatool.errors import require
 from vlatool.module._axis_values import argument, size_of
+from vlatool.module._segment_rules import SPLITS, along_of
 from vlatool.module.axes import Walk
 
 SIZED = {
@@ -41,9 +43,9 @@ class Resizer:
             if name in SIZED and self._walk.shape(node) is not None:
                 self._stated(node, SIZED[name])
             elif node in self._walk.counts:
-                self._grouped(node)
-            elif name in ("split", "split_with_sizes"):
-                self._split(node, name)
+                self._counted(node)
+            elif name in SPLITS:
+                self._split(node)
         except (IndexError, KeyError, TypeError, ValueError) as error:
             raise RuntimeError(
                 f"the new sizes of '{name}' in the layer '{layer_of(node)}' cannot be found "
@@ -52,8 +54,11 @@ class Resizer:
 
     def size(self, axis: Iterable[int]) -> int:
         """Return how many elements an axis has afterwards."""
-        keep, sizes = self._keep, self._walk.factors.sizes
-        return math.prod(len(keep[leaf]) if leaf in keep else sizes[leaf] for leaf in self._walk.factors.leaves(axis))
+        factors = self._walk.factors
+        return math.prod(
+            sum(map(self.size, factors.inside(leaf))) or len(self._keep.get(leaf, range(factors.sizes[leaf])))
+            for leaf in factors.leaves(axis)
+        )
 
     def _stated(self, node: Any, place: int) -> None:
         """Change the sizes in a list; those that are given for a batch of any size too."""
@@ -86,20 +91,30 @@ class Resizer:
             made.meta = {**node.meta, "val": size.meta["val"]}
         return less
 
-    def _grouped(self, node: Any) -> None:
-        """Change the number of groups of a convolution or a normalisation, wherever it stands."""
-        name, groups = self._walk.counts[node]
-        place = [stated.name for stated in node.target._schema.arguments].index(name)
-        if place < len(node.args):
-            node.args = (*node.args[:place], self.size(groups), *node.args[place + 1 :])
-        else:
-            node.kwargs = {**node.kwargs, name: self.size(groups)}
+    def _counted(self, node: Any) -> None:
+        """Change numbers that an operator states, such as that of its groups, wherever they stand."""
+        names = [stated.name for stated in node.target._schema.arguments]
+        for (name, place), axes in self._walk.counts[node].items():
+            number, whole = (sum(size(axis) for axis in axes) for size in (self.size, self._walk.factors.size))
+            if number == whole:
+                continue
+            value: Any = number
+            if place is not None:
+                value = list(argument(node, name))
+                value[place] = number
+            if (at := names.index(name)) < len(node.args):
+                node.args = (*node.args[:at], value, *node.args[at + 1 :])
+            else:
+                node.kwargs = {**node.kwargs, name: value}
 
-    def _split(self, node: Any, name: str) -> None:
+    def _split(self, node: Any) -> None:
+        """State the size of each part, where it is another one."""
         shapes = self._walk.parts(node)
-        along = argument(node, "dim", 0) % len(shapes[0])
+        along = along_of(node, len(shapes[0]))
         sizes = [self.size(part[along]) for part in shapes]
-        node.args = (node.args[0], sizes if name == "split_with_sizes" else sizes[0], *node.args[2:])
+        if sizes != [self._walk.factors.size(part[along]) for part in shapes]:
+            node.target = require("torch", "build").ops.aten.split_with_sizes.default
+            node.args, node.kwargs = (node.args[0], sizes, along), {}
 
 
 def layer_of(node: Any) -> str:

@@ -3,8 +3,9 @@
 A module that torch.export has traced is walked once. Every axis of every value is a product of factors: a projection to
 queries of 6 heads with 64 elements each has an axis of 384 = 6 x 64, as soon as a reshape says so. Axes that are added,
 multiplied or contracted with each other share their factors (a union-find), so that a factor's members are all weights
-that lose the same elements: heads are found through reshapes, where tools that follow whole channels stop. A
-factor is frozen when elements cannot go without a change of meaning: inputs and outputs, what is normalised over, what
+that lose the same elements: heads are found through reshapes, where tools that follow whole channels stop. A factor
+may be a concatenation of axes, whose elements go where each part is written and read (``vlatool.module.factors``). It
+is frozen when elements cannot go without a change of meaning: inputs and outputs, what is normalised over, what
 an operator that is not known here reads.
 
 The idea of coupled parameters is that of DepGraph (Fang et al., arXiv 2301.12900).
@@ -13,19 +14,25 @@ The idea of coupled parameters is that of DepGraph (Fang et al., arXiv 2301.1290
 from __future__ import annotations
 
 import contextlib
+import itertools
+import math
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+from numpy.typing import NDArray
 
 from vlatool.errors import require
 from vlatool.module._axis_values import Values, sizes_of
 from vlatool.module.axis_rules import TRANSPOSED, rule_for
-from vlatool.module.factors import Shape
+from vlatool.module.factors import Atom, Axis, Shape
 
 REORDERING = (*TRANSPOSED, "permute", "movedim", "detach", "to", "_to_copy", "contiguous", "clone")
 """Operators after which a weight is still one."""
 INPUT, OUTPUT = "the policy's inputs", "the policy's outputs"
 """What keeps axes, beside operators."""
+Term = tuple[tuple[int, ...], frozenset[str]]
+"""Factors whose elements may go, and what keeps a width."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +42,21 @@ class Member:
     Args:
         weight: Name in the state of the module.
         axis: Number of the axis.
-        place: Number of the factor in the axis.
-        sizes: Sizes of all factors of the axis.
+        atom: Which factor of the axis.
         reads: Whether a product sums over the axis: the weight reads the units, which others write.
+        numbers: Of each element of the axis, the unit that it belongs to; -1 for none.
     """
 
     weight: str
     axis: int
-    place: int
-    sizes: tuple[int, ...]
-    reads: bool = False
+    atom: Atom
+    reads: bool
+    numbers: NDArray[Any] = field(compare=False, repr=False)
+
+    @property
+    def units(self) -> str:
+        """Return the axis as an edit names it."""
+        return f"units {self.axis}.{'.'.join(map(str, self.atom.path))}"
 
 
 class Walk(Values):
@@ -59,12 +71,20 @@ class Walk(Values):
 
     def __init__(self, program: Any) -> None:
         super().__init__()
+        self._walk(program)
+        if stuck := self.stuck():
+            super().__init__()
+            self.apart = stuck
+            self._walk(program)
+
+    def _walk(self, program: Any) -> None:
         self.weights: dict[str, Shape] = {}
         self.unknown: set[str] = set()
         signature = program.graph_signature
         named = {**signature.inputs_to_parameters, **signature.inputs_to_buffers,
                  **signature.inputs_to_lifted_tensor_constants}  # fmt: skip
         tensors: dict[int, Shape] = {}
+        self._live = _live(program.graph)
         for node in program.graph.nodes:
             if node.op == "placeholder":
                 weight = named.get(node.name, "")
@@ -84,19 +104,47 @@ class Walk(Values):
         found: dict[int, list[Member]] = {}
         for weight, shape in self.weights.items():
             for number, axis in enumerate(shape):
-                leaves = self.factors.leaves(axis)
-                sizes = tuple(self.factors.sizes[leaf] for leaf in leaves)
-                for place, leaf in enumerate(leaves):
-                    if not self.factors.is_frozen(leaf):
-                        reads = not self.reads.isdisjoint(axis)
-                        found.setdefault(leaf, []).append(Member(weight, number, place, sizes, reads))
+                reads = not self.reads.isdisjoint(axis)
+                for atom in self.factors.atoms(axis):
+                    if not self.factors.is_frozen(atom.leaf):
+                        numbers = self.factors.numbers(axis, atom.path)
+                        found.setdefault(atom.leaf, []).append(Member(weight, number, atom, reads, numbers))
         return found
 
-    def keeps(self, product: int) -> set[str]:
-        """Return the operators that keep a whole width of a product's weights."""
+    def terms(self, product: int) -> dict[Term, int]:
+        """Return the multiply-accumulates of a product as a sum: factors whose elements may go -> of one element each.
+
+        With the factors stand the operators that keep a whole width of the weights that these multiply-accumulates
+        take; where axes are concatenations, each segment has its own.
+        """
         widths = [self.factors.leaves(axis) for axis in self.widths[product]]
-        whole = [leaves for leaves in widths if all(self.factors.is_frozen(leaf) for leaf in leaves)]
-        return {self.factors.reason(leaf) for leaves in whole for leaf in leaves}
+        run = [self.factors.leaves(axis) for axis in self.products[product]]
+        kept = {reason for leaves in widths if leaves not in run for reason in self.factors.reasons(leaves)}
+        terms: dict[Term, int] = {((), frozenset(kept)): 1}
+        for leaves in run:
+            ways, before = self._ways(leaves, leaves in widths), terms
+            terms = {}
+            for (goes, keepers), macs in before.items():
+                for (more, others), size in ways.items():
+                    term = tuple(sorted((*goes, *more))), keepers | others
+                    terms[term] = terms.get(term, 0) + macs * size
+        return terms
+
+    def _ways(self, axis: Axis, is_width: bool) -> dict[Term, int]:
+        """Return the size of an axis as such a sum."""
+        ways: dict[Term, int] = {}
+        for segment in self._segments_of(axis):
+            goes = tuple(leaf for leaf in segment if not self.factors.is_frozen(leaf))
+            size = math.prod(self.factors.sizes[leaf] for leaf in segment if leaf not in goes)
+            way = goes, frozenset() if goes or not is_width else frozenset(self.factors.reasons(segment))
+            ways[way] = ways.get(way, 0) + size
+        return ways
+
+    def _segments_of(self, axis: Axis) -> list[Axis]:
+        """Return axes that are products alone, and an axis as a concatenation of them, in any order."""
+        each = [[piece for segment in self.factors.inside(leaf) for piece in self._segments_of(segment)] or [(leaf,)]
+                for leaf in self.factors.leaves(axis)]  # fmt: skip
+        return [tuple(itertools.chain(*choice)) for choice in itertools.product(*each)]
 
     def _placeholder(self, node: Any, weight: str, tensors: dict[int, Shape], tensor: int) -> None:
         """Note the axes of an input or a weight; a weight with several names has the same axes under each."""
@@ -127,6 +175,8 @@ class Walk(Values):
             given = rule(self, node) if rule is not None else None
         except (ArithmeticError, IndexError, KeyError, TypeError, ValueError):  # a form that the rule does not know
             given = None
+        if node not in self._live:
+            del self.products[counted:], self.widths[counted:]
         if given is not None and self._fits(node, given):
             if node.target._opname in REORDERING and node.args[0] in self.stored:
                 self.stored.add(node)
@@ -134,7 +184,8 @@ class Walk(Values):
         self.unknown.add(self.factors.operator)
         self._freeze_all((node.args, node.kwargs))
         del self.products[counted:], self.widths[counted:]
-        if macs := macs_of(node):
+        self.counts.pop(node, None)
+        if macs := macs_of(node) if node in self._live else 0:
             widths = [axis for each in node.all_input_nodes if each in self.stored for axis in self.needed(each)]
             self.multiply(self.frozen([macs]), widths)
         return self._fresh(node)
@@ -167,6 +218,15 @@ class Walk(Values):
         elif hasattr(arguments, "op"):
             for axis in self.shape(arguments) or ():
                 self.factors.freeze(axis)
+
+
+def _live(graph: Any) -> set[Any]:
+    """Return the nodes that what a graph gives depends on, or that change a value."""
+    live: set[Any] = set()
+    for node in reversed(graph.nodes):
+        if node.op == "output" or node.is_impure() or not live.isdisjoint(node.users):
+            live.add(node)
+    return live
 
 
 def _name_of(node: Any) -> str:

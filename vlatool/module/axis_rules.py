@@ -10,6 +10,7 @@ from vlatool.module._axis_values import argument, sizes_of
 from vlatool.module._axis_values import size_of as size_of
 from vlatool.module._layer_rules import LAYERS
 from vlatool.module._product_rules import PRODUCTS
+from vlatool.module._segment_rules import SEGMENTS
 from vlatool.module.factors import Shape
 
 Rule = Callable[[Values, Any], Any]
@@ -70,16 +71,39 @@ def _reduce(walk: Values, node: Any) -> Any:
     return [shape for _ in value] if isinstance(value, list | tuple) else shape
 
 
-def _reshape(walk: Values, node: Any) -> Shape | None:
-    given = walk.needed(node.args[0])
+def _reshape(walk: Values, node: Any) -> Shape:
+    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
     leaves = list(walk.factors.leaves(factor for axis in given for factor in axis))
     result: Shape = []
-    for size in sizes_of(node.meta["val"]):
+    for number, size in enumerate(sizes):
         axis = walk.factors.taken(leaves, size)
-        if axis is None:
-            return None
+        if axis is None:  # what is left is divided otherwise
+            walk.factors.freeze(leaves)
+            return [*result, *walk.frozen(sizes[number:])]
         result.append(axis)
     return result
+
+
+def _reshape_as(walk: Values, node: Any) -> Shape:
+    return walk.broadcast([_reshape(walk, node), walk.needed(node.args[1])])
+
+
+def _windows(walk: Values, node: Any) -> Shape:
+    """Take pieces of an axis that may overlap."""
+    given, sizes = list(walk.needed(node.args[0])), sizes_of(node.meta["val"])
+    along = node.args[1] % len(given)
+    walk.factors.freeze(given[along])
+    (given[along],) = walk.frozen(sizes[along : along + 1])
+    return [*given, *walk.frozen(sizes[-1:])]
+
+
+def _numbered(walk: Values, node: Any) -> Shape:
+    """Give numbers that depend on nothing, or on their places."""
+    return walk.frozen(sizes_of(node.meta["val"]))
+
+
+def _one_hot(walk: Values, node: Any) -> Shape:
+    return [*walk.needed(node.args[0]), *walk.frozen(sizes_of(node.meta["val"])[-1:])]
 
 
 def _permute(walk: Values, node: Any) -> Shape:
@@ -116,9 +140,10 @@ def _expand(walk: Values, node: Any) -> Shape:
 
 def _repeat(walk: Values, node: Any) -> Shape:
     given = walk.needed(node.args[0])
-    padded = [()] * (len(node.args[1]) - len(given)) + given
+    stated = [1] * (len(given) - len(node.args[1])) + list(node.args[1])  # of tile, which may state fewer
+    padded = [()] * (len(stated) - len(given)) + given
     times = [walk.frozen([1 if isinstance(count, int) and count == 1 else size // walk.factors.size(axis)])[0]
-             for count, size, axis in zip(node.args[1], sizes_of(node.meta["val"]), padded, strict=True)]  # fmt: skip
+             for count, size, axis in zip(stated, sizes_of(node.meta["val"]), padded, strict=True)]  # fmt: skip
     return [(*copies, *axis) for copies, axis in zip(times, padded, strict=True)]
 
 
@@ -130,61 +155,23 @@ def _repeat_each(walk: Values, node: Any) -> Shape:
     return given
 
 
-def _concatenate(walk: Values, node: Any) -> Shape:
-    shapes = [walk.needed(part) for part in node.args[0]]
-    along = argument(node, "dim", 0) % len(shapes[0])
-    result: Shape = []
-    for number, size in enumerate(sizes_of(node.meta["val"])):
-        if number == along:
-            for shape in shapes:
-                walk.factors.freeze(shape[number])
-            result.append(walk.factors.new(size, frozen=True))
-            continue
-        result.append(walk.broadcast([[shape[number]] for shape in shapes])[0])
-    return result
-
-
-def _stack(walk: Values, node: Any) -> Shape:
-    result = walk.broadcast([walk.needed(part) for part in node.args[0]])
-    along = argument(node, "dim", 0) % (len(result) + 1)
-    return [*result[:along], *walk.frozen([len(node.args[0])]), *result[along:]]
-
-
-def _unbind(walk: Values, node: Any) -> list[Shape]:
-    given, along = walk.needed(node.args[0]), argument(node, "dim", 0)
+def _pairs_reduced(walk: Values, node: Any) -> Shape:
+    """Compute one number of the elements of two values along an axis."""
+    given = walk.broadcast([walk.needed(each) for each in node.args[:2]])
+    along = argument(node, "dim", -1) % len(given)
     walk.factors.freeze(given[along])
-    rest = [axis for number, axis in enumerate(given) if number != along % len(given)]
-    return [rest for _ in node.meta["val"]]
+    return [axis for number, axis in enumerate(given) if number != along or argument(node, "keepdim", False)]
 
 
-def _parts(walk: Values, node: Any) -> list[Shape] | None:
-    """Cut an axis into equal parts: which part it is is a factor of its own."""
-    given = walk.needed(node.args[0])
-    along = argument(node, "dim", 0) % len(given)
-    values = [sizes_of(value)[along] for value in node.meta["val"]]
-    if len(set(values)) > 1:
-        walk.factors.freeze(given[along])
-        return [[*given[:along], *walk.frozen([size]), *given[along + 1 :]] for size in values]
-    which, inside = walk.factors.parted(given[along], len(values))
-    walk.factors.freeze(which)
-    part: Shape = [*given[:along], inside, *given[along + 1 :]]
-    return [part for _ in values]
+def _outer(walk: Values, node: Any) -> Shape:
+    return [*walk.needed(node.args[0]), *walk.needed(node.args[1])]
 
 
-def _gated(walk: Values, node: Any) -> Shape:
-    """Multiply the first half of an axis by a sigmoid of the second one."""
-    given, along = list(walk.needed(node.args[0])), argument(node, "dim", -1)
-    half, given[along] = walk.factors.parted(given[along], 2)
-    walk.factors.freeze(half)
-    return given
-
-
-def _slice(walk: Values, node: Any) -> Shape:
-    given, sizes = walk.needed(node.args[0]), sizes_of(node.meta["val"])
-    for axis, size in zip(given, sizes, strict=True):
-        if walk.factors.size(axis) != size:
-            walk.factors.freeze(axis)
-    return _resized(walk, given, sizes)
+def _kronecker(walk: Values, node: Any) -> Shape:
+    one, other = walk.needed(node.args[0]), walk.needed(node.args[1])
+    rank = max(len(one), len(other))
+    padded = ([()] * (rank - len(each)) + each for each in (one, other))
+    return [(*slow, *fast) for slow, fast in zip(*padded, strict=True)]
 
 
 def _select(walk: Values, node: Any) -> Shape:
@@ -210,11 +197,25 @@ def _index(walk: Values, node: Any) -> Shape:
 def _by_numbers(walk: Values, node: Any) -> Shape:
     """Take or put elements along one axis, each by a number of its own: the other axes go together."""
     values = [walk.needed(each) for each in node.all_input_nodes]
-    along = node.args[1] % len(values[0])
+    along = argument(node, "dim") % len(values[0])
     for shape in values:
         walk.factors.freeze(shape[along])
     others = walk.broadcast([[*shape[:along], (), *shape[along + 1 :]] for shape in values])
     return [*others[:along], *walk.frozen([sizes_of(node.meta["val"])[along]]), *others[along + 1 :]]
+
+
+def _added_at(walk: Values, node: Any) -> Shape:
+    """Add or put a value's elements along one axis, by their numbers."""
+    given, along, source = walk.needed(node.args[0]), argument(node, "dim"), argument(node, "source")
+    put = [walk.needed(source)] if hasattr(source, "op") else []
+    for shape in (given, *put):
+        walk.factors.freeze(shape[along % len(given)])
+    walk.broadcast([_without(shape, along) for shape in (given, *put)])
+    return given
+
+
+def _without(given: Shape, along: int) -> Shape:
+    return [() if number == along % len(given) else axis for number, axis in enumerate(given)]
 
 
 def _embedding(walk: Values, node: Any) -> Shape:
@@ -226,29 +227,35 @@ def _embedding(walk: Values, node: Any) -> Shape:
 
 SAME = ("alias", "clone", "contiguous", "detach", "dropout", "alpha_dropout", "feature_dropout", "to", "_to_copy",
         "type_as", "lift_fresh_copy")  # fmt: skip
-ELEMENTWISE = ("add", "copy", "expand_as", "hardswish", "hardsigmoid", "log_sigmoid", "rsub", "rrelu", "selu", "celu",
-               "square", "divide", "multiply", "subtract", "true_divide", "where")  # fmt: skip
+ELEMENTWISE = ("add", "bucketize", "copy", "expand_as", "hardswish", "hardsigmoid", "log_sigmoid", "real", "rsub",
+               "rrelu", "selu", "celu", "square", "divide", "multiply", "subtract", "true_divide", "where")  # fmt: skip
 """Those that torch does not tag as elementwise."""
 UNIFORM = ("zeros", "ones", "full", "empty", "new_zeros", "new_ones", "new_full", "new_empty",
            "zeros_like", "ones_like", "full_like", "empty_like")  # fmt: skip
 REDUCED = ("mean", "sum", "amax", "amin", "max", "min", "std", "var", "prod", "logsumexp", "linalg_vector_norm", "norm",
-           "any", "all", "argmax", "argmin")  # fmt: skip
+           "any", "all", "argmax", "argmin", "median", "nanmedian", "nanmean", "nansum", "mode", "kthvalue", "quantile",
+           "aminmax", "var_mean", "std_mean", "count_nonzero")  # fmt: skip
 ALONG = ("softmax", "_softmax", "log_softmax", "_log_softmax", "softmin", "cumsum", "cumprod", "sort", "topk",
-         "argsort", "flip", "roll", "logcumsumexp")  # fmt: skip
-RESHAPED = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze")
-TRANSPOSED = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims")
+         "argsort", "flip", "roll", "logcumsumexp", "diff", "fft_fft", "fft_ifft", "fft_rfft", "fft_irfft", "fft_fft2",
+         "fft_ifft2", "fft_rfft2", "fft_irfft2")  # fmt: skip
+RESHAPED = ("reshape", "view", "_unsafe_view", "flatten", "unflatten", "unsqueeze", "squeeze", "ravel")
+NUMBERED = ("arange", "linspace", "logspace", "eye", "scalar_tensor", "tril_indices", "triu_indices")
+TRANSPOSED = ("transpose", "t", "mT", "numpy_T", "swapaxes", "swapdims", "adjoint", "mH")
 _RULES: dict[str, Rule] = {
-    **PRODUCTS, **LAYERS,
+    **PRODUCTS, **LAYERS, **SEGMENTS,
     **dict.fromkeys(SAME, _same), **dict.fromkeys(ELEMENTWISE, _elementwise),
     **dict.fromkeys(UNIFORM[:8], _uniform), **dict.fromkeys(UNIFORM[8:], _same),
     **dict.fromkeys(ALONG, _along), **dict.fromkeys(REDUCED, _reduce), **dict.fromkeys(RESHAPED, _reshape),
     **dict.fromkeys(("tril", "triu"), _triangle),
     "permute": _permute, **dict.fromkeys(TRANSPOSED, _transpose), **dict.fromkeys(("movedim", "moveaxis"), _moved),
-    **dict.fromkeys(("expand", "broadcast_to"), _expand), "repeat": _repeat, "repeat_interleave": _repeat_each,
-    "cat": _concatenate, "stack": _stack, "unbind": _unbind, "glu": _gated, "slice": _slice, "select": _select,
-    **dict.fromkeys(("chunk", "split", "split_with_sizes"), _parts), "embedding": _embedding,
+    **dict.fromkeys(("expand", "broadcast_to"), _expand), **dict.fromkeys(("repeat", "tile"), _repeat),
+    "repeat_interleave": _repeat_each, **dict.fromkeys(("reshape_as", "view_as"), _reshape_as), "unfold": _windows,
+    **dict.fromkeys(NUMBERED, _numbered), "one_hot": _one_hot, "outer": _outer, "kron": _kronecker,
+    **dict.fromkeys(("linalg_vecdot", "cosine_similarity", "pairwise_distance"), _pairs_reduced),
+    "select": _select, "embedding": _embedding,
     **dict.fromkeys(("index", "index_select"), _index),
-    **dict.fromkeys(("gather", "scatter", "scatter_add"), _by_numbers),
+    **dict.fromkeys(("gather", "scatter", "scatter_add", "scatter_reduce", "take_along_dim"), _by_numbers),
+    **dict.fromkeys(("index_add", "index_copy", "index_fill"), _added_at),
 }  # fmt: skip
 
 

@@ -58,7 +58,8 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
     Args:
         module: As the factory, and the edits before these, made it.
         feeds: Example inputs, a batch of 1.
-        edits: Each names a weight, and ``units AXIS.PLACE``: which factor of which of its axes.
+        edits: Each names a weight, and ``units AXIS.PLACE``: which factor of which of its axes; in a concatenation,
+            ``.SEGMENT.PLACE`` follows.
 
     Raises:
         SourceError: when torch.export cannot trace it, or an edit does not fit.
@@ -71,7 +72,8 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
     _run(kept, feeds)
 
     def retrace(size: int) -> nn.Module:
-        other = _cut(module, _repeated(feeds, size), wanted)
+        again = getattr(module, RETRACE, None)  # of one that lost units before
+        other = _cut(again(size) if again else module, _repeated(feeds, size), wanted)
         _share(kept, other)
         return other
 
@@ -138,16 +140,16 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     Raises:
         SourceError: when there is none, or it is smaller.
     """
-    axis, place = (int(number) for number in edit.axis.removeprefix("units ").split("."))
+    axis, *path = edit.path
     shape = walk.weights.get(edit.module, [])
-    leaves = walk.factors.leaves(shape[axis]) if axis < len(shape) else ()
-    if place >= len(leaves) or walk.factors.is_frozen(leaves[place]):
+    atoms = {atom.path: atom.leaf for atom in walk.factors.atoms(shape[axis])} if axis < len(shape) else {}
+    leaf = atoms.get(tuple(path))
+    if leaf is None or walk.factors.is_frozen(leaf):
         raise SourceError(f"An edit names the {edit.axis} of '{edit.module}', which cannot be chosen from.", AGAIN)
-    if max(edit.keep) >= walk.factors.sizes[leaves[place]]:
-        size = walk.factors.sizes[leaves[place]]
+    if max(edit.keep) >= (size := walk.factors.sizes[leaf]):
         kept = f"numbered from 0; an edit keeps number {max(edit.keep)}"
         raise SourceError(f"The {edit.axis} of '{edit.module}' are {size}, {kept}.", AGAIN)
-    return leaves[place]
+    return leaf
 
 
 def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[int]]) -> Any:
@@ -155,15 +157,9 @@ def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[i
     torch = require("torch", "build")
     smaller = value.detach()
     for number, axis in enumerate(shape):
-        leaves = walk.factors.leaves(axis)
-        if not any(leaf in keep for leaf in leaves):
-            continue
-        rows = torch.zeros(1, dtype=torch.int64)
-        for leaf in leaves:
-            size = walk.factors.sizes[leaf]
-            chosen = torch.tensor(keep[leaf]) if leaf in keep else torch.arange(size)
-            rows = (rows[:, None] * size + chosen[None]).reshape(-1)
-        smaller = smaller.index_select(number, rows.to(value.device)).contiguous()
+        if any(atom.leaf in keep for atom in walk.factors.atoms(axis)):
+            rows = torch.from_numpy(walk.factors.elements(axis, keep))
+            smaller = smaller.index_select(number, rows.to(value.device)).contiguous()
     whole = isinstance(value, torch.nn.Parameter)
     return torch.nn.Parameter(smaller, value.requires_grad) if whole else smaller
 

@@ -13,13 +13,13 @@ import os
 import re
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import RecipeError, SourceError, nearest, require
 from vlatool.files.json import read_json
 from vlatool.module.cut import cut
 from vlatool.module.edit import AGAIN
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 FOLDER = "module"
 EDITS = f"{FOLDER}/edits.json"
-CHANNELS, BLOCKS, UNITS = ("outputs", "inputs"), "blocks", "units "
-AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units \d\.\d+")
+CHANNELS, BLOCKS = ("outputs", "inputs"), "blocks"
+AXIS = re.compile(rf"{'|'.join(CHANNELS)}|{BLOCKS}|units(?:@[1-9]\d?)? \d(?:\.\d+\.\d+)*\.\d+")
 FORM = (
-    "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with digits) and keep (different whole "
+    "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with numbers) and keep (different whole "
     "numbers from 0)"
 )
 MOST_KNOWN = 20
@@ -139,8 +139,8 @@ def apply(
         SourceError: when there is no such module, it has no such axis or fewer channels or blocks.
     """
     made = dict(modules)
-    for units, group in groupby(edits, lambda edit: edit.axis.startswith(UNITS)):
-        if units:
+    for trace, group in groupby(edits, lambda edit: edit.trace):
+        if trace:
             if bundle is None:
                 raise ValueError("a module that loses units is traced, which takes an observation: name the bundle")
             made = _without_units(made, tuple(group), bundle)
@@ -174,24 +174,32 @@ def _without_units(modules: Mapping[str, nn.Module], edits: Sequence[Edit], bund
 
 def loses_units(edits: Iterable[Edit]) -> bool:
     """Say whether a module must be traced to be edited so."""
-    return any(edit.axis.startswith(UNITS) for edit in edits)
+    return any(edit.trace for edit in edits)
+
+
+def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
+    """Refuse a policy that lost units: its parts are those of a trace, and not of the classes that it was made of.
+
+    Args:
+        bundle: The policy.
+        what: Parts that would be looked for by their class.
+        command: That looks for them.
+
+    Raises:
+        RecipeError: naming the order that works.
+    """
+    if loses_units(read_edits(bundle)):
+        raise RecipeError(
+            f"{bundle.manifest.name} lost heads, neurons or channels before: it is a trace since, in which {what} "
+            "cannot be found.",
+            f"run {command} first, and vlatool prune structured or vlatool prune latency on what it makes",
+        )
 
 
 def joined_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
-    """Return edits that do what those before and those after them do; of the same units, those kept both times."""
-    last: dict[tuple[str, str, str], int] = {}
-    result = list(before)
-    for number, edit in enumerate(before):
-        last = {} if not edit.axis.startswith(UNITS) else last
-        last[edit.graph, edit.module, edit.axis] = number
-    for edit in after:
-        number = last.get((edit.graph, edit.module, edit.axis), -1)
-        if edit.axis.startswith(UNITS) and number >= 0:
-            kept = result[number].keep
-            result[number] = replace(edit, keep=tuple(kept[index] for index in edit.keep))
-        else:
-            result.append(edit)
-    return tuple(result)
+    """Return edits that do what those before and those after them do; the units of the latter are of another trace."""
+    traces = max((edit.trace for edit in before), default=0)
+    return (*before, *(edit.after(traces) for edit in after))
 
 
 def _keep(module: Any, edit: Edit) -> None:

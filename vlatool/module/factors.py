@@ -1,39 +1,62 @@
-"""Axes as products of factors, in classes of equal ones (a union-find)."""
+"""Axes as products of factors, in classes of equal ones (a union-find); a factor may be a concatenation of axes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 Axis = tuple[int, ...]
 """Factors of an axis, the slowest one first; none for an axis of size 1."""
 Shape = list[Axis]
 
 
+@dataclass(frozen=True)
+class Atom:
+    """One place in an axis that a factor has, which is neither divided nor a concatenation.
+
+    Args:
+        leaf: The factor.
+        path: Number of the factor in the axis; where that one is a concatenation, number of the segment and of the
+            factor in it, and so on.
+        slower: Factors that it lies within, as the elements of a head lie within the heads.
+        is_fastest: Whether no factor lies within it.
+    """
+
+    leaf: int
+    path: tuple[int, ...]
+    slower: Axis
+    is_fastest: bool
+
+
 class Factors:
     """Factors of axes, in classes of equal ones.
 
+    A leaf is a factor that is not divided into a product. It may be a concatenation: its segments are axes again.
+    Both are what was found so far: a leaf is divided, or cut into segments, as soon as an operator says so, wherever it
+    occurs.
+
     Attributes:
         sizes: Of each factor.
-        operator: What is being looked at; it is noted as the reason for what it freezes.
+        operator: What is being looked at; it is noted as a reason for what it freezes.
     """
 
     def __init__(self) -> None:
         self._above: list[int] = []
         self._parts: dict[int, Axis] = {}
+        self._segments: dict[int, tuple[Axis, ...]] = {}
         self.sizes: list[int] = []
-        self._frozen: dict[int, str] = {}
+        self._frozen: dict[int, set[str]] = {}
         self.operator = ""
 
     def new(self, size: int, frozen: bool = False) -> Axis:
         """Return an axis of one factor, none for size 1."""
-        if size == 1:
-            return ()
-        self._above.append(len(self._above))
-        self.sizes.append(size)
-        if frozen:
-            self._frozen[len(self._above) - 1] = self.operator
-        return (len(self._above) - 1,)
+        return self._new(size, {self.operator} if frozen else set())
 
     def root(self, factor: int) -> int:
         """Return the factor that stands for its class."""
@@ -50,29 +73,100 @@ class Factors:
             found += self.leaves(self._parts[root]) if root in self._parts else [root]
         return tuple(found)
 
+    def inside(self, leaf: int) -> tuple[Axis, ...]:
+        """Return the segments of a leaf; none for one that is no concatenation."""
+        return self._segments.get(leaf, ())
+
+    def segments(self, axis: Iterable[int]) -> list[Axis]:
+        """Return the axes that an axis is a concatenation of: itself where it is none.
+
+        What turns faster than a concatenation is in each of its segments: ``(a + b) x c`` is ``a x c + b x c``.
+        """
+        leaves = self.leaves(axis)
+        if not leaves or leaves[0] not in self._segments:
+            return [leaves]
+        return [piece for segment in self._segments[leaves[0]] for piece in self.segments((*segment, *leaves[1:]))]
+
+    def atoms(self, axis: Iterable[int]) -> Iterator[Atom]:
+        """Yield the factors in an axis that are neither divided nor concatenations, with their places."""
+        leaves = self.leaves(axis)
+        for place, leaf in enumerate(leaves):
+            last = place == len(leaves) - 1
+            if leaf not in self._segments:
+                yield Atom(leaf, (place,), leaves[:place], last)
+            for number, segment in enumerate(self.inside(leaf)):
+                for atom in self.atoms(segment):
+                    path, slower = (place, number, *atom.path), (*leaves[:place], *atom.slower)
+                    yield Atom(atom.leaf, path, slower, last and atom.is_fastest)
+
+    def numbers(self, axis: Iterable[int], path: Sequence[int]) -> NDArray[Any]:
+        """Return for each element of an axis which element of a factor it belongs to; -1 for none.
+
+        Args:
+            axis: Of so many elements.
+            path: Place of the factor.
+        """
+        leaves = self.leaves(axis)
+        leaf = leaves[path[0]]
+        found = np.arange(self.sizes[leaf])
+        if len(path) > 1:
+            segments = [np.full(self.size(segment), -1) for segment in self._segments[leaf]]
+            segments[path[1]] = self.numbers(self._segments[leaf][path[1]], path[2:])
+            found = np.concatenate(segments)
+        before, after = self.size(leaves[: path[0]]), self.size(leaves[path[0] + 1 :])
+        return np.tile(np.repeat(found, after), before)
+
+    def elements(self, axis: Iterable[int], keep: Mapping[int, Sequence[int]]) -> NDArray[Any]:
+        """Return the elements of an axis that stay.
+
+        Args:
+            axis: Of so many elements.
+            keep: Factor -> its elements that stay; all of the others stay.
+        """
+        found = np.zeros(1, dtype=np.int64)
+        for leaf in self.leaves(axis):
+            chosen = np.asarray(keep.get(leaf, range(self.sizes[leaf])), dtype=np.int64)
+            if segments := self.inside(leaf):
+                starts = accumulate(map(self.size, segments), initial=0)
+                each = [start + self.elements(segment, keep) for start, segment in zip(starts, segments, strict=False)]
+                chosen = np.concatenate(each)
+            found = (found[:, None] * self.sizes[leaf] + chosen[None]).reshape(-1)
+        return found
+
     def size(self, axis: Iterable[int]) -> int:
         """Return the size of an axis."""
         return math.prod(self.sizes[factor] for factor in self.leaves(axis))
 
     def is_frozen(self, factor: int) -> bool:
-        """Say whether elements of a leaf must stay."""
-        return self.root(factor) in self._frozen
+        """Say whether all elements of a leaf must stay."""
+        return all(atom.leaf in self._frozen for atom in self.atoms((factor,)))
 
-    def reason(self, factor: int) -> str:
-        """Return the operator that a leaf was frozen by first; empty for one whose elements may go."""
-        return self._frozen.get(self.root(factor), "")
+    def reasons(self, axis: Iterable[int]) -> set[str]:
+        """Return the operators that an axis was frozen by; none for one of which elements may go."""
+        reasons = [self._frozen.get(atom.leaf, set()) for atom in self.atoms(axis)]
+        return set().union(*reasons) if all(reasons) else set()
 
     def freeze(self, axis: Iterable[int]) -> None:
         """Let all elements of an axis stay."""
-        for leaf in self.leaves(axis):
-            self._frozen.setdefault(leaf, self.operator)
+        self._freeze(axis, {self.operator})
 
     def divide(self, leaf: int, slow: int) -> None:
-        """Divide a leaf into a factor of size ``slow`` and the rest, which turns faster."""
-        parts = self.new(slow) + self.new(self.sizes[leaf] // slow)
-        if leaf in self._frozen:
-            self._frozen |= dict.fromkeys(parts, self._frozen[leaf])
-        self._parts[leaf] = parts
+        """Divide a leaf into a factor of size ``slow`` and the rest, which turns faster.
+
+        A concatenation is divided where each of its segments can be; else its elements stay.
+        """
+        fast = self.sizes[leaf] // slow
+        segments = self._segments.pop(leaf, ())
+        if segments and all(self.size(segment) % fast == 0 for segment in segments):
+            divided = [self.parted(segment, self.size(segment) // fast) for segment in segments]
+            for _, rest in divided[1:]:
+                self.unite(divided[0][1], rest)
+            self._parts[leaf] = self.concatenated([first for first, _ in divided]) + divided[0][1]
+            return
+        for segment in segments:
+            self.freeze(segment)
+        reasons = self._frozen.get(leaf, {self.operator} if segments else set())
+        self._parts[leaf] = self._new(slow, reasons) + self._new(fast, reasons)
 
     def parted(self, axis: Iterable[int], slow: int) -> tuple[Axis, Axis]:
         """Return a part of size ``slow`` and the rest, which turns faster; frozen where an axis is divided otherwise.
@@ -89,28 +183,49 @@ class Factors:
         self.freeze(axis)
         return self.new(slow, frozen=True), self.new(size // slow, frozen=True)
 
+    def concatenated(self, axes: Sequence[Axis]) -> Axis:
+        """Return the axis that has the elements of several ones, one after the other."""
+        full = [axis for axis in axes if self.size(axis)]
+        if len(full) == 1:
+            return full[0]
+        size = sum(self.size(axis) for axis in full)
+        if all(self.is_frozen(leaf) for axis in full for leaf in self.leaves(axis)):
+            return self._new(size, set().union(*(self.reasons(axis) for axis in full)) or {self.operator})
+        whole = self._new(size, set())
+        self._segments[whole[0]] = tuple(full)
+        return whole
+
+    def pieces(self, axis: Axis, sizes: Sequence[int]) -> list[Axis]:
+        """Cut an axis into pieces of some sizes, which are its size together."""
+        if all(self.is_frozen(leaf) for leaf in self.leaves(axis)):
+            reasons = self.reasons(axis) or {self.operator}
+            return [self._new(size, reasons) for size in sizes]
+        ends = list(accumulate(sizes))
+        for end in ends:
+            self._cut(axis, end)
+        segments = self.segments(axis)
+        starts = list(accumulate(map(self.size, segments), initial=0))
+        inside = [[segment for start, segment in zip(starts, segments, strict=False) if end - size <= start < end]
+                  for size, end in zip(sizes, ends, strict=True)]  # fmt: skip
+        return [self.concatenated(piece) for piece in inside]
+
     def unite(self, one: Axis, other: Axis) -> None:
         """Let two axes of equal size be the same; where they are divided otherwise, as far as can be, else freeze."""
-        ours, theirs = list(self.leaves(one)), list(self.leaves(other))
-        while ours and theirs:
-            if ours[0] == theirs[0]:
-                ours, theirs = ours[1:], theirs[1:]
-                continue
-            small, large = sorted((ours, theirs), key=lambda leaves: self.sizes[leaves[0]])
-            if self.sizes[small[0]] == self.sizes[large[0]]:
+        ours, theirs = self.leaves(one), self.leaves(other)
+        while ours and theirs and self.size(ours) == self.size(theirs):
+            small, large = sorted((ours[0], theirs[0]), key=self.sizes.__getitem__)
+            if small == large or self.sizes[small] == self.sizes[large]:
                 self._join(ours[0], theirs[0])
-                ours, theirs = list(self.leaves(ours[1:])), list(self.leaves(theirs[1:]))
-            elif self.sizes[large[0]] % self.sizes[small[0]] == 0:
-                self.divide(large[0], self.sizes[small[0]])
-                ours, theirs = list(self.leaves(ours)), list(self.leaves(theirs))
+                ours, theirs = ours[1:], theirs[1:]
+            elif small in self._segments or large in self._segments:
+                self._align(ours, theirs)
+                return
+            elif self.sizes[large] % self.sizes[small] == 0:
+                self.divide(large, self.sizes[small])
             else:
                 break
+            ours, theirs = self.leaves(ours), self.leaves(theirs)
         self.freeze((*ours, *theirs))
-
-    def _join(self, one: int, other: int) -> None:
-        self._above[other] = one
-        if other in self._frozen:
-            self._frozen.setdefault(one, self._frozen[other])
 
     def taken(self, leaves: list[int], size: int) -> Axis | None:
         """Take factors from the front of a list until they have a size; divide the last one; None where none fits."""
@@ -128,3 +243,61 @@ class Factors:
             else:
                 return None
         return tuple(taken)
+
+    def _new(self, size: int, reasons: set[str]) -> Axis:
+        if size == 1:
+            return ()
+        factor = len(self._above)
+        self._above.append(factor)
+        self.sizes.append(size)
+        if reasons:
+            self._frozen[factor] = set(reasons)
+        return (factor,)
+
+    def _freeze(self, axis: Iterable[int], reasons: set[str]) -> None:
+        for atom in self.atoms(axis):
+            self._frozen.setdefault(atom.leaf, set()).update(reasons)
+
+    def _join(self, one: int, other: int) -> None:
+        """Let two leaves of equal size be one."""
+        if one == other:
+            return
+        if one in self._segments or other in self._segments:
+            self._align((one,), (other,))
+            del self._segments[other]
+        self._above[other] = one
+        if reasons := self._frozen.pop(other, set()):
+            self._freeze((one,), reasons)
+
+    def _align(self, one: Axis, other: Axis) -> None:
+        """Cut two axes of equal size at the same places, and unite their segments."""
+        while places := self._ends(one) ^ self._ends(other):
+            for place in places:
+                self._cut(one, place)
+                self._cut(other, place)
+        for ours, theirs in zip(self.segments(one), self.segments(other), strict=True):
+            self.unite(ours, theirs)
+
+    def _ends(self, axis: Axis) -> set[int]:
+        return set(accumulate(map(self.size, self.segments(axis))))
+
+    def _cut(self, axis: Iterable[int], place: int) -> None:
+        """Let a segment of an axis end at a place."""
+        for segment in self.segments(axis):
+            if place < self.size(segment):
+                break
+            place -= self.size(segment)
+        if not place:
+            return
+        first, rest = segment[0], segment[1:]
+        if not rest:
+            self._cut_leaf(first, place)
+            return
+        before, within = divmod(place, self.size(rest))
+        for bound in (before, before + bool(within)):
+            self._cut((first,), bound)
+        self._cut(rest, within)
+
+    def _cut_leaf(self, leaf: int, place: int) -> None:
+        reasons = self._frozen.pop(leaf, set())
+        self._segments[leaf] = self._new(place, reasons), self._new(self.sizes[leaf] - place, reasons)

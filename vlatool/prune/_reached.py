@@ -63,6 +63,7 @@ def refuse_short(bundle: Bundle) -> None:
     if record["reached"] >= SHORT * record["asked"]:
         return
     shown = [f"{name} ({share:.1%})" for name, share in list(record["keeps"].items())[:NAMED]]
+    shown += [f"{len(record['keeps']) - NAMED} more"] if len(record["keeps"]) > NAMED else []
     keepers = f" Widths that stay, with the share of the work left: {', '.join(shown)}." if shown else ""
     unknown = f" Without a rule: {', '.join(record['without_rule'])}." if record["without_rule"] else ""
     less = f"ask for less: --ratio {int(100 * record['reached']) / 100:.2f}; " if record["reached"] >= 0.01 else ""

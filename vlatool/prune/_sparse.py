@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -18,6 +17,7 @@ from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.module.zeros import zero_share
 from vlatool.prune._last import last_layers
+from vlatool.prune._products import is_product, looking
 from vlatool.prune._selection import Selection, protected_parts
 from vlatool.runtime.engine import usable_engines
 from vlatool.stage.base import Context
@@ -94,24 +94,19 @@ class Sparse(ModuleStage):
         self, layers: Mapping[str, Any], modules: Mapping[str, nn.Module], source: Bundle, context: Context
     ) -> dict[str, Tensor]:
         """Return name of a layer -> mean of x xT over what it is given on recorded observations."""
-        torch = require("torch", "build")
         program = BatchedProgram(source.manifest.program, modules)
         noise = drawn(program.noise, 1, np.random.default_rng(0))
         sums: dict[str, Any] = {}
         counts: dict[str, int] = {}
+        names = {id(layer.weight): name for name, layer in layers.items()}
 
-        def hook(name: str) -> Any:
-            def look(layer: Any, arguments: tuple[Any, ...]) -> None:
-                rows = _rows(layer, arguments[0]).double()
-                sums[name] = sums.get(name, 0) + rows.T @ rows
+        def look(weight: Tensor, rows: Tensor) -> None:
+            if name := names.get(id(weight)):
+                sums[name] = sums.get(name, 0) + rows.double().T @ rows.double()
                 counts[name] = counts.get(name, 0) + len(rows)
 
-            return look
-
         recorded = passages(source, program, noise, self.samples, 1)
-        with contextlib.ExitStack() as stack, torch.no_grad():
-            for name, layer in layers.items():
-                stack.callback(layer.register_forward_pre_hook(hook(name)).remove)
+        with require("torch", "build").no_grad(), looking(look):
             for number, passage in enumerate(recorded):
                 context.tell("looking at what layers are given", number / len(recorded))
                 passage.run(program, noise)
@@ -189,18 +184,16 @@ def sparse_layers(
 ) -> Layers:
     """Choose whose weights become zero; embeddings, norms, heads and what gives the action stay, unless included.
 
-    A layer that several graphs share is the first one's.
+    A layer that several graphs share is the first one's, and so is a weight of several layers.
 
     Raises:
         RecipeError: when a pattern matches none, or there is none.
     """
-    nn = require("torch", "build").nn
-    kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
     found: dict[int, tuple[tuple[str, str], Any]] = {}
     for graph, module in modules.items():
         for name, part in module.named_modules():
-            if isinstance(part, kinds):
-                found.setdefault(id(part), ((graph, name), part))
+            if is_product(part):
+                found.setdefault(id(part.weight), ((graph, name), part))
     named = dict(found.values())
     full = {(graph, name): f"{graph}.{name}" if len(modules) > 1 else name for graph, name in named}
     selection = Selection(include, exclude, PROTECTED, protected_parts(source.manifest.parts, PROTECTED))
@@ -215,21 +208,3 @@ def sparse_layers(
         raise RecipeError(f"{source.manifest.name} has no layer to prune.", "look at --include and --exclude")
     dense = [name for place, name in full.items() if name not in chosen]
     return Layers(chosen, tuple(dense))
-
-
-def _rows(layer: Any, given: Tensor) -> Tensor:
-    """Return what a layer's weight is multiplied with, a row for each product: (N, inputs)."""
-    torch = require("torch", "build")
-    if not hasattr(layer, "kernel_size"):
-        return given.reshape(-1, given.shape[-1])
-    size, steps, holes = layer.kernel_size, layer.stride, layer.dilation
-    pads = layer.padding
-    if isinstance(pads, str):
-        pads = tuple(hole * (side - 1) // 2 if pads == "same" else 0 for hole, side in zip(holes, size, strict=True))
-    if given.dim() == 3:  # one dimension: a picture of one row
-        given, size, pads, steps, holes = given[:, :, None], (1, *size), (0, *pads), (1, *steps), (1, *holes)
-    columns = torch.nn.functional.unfold(given.float(), size, holes, pads, steps)
-    groups = layer.groups
-    parts = columns.reshape(len(given), groups, -1, columns.shape[-1]).mean(1) if groups > 1 else columns
-    rows: Tensor = parts.transpose(1, 2).reshape(-1, parts.shape[1])
-    return rows

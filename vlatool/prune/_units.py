@@ -17,7 +17,7 @@ from vlatool.module.axes import Member, Walk
 from vlatool.module.batched import BatchedProgram, drawn
 from vlatool.module.carried import LEADING, passages
 from vlatool.module.cut import traced
-from vlatool.module.edits import UNITS, Edit
+from vlatool.module.edits import Edit
 from vlatool.module.feeds import first_feeds
 from vlatool.prune._selection import Selection
 from vlatool.prune._slopes import slopes_of
@@ -85,8 +85,7 @@ class Group:
             keep: Numbers of the units that stay; those of the group when None.
         """
         member = member or self.members[0]
-        axis = f"{UNITS}{member.axis}.{member.place}"
-        return Edit(self.graph, member.weight, axis, tuple(self.keep if keep is None else keep))
+        return Edit(self.graph, member.weight, member.units, tuple(self.keep if keep is None else keep))
 
 
 def walks_of(modules: Mapping[str, nn.Module], source: Bundle) -> dict[str, Walk]:
@@ -118,7 +117,7 @@ def groups_of(walks: Mapping[str, Walk], selection: Selection, multiple: int, na
             names += [member.weight for member in members]
             if not _is_slowest(walk, members) or not selection.has(member.weight for member in members):
                 continue
-            heads = any(member.place < len(member.sizes) - 1 for member in members)
+            heads = not all(member.atom.is_fastest for member in members)
             step = 1 if heads or size <= multiple else multiple
             groups.append(Group(graph, leaf, size, members, step, np.zeros(size), list(range(size))))
     if names:
@@ -170,7 +169,7 @@ def rank_units(
                 moved = np.zeros(group.size)
                 for member in _readers(group):
                     if (key := (group.graph, member.weight)) in slopes:
-                        moved += _by_unit(values[key].detach() * slopes[key], member).numpy()
+                        moved += _by_unit(values[key].detach() * slopes[key], member)
                 group.importance = group.importance + moved**2
     finally:
         for value in values.values():
@@ -187,25 +186,34 @@ class Work:
     """
 
     def __init__(self, walks: Mapping[str, Walk], runs: Mapping[str, int], groups: Sequence[Group]) -> None:
-        numbers = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
+        self._numbers = {(group.graph, group.leaf): number for number, group in enumerate(groups)}
         self._sizes = [group.size for group in groups]
-        self._terms: list[tuple[int, list[int]]] = []
-        self._keepers: list[set[str]] = []
+        self._terms: list[tuple[int, list[int], frozenset[str]]] = []
+        self._of: list[list[int]] = [[] for _ in groups]
         for graph, walk in walks.items():
-            for number, product in enumerate(walk.products):
-                leaves = [leaf for axis in product for leaf in walk.factors.leaves(axis)]
-                loses = [numbers[graph, leaf] for leaf in leaves if (graph, leaf) in numbers]
-                fixed = [walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in numbers]
-                self._terms.append((runs[graph] * math.prod(fixed), loses))
-                self._keepers.append(walk.keeps(number))
+            for product in range(len(walk.products)):
+                for (leaves, keepers), macs in walk.terms(product).items():
+                    self._add(graph, walk, leaves, keepers, runs[graph] * macs)
+
+    def saved(self, number: int, size: int, sizes: Sequence[int]) -> int:
+        """Return what is saved when one group has so many units instead of those that it has.
+
+        Args:
+            number: Of the group.
+            size: Its units afterwards.
+            sizes: Units of each group.
+        """
+        less = {number: size}
+        terms = (self._terms[term][:2] for term in self._of[number])
+        return sum(
+            fixed
+            * (math.prod(sizes[each] for each in loses) - math.prod(less.get(each, sizes[each]) for each in loses))
+            for fixed, loses in terms
+        )
 
     def without(self, number: int, size: int) -> int:
         """Return what is saved when one group has so many units, and all others are whole."""
-        return sum(
-            fixed * math.prod(self._sizes[other] for other in loses)
-            - fixed * math.prod(size if other == number else self._sizes[other] for other in loses)
-            for fixed, loses in self._terms
-        )
+        return self.saved(number, size, self._sizes)
 
     def macs(self, sizes: Sequence[int]) -> int:
         """Return the work with so many units of each group."""
@@ -215,22 +223,24 @@ class Work:
         """Return who keeps a whole width of layers -> share of the work in these layers, with so many units."""
         each = self._each(sizes)
         kept: Counter[str] = Counter()
-        for macs, keepers in zip(each, self._keepers, strict=True):
-            kept.update(dict.fromkeys(keepers, macs))
+        for macs, (_, _, keepers) in zip(each, self._terms, strict=True):
+            kept.update(dict.fromkeys(sorted(keepers), macs))
         return {keeper: macs / max(sum(each), 1) for keeper, macs in kept.most_common()}
 
+    def _add(self, graph: str, walk: Walk, leaves: Sequence[int], keepers: frozenset[str], macs: int) -> None:
+        loses = [self._numbers[graph, leaf] for leaf in leaves if (graph, leaf) in self._numbers]
+        fixed = macs * math.prod(walk.factors.sizes[leaf] for leaf in leaves if (graph, leaf) not in self._numbers)
+        for number in set(loses):
+            self._of[number].append(len(self._terms))
+        self._terms.append((fixed, loses, keepers))
+
     def _each(self, sizes: Sequence[int]) -> list[int]:
-        return [fixed * math.prod(sizes[number] for number in loses) for fixed, loses in self._terms]
+        return [fixed * math.prod(sizes[number] for number in loses) for fixed, loses, _ in self._terms]
 
 
 def _is_slowest(walk: Walk, members: Sequence[Member]) -> bool:
     """Leave out what lies within another unit, such as the elements of a head."""
-    for member in members:
-        axis = walk.weights[member.weight][member.axis]
-        slower = walk.factors.leaves(axis)[: member.place]
-        if any(not walk.factors.is_frozen(other) for other in slower):
-            return False
-    return True
+    return all(walk.factors.is_frozen(slower) for member in members for slower in member.atom.slower)
 
 
 def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
@@ -238,7 +248,7 @@ def _magnitude(group: Group, weights: Mapping[str, Any]) -> NDArray[Any]:
     product = np.ones(group.size)
     for reads in (False, True):
         squares = [
-            _by_unit(weights[member.weight].detach() ** 2, member).numpy()
+            _by_unit(weights[member.weight].detach().abs() ** 2, member)
             for member in group.members
             if member.reads == reads and member.weight in weights and weights[member.weight].dim() > 1
         ]
@@ -251,12 +261,11 @@ def _readers(group: Group) -> list[Member]:
     return [member for member in group.members if member.reads] or group.members
 
 
-def _by_unit(values: Tensor, member: Member) -> Tensor:
+def _by_unit(values: Tensor, member: Member) -> NDArray[Any]:
     """Return sums of a weight's values for each unit of a member: (units,)."""
-    shape = values.shape
-    parts = values.reshape(*shape[: member.axis], *member.sizes, *shape[member.axis + 1 :])
-    unit = member.axis + member.place
-    return parts.double().sum(dim=[axis for axis in range(parts.dim()) if axis != unit])
+    each = values.double().movedim(member.axis, 0).reshape(len(member.numbers), -1).sum(1)
+    within = member.numbers >= 0
+    return np.bincount(member.numbers[within], each.numpy()[within])
 
 
 def _actions(modules: Mapping[str, nn.Module], source: Bundle, samples: int) -> Iterator[Any]:

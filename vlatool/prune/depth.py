@@ -11,7 +11,7 @@ from pydantic import Field, field_validator
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError
 from vlatool.module.blocks import stacks_of
-from vlatool.module.edits import BLOCKS, Edit
+from vlatool.module.edits import BLOCKS, Edit, refuse_traced
 from vlatool.module.feeds import unrecorded
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._ranking import Place, Ranking, Stack
@@ -136,6 +136,7 @@ class Depth(ModuleStage):
     def _chosen(self, sizes: Mapping[Stack, int], source: Bundle) -> dict[Stack, int]:
         names = [name for _, name in sizes]
         if not sizes:
+            refuse_traced(source, "lists of blocks", "vlatool prune depth")
             raise RecipeError(
                 f"{source.manifest.name} has no stack of blocks: an nn.ModuleList or nn.Sequential of modules of one "
                 "class, each of which gives what it takes.",

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, require
-from vlatool.module.edits import Edit
+from vlatool.module.edits import Edit, refuse_traced
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.prune._selection import Selection
 from vlatool.stage.base import Context
@@ -45,6 +45,8 @@ class Neurons(ModuleStage):
             RecipeError: when no hidden layer can be pruned, or a pattern matches none.
         """
         layers = [(graph, *layer) for graph, module in modules.items() for layer in hidden_layers(module)]
+        if not layers:
+            refuse_traced(source, "hidden layers of an nn.Sequential", "vlatool prune neurons")
         names = [first for _, first, *_ in layers]
         selection = Selection(self.include, self.exclude)
         selection.check(names, "hidden layer")

@@ -93,7 +93,7 @@ class Structured(ModuleStage):
             prices = []
             for number, group in enumerate(groups):
                 cost, loses = group.cheapest(self.least)
-                saved = left - work.macs([*sizes[:number], sizes[number] - len(loses), *sizes[number + 1 :]])
+                saved = work.saved(number, sizes[number] - len(loses), sizes)
                 prices += [(cost / saved, number, loses)] if saved > 0 else []
             if not prices:
                 return
