@@ -17,6 +17,7 @@ from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, OutputError, SourceError, VlatoolError
 from vlatool.evaluate._names import names_of
 from vlatool.files.printable import message_of
+from vlatool.files.scratch import scratch
 from vlatool.render.filmstrip import Shot, filmstrip
 from vlatool.render.video import write_video
 from vlatool.stage.base import Context
@@ -125,8 +126,8 @@ def _filmed(
 ) -> tuple[list[Outcome], str]:
     """Play the episode, film it and write the video; return its outcomes, and what is to be seen."""
     context.tell("filming an episode", None)
-    with tempfile.TemporaryDirectory(prefix="vlatool-video-") as scratch:
-        folders = [Path(scratch) / str(place) for place in range(len(plays))]
+    with scratch() as temporary:
+        folders = [temporary / str(place) for place in range(len(plays))]
         found = [play([replace(again, film=str(folder))])[0] for play, folder in zip(plays, folders, strict=True)]
         names = names_of(bundles)
         shots = [_shot(name, outcome, Film.open(folder))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,6 +26,7 @@ from vlatool.explain._origin import (
     sensitivity_stage,
 )
 from vlatool.explain._remedy import measure, plans
+from vlatool.files.scratch import scratch
 from vlatool.graph.workload import workload
 from vlatool.machine.host import before_run
 from vlatool.measurement.reach import reached_in
@@ -98,12 +98,12 @@ def explain(bundle: Bundle, options: Options, context: Context) -> Report:
     host = before_run()
     contended = tuple(busy(host))
     findings = _find(bundle, options, context)
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
+    with scratch() as folder:
         engine = bundle.manifest.engine or DEFAULT_ENGINE
         suggests = options.suggest and findings.baseline is not None and findings.seen.recorded
         tried = plans(findings.made.stage, findings.layers, findings.fallen, engine) if suggests else []
         values = findings.seen.values
-        contest = measure(bundle, findings.baseline, tried, values, Path(scratch), options.threads, context)
+        contest = measure(bundle, findings.baseline, tried, values, folder, options.threads, context)
         sentences = _sentences(findings, contest.speed)
         sentences[1:1] = tables.suggestion(contest, findings.source)
         sentences += tables.trial_sentences(contest, findings.layers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import VlatoolError
 from vlatool.explain._operators import raw_actions
+from vlatool.files.scratch import scratch
 from vlatool.graph.files import load, part_phases, save
 from vlatool.graph.phase import cut_phases, periodic
 from vlatool.runtime.engine import computing, engine_class
@@ -95,8 +95,8 @@ def _measured(bundle: Bundle, phase: Phases, observations: Sequence[Mapping[str,
     context.tell(f"measuring what bfloat16 does to the phases of {phase.graph}", None)
     manifest = bundle.manifest
     note = ""
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-        path = Path(scratch) / f"{phase.graph}.onnx"
+    with scratch() as folder:
+        path = folder / f"{phase.graph}.onnx"
         model = load(bundle.file(manifest.graphs[phase.graph].file))
         save(model, path)
         if cut_phases(model) is None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment, Observations
+from vlatool.files.scratch import scratch
 from vlatool.machine.host import onednn_max_cpu_isa
 from vlatool.runtime.engine import (
     BFLOAT16,
@@ -87,9 +86,9 @@ def profile(
     """
     engine = engine or bundle.manifest.engine or DEFAULT_ENGINE
     library: type[Engine] = engine_class(engine)
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
+    with scratch() as folder:
         sessions: dict[str, Profiled] = {
-            name: library.profiled(bundle.file(graph.file), threads, graph.compute, Path(scratch) / name)
+            name: library.profiled(bundle.file(graph.file), threads, graph.compute, folder / name)
             for name, graph in bundle.manifest.graphs.items()
         }
         policy = Policy(bundle, Program(bundle.manifest.program, sessions, seed=0), engine)

@@ -121,7 +121,7 @@ def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Itera
         OutputError: when ``final`` exists (and not ``force``), is not vlatool's, or the place is read-only or full.
     """
     final = Path(os.path.abspath(final))
-    with output_errors(final):
+    with output_errors(final, cache=damaged):
         if not damaged:
             refuse_replacing(final, force=force)
         final.parent.mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Itera
             lock = os.open(draft.place, os.O_RDONLY)
             fcntl.flock(lock, fcntl.LOCK_EX)
     try:
-        with output_errors(final):
+        with output_errors(final, cache=damaged):
             yield draft.content
             note(draft.content)
             _flush(draft.content)

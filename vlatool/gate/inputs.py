@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +12,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import EVALUATION, Drawer, Drawn, Recording, calibration_recording, read_recording, save_drawn
+from vlatool.files.scratch import scratch
 
 TIMING, AGREEMENT, MEMORY = range(3)
 """Purposes, each of which draws observations of its own."""
@@ -62,8 +62,8 @@ class Inputs:
     @contextlib.contextmanager
     def file(self, count: int, purpose: int, number: int = 0) -> Iterator[Path]:
         """Yield a file of observations for a process, and remove it in the end."""
-        with tempfile.TemporaryDirectory(prefix="vlatool-gate-") as folder:
-            path = Path(folder) / "observations.npz"
+        with scratch() as folder:
+            path = folder / "observations.npz"
             save_drawn(path, self.draw(count, purpose, number))
             yield path
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from pydantic import Field, model_validator
 
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import DataError, RecipeError
+from vlatool.files.scratch import scratch
 from vlatool.hardware.profile import Profile, load_profile, names, profile_file
 from vlatool.latency_model.board import Candidate
 from vlatool.latency_model.measured import calibrations
@@ -152,8 +152,8 @@ class LatencyPruning(ModuleStage):
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
-        with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-            clock = self._clock(source, Path(scratch), context)
+        with scratch() as folder:
+            clock = self._clock(source, folder, context)
             edits = self._met(groups, blocks, work, clock, context)
         board = {"board": load_profile(self.board).name} if self.board else {}
         return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
@@ -161,8 +161,8 @@ class LatencyPruning(ModuleStage):
     def _predict_whole(self, source: Bundle, context: Context) -> None:
         """Say at once, and not after the ranking, that there is nothing to do."""
         context.tell(f"predicting for {self.board}", None)
-        with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-            whole, _ = self._clock(source, Path(scratch), context).times([])
+        with scratch() as folder:
+            whole, _ = self._clock(source, folder, context).times([])
         self._refuse_met(whole)
 
     def _clock(self, source: Bundle, scratch: Path, context: Context) -> Clock:

@@ -6,7 +6,6 @@ import contextlib
 import fnmatch
 import io
 import logging
-import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -20,6 +19,7 @@ from vlatool.bundle.manifest import Graph
 from vlatool.bundle.unexported import no_graph
 from vlatool.data import calibration_recording, observations_for
 from vlatool.errors import BundleError, RecipeError, nearest
+from vlatool.files.scratch import scratch
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
 from vlatool.graph.nodes import FOLDED, matches
@@ -228,12 +228,12 @@ def quiet_quantizer() -> Iterator[Path]:
     logger.setLevel(logging.ERROR)
     try:
         with (
-            tempfile.TemporaryDirectory(prefix="vlatool-") as scratch,
+            scratch() as folder,
             contextlib.redirect_stdout(io.StringIO()),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
-            yield Path(scratch)
+            yield folder
     finally:
         logger.setLevel(level)
 

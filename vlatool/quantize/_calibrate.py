@@ -5,7 +5,6 @@ Nothing of a sample is kept: peak memory is one session, one sample's activation
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment
 from vlatool.errors import DataError, GraphError
+from vlatool.files.scratch import scratch
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._ranges import Statistics
 from vlatool.quantize._watched import SAMPLE, Watcher, run_watched
@@ -85,10 +85,10 @@ def calibrate(
         GraphError: when the program never runs a graph, whose ranges would be guesses.
     """
     statistics = {graph: {name: Statistics(channels) for name in names} for graph, names in values.items()}
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
+    with scratch() as folder:
         files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in statistics}
         watchers = {
-            graph: _Calibrating(graph, file, Path(scratch), statistics[graph], (spared or {}).get(graph, ()))
+            graph: _Calibrating(graph, file, folder, statistics[graph], (spared or {}).get(graph, ()))
             for graph, file in files.items()
         }
         run_watched(bundle, watchers, observations, context, "calibrating on", numbers)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment
+from vlatool.files.scratch import scratch
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._watched import Watcher, run_watched
 from vlatool.stage.base import Context
@@ -91,7 +91,7 @@ def find_beyond(
         DataError: when an observation does not fit the spec; names the sample.
     """
     files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in graphs}
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-        watchers = {graph: _Watching(file, Path(scratch) / f"{graph}.onnx", limit) for graph, file in files.items()}
+    with scratch() as folder:
+        watchers = {graph: _Watching(file, folder / f"{graph}.onnx", limit) for graph, file in files.items()}
         run_watched(bundle, watchers, observations, context, "looking for large values in")
     return {graph: watcher.beyond for graph, watcher in watchers.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment
+from vlatool.files.scratch import scratch
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.quantize._float16_graph import HALF, LARGEST, around
 from vlatool.quantize._watched import Watcher, run_watched
@@ -124,8 +124,8 @@ def find_small(
         DataError: when an observation does not fit the spec; names the sample.
     """
     files = {graph: bundle.file(bundle.manifest.graphs[graph].file) for graph in graphs}
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch:
-        watchers = {graph: _Watching(file, Path(scratch) / f"{graph}.onnx") for graph, file in files.items()}
+    with scratch() as folder:
+        watchers = {graph: _Watching(file, folder / f"{graph}.onnx") for graph, file in files.items()}
         run_watched(bundle, watchers, observations, context, "looking for small values in")
     return {graph: watcher.found for graph, watcher in watchers.items()}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, get_args
 
 from vlatool.bundle.bundle import LOCATION, MANIFEST, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.files.scratch import scratch
 from vlatool.files.writing import writing
 from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
@@ -164,10 +164,10 @@ def rebuild(
     entries = build_record(bundle)
     start = _start(bundle, entries, source, files, cache)
     same: list[tuple[str, bool]] = []
-    with tempfile.TemporaryDirectory(prefix="vlatool-rebuild-") as scratch:
+    with scratch() as temporary:
         product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
-            before, place = product, Path(scratch) / f"{number}-{entry['stage']}"
+            before, place = product, temporary / f"{number}-{entry['stage']}"
             product = (
                 _finalized(entry, before, place) if stage is None else run_transform(stage, before, place, context)
             )

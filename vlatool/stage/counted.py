@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlatool.errors import VlatoolError, require
+from vlatool.files.scratch import scratch
 from vlatool.graph.files import write_beside
 from vlatool.graph.flat import named_everywhere
 from vlatool.graph.onnx_graph import type_name
@@ -53,10 +53,10 @@ def _run(path: Path) -> dict[str, Seen]:
     onnx = require("onnx", "build")
     model = named_everywhere(onnx.load(str(path), load_external_data=False))
     stored = {tensor.name for tensor in model.graph.initializer}
-    with tempfile.TemporaryDirectory(prefix="vlatool-") as scratch, contextlib.suppress(VlatoolError):
-        copy = write_beside(model, path, Path(scratch) / path.name)
+    with scratch() as folder, contextlib.suppress(VlatoolError):
+        copy = write_beside(model, path, folder / path.name)
         with risky(engine_class(), f"ran {path.name} to see its shapes"):
-            session = traced(copy, Path(scratch) / "trace")
+            session = traced(copy, folder / "trace")
             try:
                 session.run(_drawn([value for value in model.graph.input if value.name not in stored]))
             except Exception:  # the seam: what ONNX Runtime refuses, and types that numpy lacks, is not counted
