@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from vlatool.bundle.bundle import LOCATION, MANIFEST, Bundle, hash_file
+from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.files.scratch import scratch
 from vlatool.files.writing import writing
@@ -29,6 +29,7 @@ from vlatool.user_code import trust
 Entry = dict[str, Any]
 RECORDED_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
 """How a record names a file that an option gives."""
+GRAPHS = "graphs/"
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,33 @@ class Rebuilt:
 
     @property
     def first_difference(self) -> Compared | None:
-        """The first file that differs, None when none does."""
-        return next((file for file in self.files if not file.identical), None)
+        """The file that differs and says most, None when none does: a graph, others, golden outputs, the manifest.
+
+        Golden outputs are computed by the graphs, and the manifest holds the hashes of all.
+        """
+        differing = (file for file in self.files if not file.identical)
+        return min(differing, key=lambda file: (file.file == MANIFEST, _is_golden(file.file),
+                                                not file.file.startswith(GRAPHS)), default=None)  # fmt: skip
+
+    @property
+    def differs_since(self) -> str:
+        """The first stage that gave other graphs than the record names; empty when none did."""
+        return next((name for name, same in self.stages if not same), "")
+
+    @property
+    def machine_may_differ(self) -> bool:
+        """Whether all that differs is of the machine that made the bundle: golden outputs, and the manifest."""
+        return all(file.identical or file.file == MANIFEST or _is_golden(file.file) for file in self.files)
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """What is in the bundle, and in no hash, so that nothing of it was compared."""
+        hashed = (MANIFEST, DIGEST, LEDGER)
+        return tuple(name for name in UNRECORDED if name not in hashed and (self.bundle.path / name).exists())
+
+
+def _is_golden(file: str) -> bool:
+    return file.startswith("golden/")
 
 
 @dataclass(frozen=True)
