@@ -122,7 +122,7 @@ class Workshop(Place):
         """The disk is full whenever that function is called."""
 
         def full(*_: object, **__: object) -> None:
-            raise OSError(28, "No space left on device", "checkpoint")
+            raise OSError(28, "No space left on device")
 
         self.patch.setattr(function, full)
         return self.line()

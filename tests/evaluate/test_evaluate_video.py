@@ -188,7 +188,7 @@ def test_a_video_that_fails_costs_the_video_alone(reach: dict[str, Bundle], tmp_
 
 def test_a_disk_that_fills_up_costs_the_video_alone(reach: dict[str, Bundle], tmp_path: Path,
                                                     monkeypatch: pytest.MonkeyPatch):  # fmt: skip
-    def full(*_: Any) -> str:
+    def full(*_: Any, **__: Any) -> str:
         raise OutputError("Cannot write a.gif: the disk is full.", "free some space")
 
     monkeypatch.setattr(_shown, "write_video", full)

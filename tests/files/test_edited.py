@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import fcntl
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
 from vlatool.errors import OutputError
-from vlatool.files.edited import unstamped, whole_file, write_own
+from vlatool.files.edited import DRAFT, unstamped, whole_file, write_own
 
 
 def test_the_draft_takes_the_place_of_the_file(tmp_path: Path) -> None:
@@ -64,6 +67,68 @@ def test_a_file_that_nobody_changed_is_replaced_and_no_other(tmp_path: Path) -> 
     with pytest.raises(OutputError, match="was changed since"):
         write_own(path, "a: 4\n", force=True)
     assert unstamped(path.read_text()) == "a: 3\n"
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from vlatool.files.edited import whole_file
+with whole_file(Path(sys.argv[1])) as draft:
+    draft.write_text("half")
+    print(draft, flush=True)
+    {}
+"""
+
+
+def begun(path: Path, then: str) -> tuple[subprocess.Popen[str], Path]:
+    """Let another process begin to write a file; return it and its draft."""
+    words = [sys.executable, "-c", KILLED.format(then), str(path)]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    return process, Path(process.stdout.readline().strip())
+
+
+@pytest.mark.parametrize("name", ["a.json", "a [1].gif", ".hidden"])
+def test_the_draft_of_a_killed_writer_is_removed_by_the_next(tmp_path: Path, name: str) -> None:
+    killed, draft = begun(tmp_path / name, "os.kill(os.getpid(), 9)")
+    killed.communicate()
+    assert draft.read_text() == "half"
+    with whole_file(tmp_path / "another") as other:
+        other.write_text("new")
+    assert draft.exists(), "it is of another file"
+    with whole_file(tmp_path / name) as other:
+        other.write_text("new")
+    assert not draft.exists()
+    assert (tmp_path / name).read_text() == "new"
+
+
+def test_the_draft_of_a_living_writer_stays(tmp_path: Path) -> None:
+    process, draft = begun(tmp_path / "a.json", "sys.stdin.readline()")
+    with whole_file(tmp_path / "a.json") as other:
+        other.write_text("new")
+    assert draft.exists()
+    process.communicate("go on")
+    assert (tmp_path / "a.json").read_text() == "half", "both were written whole, the last one stays"
+
+
+@pytest.mark.parametrize(
+    "name", [".a.json.12.part", ".a.json.vlatool-4194305.part", "a.json.vlatool-4194305-01234567.part"]
+)
+def test_what_is_only_called_like_a_draft_stays(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with whole_file(tmp_path / "a.json") as draft:
+        draft.write_text("new")
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_a_draft_that_another_machine_writes_stays(tmp_path: Path) -> None:
+    draft = tmp_path / DRAFT.format("a.json", 2**22 + 1, "0" * 8)
+    draft.write_text("half")
+    with draft.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with whole_file(tmp_path / "a.json") as other:
+            other.write_text("new")
+        assert draft.exists(), "its process is not of this machine, and its lock is held"
 
 
 @pytest.mark.parametrize("content", [b"", b"\n", b"mine", b"written by vlatool; SHA-256 of the lines above: ", b"\xff"])

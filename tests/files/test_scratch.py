@@ -1,17 +1,22 @@
-"""No message names a place that a person never sees: a draft beside the output or in the cache, or a scratch folder."""
+"""Places that a person never sees: no message names them, they are gone in the end, and are blamed when full."""
+
+from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from vlatool.data.npz import NpzReader
 from vlatool.errors import BundleError, GraphError, OutputError, VlatoolError
-from vlatool.files import scratch
+from vlatool.files import scratch as scratch_module
 from vlatool.files.scratch import scratch_directory
 from vlatool.files.writing import writing
 from vlatool.measurement.child import ended
@@ -105,7 +110,7 @@ def test_a_full_disk_of_the_cache_says_where_the_cache_could_be(tmp_path: Path, 
         raise OSError(number, os.strerror(number), str(draft / "a"))
     assert "VLATOOL_CACHE=DIR" in caught.value.fix
     assert "vlatool cache prune" in caught.value.fix
-    assert "an entry of the cache" in caught.value.message
+    assert "to the cache" in caught.value.message
     assert ".tmp-" not in caught.value.message
 
 
@@ -137,8 +142,95 @@ def test_an_error_about_a_scratch_folder_names_the_file_alone(kind: Callable[[Pa
     assert not place.exists()
 
 
-def test_a_full_disk_of_scratch_folders_says_where_they_could_be(monkeypatch):
-    monkeypatch.setattr(scratch.os, "statvfs", lambda _path: os.statvfs_result((4096, 4096, 9, 0, 0, 9, 9, 9, 0, 255)))
-    with pytest.raises(OutputError, match="temporary files") as caught, scratch_directory():
+KILLED = """
+import os
+from vlatool.files.scratch import scratch_directory
+with scratch_directory() as folder:
+    (folder / "weights").write_bytes(b"large")
+    print(folder, flush=True)
+    os.kill(os.getpid(), 9)
+"""
+GONE = 2**22 + 1
+"""No process has this number."""
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files."""
+    place = tmp_path / "temporary"
+    place.mkdir()
+    monkeypatch.setenv("TMPDIR", str(place))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    return place
+
+
+@pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt])
+def test_it_is_removed_with_what_is_in_it(temporary: Path, error: type[BaseException] | None) -> None:
+    def used() -> None:
+        with scratch_directory() as folder:
+            assert folder.parent == temporary
+            (folder / "deep/down").mkdir(parents=True)
+            (folder / "deep/file").write_text("some")
+            if error is not None:
+                raise error
+
+    if error is None:
+        used()
+    else:
+        with pytest.raises(error):
+            used()
+    assert list(temporary.iterdir()) == []
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(temporary: Path) -> None:
+    told = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True, check=False)
+    left = Path(told.stdout.strip())
+    assert (left / "weights").exists()
+    with scratch_directory() as folder:
+        assert list(temporary.iterdir()) == [folder]
+
+
+@pytest.mark.parametrize("name", [f"vlatool-{os.getpid()}-12345678", "vlatool-12345678", "vlatool-x-12345678",
+                                  f"vlatool-{GONE}-1234567", f"vlatool-{GONE}-12345678.bak"])  # fmt: skip
+def test_what_is_in_use_or_somebody_elses_stays(temporary: Path, name: str) -> None:
+    (temporary / name).mkdir()
+    with scratch_directory():
+        assert (temporary / name).is_dir()
+
+
+def test_a_link_is_not_followed_and_a_held_lock_counts(temporary: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/file").write_text("mine")
+    (temporary / f"vlatool-{GONE}-12345678").symlink_to(tmp_path / "mine")
+    (temporary / f"vlatool-{GONE}-87654321").mkdir()
+    handle = os.open(temporary / f"vlatool-{GONE}-87654321", os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    with scratch_directory():
+        pass
+    os.close(handle)
+    assert (tmp_path / "mine/file").read_text() == "mine"
+    assert (temporary / f"vlatool-{GONE}-87654321").is_dir(), "a process of another container has it"
+
+
+def test_a_full_temporary_folder_is_blamed_and_not_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scratch_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=4096))
+    says = f"Cannot write temporary files to {tmp_path}/temporary: the disk is full"
+    with pytest.raises(OutputError, match=says) as caught, writing(tmp_path / "out"), scratch_directory():
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    assert "TMPDIR=DIR" in caught.value.fix
+    assert "TMPDIR" in caught.value.fix
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_disk_that_is_full_elsewhere_is_not_the_temporary_folders(tmp_path: Path, named: bool) -> None:
+    where = (str(tmp_path / "out/file"),) if named else ()
+    with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: the disk is full"), \
+            writing(tmp_path / "out"), scratch_directory():  # fmt: skip
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), *where)
+
+
+def test_a_directory_that_is_written_among_temporary_files_is_one_of_them() -> None:
+    with scratch_directory() as folder, pytest.raises(OutputError, match="Cannot write temporary files: ") as caught, \
+            writing(folder / "0-export.onnx"):  # fmt: skip
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert "TMPDIR" in caught.value.fix

@@ -354,6 +354,37 @@ def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path, number, message)
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.parametrize(("number", "message"), [
+    (errno.ENOSPC, "the disk is full"), (errno.EROFS, "the file system is read-only"),
+    (errno.ENOTDIR, "a part of the path is a file"), (errno.ENOENT, "nothing can be made there"),
+])  # fmt: skip
+def test_where_the_cache_cannot_be_written_another_cache_helps_and_no_other_output(
+    tmp_path: Path, monkeypatch, number, message
+):
+    def refuse(path: Path, *_args, **_options):
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with (
+        pytest.raises(OutputError, match=f"Cannot write to the cache: .*{message}") as caught,
+        writing(tmp_path / "stages/x", damaged=True),
+    ):
+        pytest.fail("the block must not run")
+    assert "VLATOOL_CACHE" in caught.value.fix
+
+
+def test_a_file_elsewhere_that_a_disk_has_no_room_for_is_named(tmp_path: Path):
+    with pytest.raises(OSError, match="elsewhere/file"), writing(tmp_path / "out"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "elsewhere/file"))
+
+
+def test_a_copy_that_has_no_room_is_the_fault_of_where_it_goes(tmp_path: Path):
+    """The operating system names the source of a copy first."""
+    with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: the disk is full"), \
+            writing(tmp_path / "out") as draft:  # fmt: skip
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "source"), None, str(draft / "file"))
+
+
 def test_a_disk_that_is_full_from_the_first_byte_leaves_nothing(tmp_path: Path, monkeypatch):
     def full(path: Path, *_args: object, **_options: object) -> None:
         path.touch()
@@ -367,7 +398,11 @@ def test_a_disk_that_is_full_from_the_first_byte_leaves_nothing(tmp_path: Path, 
 
 @pytest.mark.parametrize(
     ("number", "message"),
-    [(errno.EROFS, "the file system is read-only"), (errno.EACCES, "permission denied")],
+    [
+        (errno.EROFS, "the file system is read-only"),
+        (errno.EACCES, "permission denied"),
+        (errno.ENOENT, "nothing can be made there"),
+    ],
 )
 def test_a_place_that_may_not_be_written_to(tmp_path: Path, monkeypatch, number, message):
     def refuse(path: Path, *_args, **_options):

@@ -203,6 +203,28 @@ def test_a_video_appears_whole_or_not_at_all(tmp_path: Path, name: str):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_that_came_meanwhile_is_not_replaced(tmp_path: Path):
+    def slowly() -> Iterator[Picture]:
+        (tmp_path / "a.gif").write_bytes(b"mine")
+        yield from moving(3)
+
+    for force in (False, True):
+        with pytest.raises(OutputError, match="exists already" if not force else "was not written by vlatool"):
+            write_video(Video(slowly, 3, 20.0), tmp_path / "a.gif", force=force)
+    assert (tmp_path / "a.gif").read_bytes() == b"mine"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_of_two_writers_of_one_video_the_second_is_told(tmp_path: Path):
+    def slowly() -> Iterator[Picture]:
+        write_video(Video(lambda: moving(2), 2, 20.0), tmp_path / "a.gif", force=True)
+        yield from moving(3)
+
+    with pytest.raises(OutputError, match="exists already"):
+        write_video(Video(slowly, 3, 20.0), tmp_path / "a.gif")
+    write_video(Video(slowly, 3, 20.0), tmp_path / "a.gif", force=True)
+
+
 def test_formats_are_found_by_their_files():
     assert isinstance(video.format_of(Path("A.GIF")), gif.Gif)
     assert isinstance(video.format_of(Path("b.mp4")), mp4.Mp4)

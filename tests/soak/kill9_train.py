@@ -5,7 +5,8 @@ reference), then starts the same command from nothing and kills its whole proces
 the duration of the reference, each time going on from what the last kill left. A round ends when the command runs to
 its end; rounds follow each other until there were so many kills. After each kill the output is absent or whole; at the
 end of each round the bundle is the reference's byte for byte (``reports/`` apart, which hold times), and no unfinished
-work is left. Options after ``--`` are added to the command, as ``-- --processes 2``.
+work is left. ``--command qat`` and ``--command gradual`` kill ``quantize qat`` and ``prune gradual`` in the same way.
+Options after ``--`` are added to the command, as ``-- --processes 2``.
 
 Prints counts; the exit status is 1 when anything was violated.
 """
@@ -13,32 +14,26 @@ Prints counts; the exit status is 1 when anything was violated.
 from __future__ import annotations
 
 import argparse
-import os
 import random
-import signal
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
-from kill9 import Work, differences, drafts, make_policy
-
-from vlatool.bundle.bundle import Bundle
-from vlatool.errors import BundleError
+from kill9 import Work, make_policy
 
 SHORT = ["--steps", "200", "--batch", "8", "--every", "40", "--episodes", "6", "--student-episodes", "2"]
+COMMANDS = {"distill": ["distill", "policy"], "qat": ["quantize", "qat"], "gradual": ["prune", "gradual"]}
 LATEST = 0.98
 """Share of the reference's duration up to which is killed."""
 
 
-def training(folder: Path, options: list[str]) -> Work:
-    """Prepare a policy and its pruned bundle; return the command that distils that."""
+def training(folder: Path, options: list[str], command: str = "distill") -> Work:
+    """Prepare a policy and its pruned bundle; return the command that trains that."""
     policy = make_policy(folder / "tiny")
     prune = Work(["prune", "neurons", str(policy), "--ratio", "0.7"], folder / "prune")
     prune.make_reference()
-    words = ["distill", "policy", str(prune.reference), "--trust", str(policy), *SHORT, *options]
+    words = [*COMMANDS[command], str(prune.reference), "--trust", str(policy), *SHORT, *options]
     return Work(words, folder / "train")
 
 
@@ -51,46 +46,12 @@ def rounds(work: Work, kills: int, seed: int, tell: Callable[[str], None] = prin
         work.clear()
         while work.counts["killed"] < kills and not work.out.exists():
             moment = moments.uniform(0, seconds * LATEST)
-            found = kill(work, moment)
+            found = work.kill(moment)
             tell(f"kill {work.counts['killed']} at {moment:.2f} s: {found or checkpoint(work)}")
             violations += found
         violations += end(work)
         work.counts["rounds"] += 1
     return violations
-
-
-def kill(work: Work, moment: float) -> list[str]:
-    """Start or go on, kill after ``moment`` seconds, and look."""
-    process = work.start()
-    try:
-        process.wait(timeout=moment)
-        work.counts["ended before the kill"] += 1
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        work.counts["killed"] += 1
-    wait_for_children(work)
-    if not work.out.exists():
-        return []
-    try:
-        Bundle.open(work.out)
-    except BundleError as error:
-        return [f"half a bundle after the kill: {error}"]
-    return differences(work.reference, work.out)
-
-
-def wait_for_children(work: Work, most_s: float = 20.0) -> None:
-    """Wait until no process is left that names the folder of the work: children die with their parents, not at once."""
-    end_at = time.monotonic() + most_s
-    while time.monotonic() < end_at and any(_names(entry, work.cache) for entry in Path("/proc").glob("[0-9]*")):
-        time.sleep(0.05)
-
-
-def _names(entry: Path, folder: Path) -> bool:
-    try:
-        return f"VLATOOL_CACHE={folder}".encode() in (entry / "environ").read_bytes().split(b"\0")
-    except OSError:
-        return False
 
 
 def checkpoint(work: Work) -> str:
@@ -104,8 +65,7 @@ def end(work: Work) -> list[str]:
     """Run to the end, and hold the bundle against the reference."""
     if not work.out.exists() and (wrong := work.run()):
         return [f"the run after the kills: {wrong}"]
-    left = [f"left over: {path}" for path in (*drafts(work.folder), *work.cache.glob("streams/*/round-*"))]
-    return differences(work.reference, work.out) + left
+    return work.look_at_the_end() + [f"left over: {path}" for path in work.cache.glob("streams/*/round-*")]
 
 
 def main() -> int:
@@ -113,10 +73,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("options", nargs="*", help="of vlatool distill policy, behind --")
+    parser.add_argument("--command", choices=COMMANDS, default="distill")
+    parser.add_argument("options", nargs="*", help="of the command, behind --")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="vlatool-kill9-") as scratch:
-        work = training(Path(scratch), given.options)
+        work = training(Path(scratch), given.options, given.command)
         violations = rounds(work, given.kills, given.seed, lambda line: print(line, flush=True))
     for violation in violations:
         print(f"VIOLATED {violation}")

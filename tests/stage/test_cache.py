@@ -215,6 +215,25 @@ def test_drafts_of_killed_writers_are_removed_and_those_of_living_ones_stay(kept
     assert contents(cache).unknown == ()
 
 
+def test_drafts_of_counts_are_vlatools_and_go_when_their_writers_are_gone(kept: Bundle, cache: Path, tmp_path: Path):
+    names = [f".{'a' * 32}.json.vlatool-{process}-01234567.part" for process in (2**22 + 1, os.getpid())]
+    mine = f".notes.vlatool-{2**22 + 1}-01234567.part"
+    for name in (*names, mine):
+        (cache / "workloads" / name).write_text("half")
+    assert contents(cache).unknown == (f"workloads/{mine}",)
+    prune(cache, older_than_s=1000 * DAY)
+    assert [(cache / "workloads" / name).exists() for name in (*names, mine)] == [False, True, True]
+
+
+def test_nothing_is_removed_behind_a_link(kept: Bundle, cache: Path, tmp_path: Path):
+    (cache / "workloads").rename(tmp_path / "elsewhere")
+    (cache / "workloads").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / f".{'a' * 32}.json.vlatool-{2**22 + 1}-01234567.part").write_text("half")
+    before = sorted((tmp_path / "elsewhere").iterdir())
+    prune(cache, older_than_s=0)
+    assert sorted((tmp_path / "elsewhere").iterdir()) == before
+
+
 def test_what_another_process_removes_meanwhile_is_no_entry(kept: Bundle, cache: Path, monkeypatch: pytest.MonkeyPatch):
     (cache / FILES).mkdir()
     gone = {folder: cache / folder / name for folder, name in (
@@ -238,8 +257,10 @@ def test_a_file_that_only_looks_like_a_shared_one_stays(kept: Bundle, cache: Pat
 
 
 @pytest.mark.parametrize(
-    "name", ["trials.db", "trials.db-journal", "expert/round-000/action.npy", "held-out/expert/draft-000/image.npy"]
-)
+    "name", ["trials.db", "trials.db-journal", "expert/round-000/action.npy", "held-out/expert/draft-000/image.npy",
+             *(f".{name}.vlatool-{2**22 + 1}-01234567.part" for name in (
+                 "round-000.json", "checkpoint.safetensors", f"answer-{'a' * 32}.json"))]
+)  # fmt: skip
 def test_trials_and_what_an_expert_did_are_unfinished_work(cache: Path, name: str):
     place = cache / "streams" / "optimize.trials-0123456789abcdef"
     with work_directory(place):

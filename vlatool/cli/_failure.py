@@ -12,7 +12,7 @@ import typer
 
 from vlatool import registry
 from vlatool.errors import VlatoolError
-from vlatool.files.printable import message_of
+from vlatool.files.printable import file_of, message_of
 
 OK = 0
 INPUT = 3
@@ -75,7 +75,7 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
     if isinstance(error, BrokenPipeError):
         return Failure("OSError", "the reader of the output is gone.", "", OK)
     if isinstance(error, OSError):
-        where = error.filename or ("standard output" if _printing(error) else "a file")
+        where = file_of(error) or ("standard output" if _printing(error) else "a file")
         return Failure(
             "OSError", f"{where}: {error.strerror or error}.", OF_SYSTEM.get(error.errno or 0, READABLE), INPUT
         )

@@ -257,7 +257,7 @@ def measure(
 
         board = load_profile(profile)
     with progress(*crew(workers)) as context:
-        context = replace(context, video=str(video.absolute()) if video else "")
+        context = replace(context, video=str(video.absolute()) if video else "", force=force)
         bundle = opened(source, context)
         stage.check(bundle, board)
         if target is not None:

@@ -18,6 +18,9 @@ from vlatool.files.outputs import BUNDLE
 if TYPE_CHECKING:
     from vlatool.rebuild.rebuild import Rebuilt
 
+RECORDED = "the versions are the recorded ones"
+CHANGED = "the bundle was changed after it was made"
+OTHERS = "check on the kind of processor that made the bundle, since others round otherwise"
 Versions = dict[str, tuple[str, str]]
 
 
@@ -79,10 +82,10 @@ def _text(rebuilt: Rebuilt, versions: Versions, output: Path | None) -> str:
         f"stages    {' -> '.join(name for name, _ in rebuilt.stages)}",
         f"versions  {'not as recorded' if versions else 'as recorded'}",
     ]
-    if rebuilt.left_out:
-        lines.append(
-            f"left out  {', '.join(rebuilt.left_out)} in manifest.json: measured, so not the same twice; reports/"
-        )
+    measured = [f"{', '.join(rebuilt.left_out)} in manifest.json: measured, so not the same twice"]
+    beside = [f"{', '.join(rebuilt.beside)}: in no hash"]
+    if left_out := [*(measured if rebuilt.left_out else []), *(beside if rebuilt.beside else [])]:
+        lines.append(f"left out  {'; '.join(left_out)}")
     width = max(len(item.file) for item in rebuilt.files)
     lines += ["", f"{'file':<{width}}  {'bytes':>12}  identical"]
     lines += [f"{item.file:<{width}}  {item.bytes:>12}  {'yes' if item.identical else 'NO'}" for item in rebuilt.files]
@@ -125,12 +128,13 @@ def _fail(rebuilt: Rebuilt, versions: Versions) -> None:
     first = rebuilt.first_difference
     if first is None:
         return
-    stage = next((name for name, same in rebuilt.stages if not same), None)
-    since = f" The graphs differ since {stage}." if stage else ""
+    since = f" The graphs differ since {rebuilt.differs_since}." if rebuilt.differs_since else ""
     if versions:
         cause = f"the likely cause are the versions ({_shifts(versions)}); install the recorded ones"
-    elif first.file.startswith("golden/"):
-        cause = "golden outputs are what the graphs gave on the machine that made the bundle; check on that processor"
+    elif since:
+        cause = f"{RECORDED}: {OTHERS}; on the same kind, look for random numbers or the time in the policy's code"
+    elif rebuilt.machine_may_differ:
+        cause = f"{RECORDED}, and so are the graphs; golden outputs and tolerances are of one machine: there, {CHANGED}"
     else:
-        cause = "the versions are the recorded ones: look for random numbers or the time in the policy's code"
+        cause = f"{RECORDED}, and every stage gave the recorded graphs: {CHANGED}"
     raise GateFailed(f"{first.file} differs: {first.why}.{since}", cause)

@@ -126,7 +126,7 @@ def _filmed(
 ) -> tuple[list[Outcome], str]:
     """Play the episode, film it and write the video; return its outcomes, and what is to be seen."""
     context.tell("filming an episode", None)
-    with scratch_directory("vlatool-video-") as scratch:
+    with scratch_directory() as scratch:
         folders = [scratch / str(place) for place in range(len(plays))]
         found = [play([replace(again, film=str(folder))])[0] for play, folder in zip(plays, folders, strict=True)]
         names = names_of(bundles)
@@ -135,7 +135,7 @@ def _filmed(
         episode = f"task '{again.task}', seed {again.seeds[0]}"
         asked = f": {found[-1].instruction}" if found[-1].instruction else ""
         video = filmstrip(shots, f"{episode}{asked}", bundles[-1].manifest.spec.control_hz)
-        lacks = write_video(video, Path(context.video))
+        lacks = write_video(video, Path(context.video), force=context.force)
     return found, "; ".join([episode, *_reservations(shots, before), *([lacks] if lacks else [])])
 
 

@@ -3,23 +3,35 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
+import glob
 import hashlib
 import os
+import re
+import stat
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 from vlatool.errors import OutputError
+from vlatool.files.locks import alone
 from vlatool.files.written import note_file
+
+DRAFT = ".{}.vlatool-{}-{}.part"
+"""What a draft is called: the file's name, the number of the process that writes it, and which of its drafts it is."""
+DRAFT_NAME = re.compile(r"\.(?P<final>.+)\.vlatool-(?P<process>\d+)-[0-9a-f]{8}\.part")
 
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """Give a draft beside ``path``: it takes the place of ``path`` when the block ends, and is removed when it fails.
 
-    A symbolic link stays one: the file that it leads to is written.
+    A symbolic link stays one: the file that it leads to is written. The draft is locked, so that one that a killed
+    process left is known as such: the next writer of the same file removes it.
 
     Raises:
-        OSError: when the draft cannot be moved.
+        OSError: when the draft cannot be made or moved, or nothing was written to it.
 
     Example:
         >>> import tempfile
@@ -30,14 +42,32 @@ def whole_file(path: Path) -> Iterator[Path]:
         'all of it'
     """
     target = path.resolve()
-    draft = target.with_name(f".{target.name}.{os.getpid()}.part")
+    sweep_drafts(target)
+    draft = target.with_name(DRAFT.format(target.name, os.getpid(), uuid.uuid4().hex[:8]))
+    lock = os.open(draft, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
         yield draft
+        if not draft.stat().st_size:
+            raise FileNotFoundError(errno.ENOENT, "nothing was written", str(draft))
         draft.replace(target)
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to tell
             draft.unlink(missing_ok=True)
         raise
+    finally:
+        os.close(lock)
+
+
+def sweep_drafts(path: Path) -> None:
+    """Remove drafts of a file whose process is gone, and whose lock is free."""
+    for draft in path.parent.glob(f".{glob.escape(path.name)}.vlatool-*.part"):
+        found = DRAFT_NAME.fullmatch(draft.name)
+        if found is None or Path(f"/proc/{found['process']}").exists():
+            continue
+        with alone(draft) as free, contextlib.suppress(OSError):
+            if free and stat.S_ISREG(draft.lstat().st_mode):
+                draft.unlink()
 
 
 STAMP = "written by vlatool; SHA-256 of the lines above: "

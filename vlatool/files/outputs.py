@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from vlatool.errors import OutputError
+from vlatool.files.printable import file_of
 from vlatool.files.written import LEDGER, refuse_foreign
 
 RECIPE = "recipe.yaml"
@@ -17,8 +20,26 @@ WRITTEN = (LEDGER, "manifest.json", "report.json")
 BUNDLE, REPORT = "a bundle", "a report"
 KINDS = {BUNDLE: ("manifest.json", "manifest.sha256"), REPORT: ("report.json",)}
 """What a directory that vlatool wrote is -> the files that all of its kind hold; the first that fits it is."""
-ELSEWHERE = "keep the cache elsewhere: VLATOOL_CACHE=DIR"
-PRUNE = "free some space there (vlatool cache prune)"
+SCRATCH = re.compile(r"vlatool-(?P<process>\d+)-\w{8}")
+"""What a folder for temporary files is called."""
+FULL = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file would be larger than the limit on file sizes",
+}
+REFUSED = {
+    errno.EROFS: ("the file system is read-only", "write elsewhere"),
+    errno.EACCES: ("permission denied", "write elsewhere, or change the permissions of the directory"),
+    errno.ENAMETOOLONG: ("the name is too long", "choose a shorter one"),
+    errno.EEXIST: ("a part of the path is a file", "choose another output"),
+    errno.ENOTDIR: ("a part of the path is a file", "choose another output"),
+    errno.EBUSY: ("it is in use as a file system", "choose another output"),
+    errno.ENOENT: ("nothing can be made there, or it was removed meanwhile", "choose another output"),
+}
+"""What the operating system says of a place -> why nothing is written there, and what to do about an output."""
+FREE, LARGER = "free some space, or write elsewhere", "raise the limit (ulimit -f)"
+OTHER_CACHE = "keep the cache elsewhere: VLATOOL_CACHE=DIR"
+OTHER_SCRATCH = "free some space, or name another directory: TMPDIR=DIR"
 EXISTS = "choose another output, or pass --force to replace it"
 
 
@@ -102,38 +123,43 @@ def refuse_inputs(final: Path, inputs: Iterable[str | os.PathLike[str] | None]) 
 
 @contextlib.contextmanager
 def output_errors(final: Path, *, cache: bool = False) -> Iterator[None]:
-    """Map the operating system's refusals to write into one sentence for the person.
+    """Map the operating system's refusals to write into one sentence for the person, which names the place.
 
     Args:
         final: What is written.
-        cache: Whether it is an entry of the cache, whose place nobody has named on the command line.
+        cache: Whether it lies in vlatool's cache, so that another output would not help.
+
+    Raises:
+        OutputError: for a full disk, unless the error names a file elsewhere, and for what is wrong with this place.
     """
     try:
         yield
     except OSError as error:
-        reason = {
-            errno.ENOSPC: ("the disk is full", "free some space, or write elsewhere"),
-            errno.EDQUOT: ("the disk quota is used up", "free some space, or write elsewhere"),
-            errno.EROFS: ("the file system is read-only", "write elsewhere"),
-            errno.EACCES: ("permission denied", "write elsewhere, or change the permissions of the directory"),
-            errno.EFBIG: ("a file would be larger than the limit on file sizes", "raise the limit (ulimit -f)"),
-            errno.ENAMETOOLONG: ("the name is too long", "choose a shorter one"),
-            errno.EEXIST: ("a part of the path is a file", "choose another output"),
-            errno.ENOTDIR: ("a part of the path is a file", "choose another output"),
-            errno.EBUSY: ("it is in use as a file system", "choose another output"),
-        }.get(error.errno or 0)
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        named = Path(str(error.filename or "-"))
+        number = error.errno or 0
+        reason, remedy = (FULL[number], FREE) if number in FULL else REFUSED.get(number, ("", ""))
+        named = Path(os.path.abspath(file_of(error) or "-"))
         drafts = any(part.startswith(f".{final.name}.") for part in named.parts)
         ours = drafts or named.is_relative_to(final) or final.is_relative_to(named)
-        if reason is None or not (full or ours):
+        lost = number == errno.ENOENT and not final.is_relative_to(named) and _draft_of(named, final).exists()
+        if not reason or lost or not (ours or (number in FULL and not file_of(error))):
             raise
-        what, fix = ("an entry of the cache, ", _of_cache(error)) if cache else ("", "")
-        raise OutputError(f"Cannot write {what}{final}: {reason[0]}.", fix or reason[1]) from error
+        what = ""
+        if in_scratch(final):
+            what, remedy = "temporary files: ", OTHER_SCRATCH
+        elif cache:
+            free = "free some space there (vlatool cache prune), or "
+            what, remedy = "to the cache: ", f"{free if number in FULL else ''}{OTHER_CACHE}"
+        remedy = LARGER if number == errno.EFBIG else remedy
+        raise OutputError(f"Cannot write {what}{final}: {reason}.", remedy) from error
 
 
-def _of_cache(error: OSError) -> str:
-    """Return what helps where the cache cannot be written; nothing where it is the same as elsewhere."""
-    if error.errno == errno.EFBIG:
-        return ""
-    return f"{PRUNE}, or {ELSEWHERE}" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ELSEWHERE
+def _draft_of(named: Path, final: Path) -> Path:
+    """Return the draft of an output in which a path lies; the path itself where it lies in none."""
+    drafts = (place for place in (named, *named.parents) if place.name.startswith(f".{final.name}."))
+    return next(drafts, named)
+
+
+def in_scratch(path: Path) -> bool:
+    """Say whether a path is one of the temporary files of ``vlatool.files.scratch``, or lies in their folder."""
+    home = Path(tempfile.gettempdir())
+    return any(place.parent == home and SCRATCH.fullmatch(place.name) for place in (path, *path.parents))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 import unicodedata
 
@@ -66,6 +67,19 @@ def secrets_in(text: str) -> set[str]:
     _, colon, password = (before if at else rest.partition("/")[0]).partition(":")
     secrets = {password} if colon and (at or not password.isdecimal()) else set()
     return {secret for secret in secrets | {item.partition("=")[2] for item in query.split("&")} if secret}
+
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a place that takes no more."""
+
+
+def file_of(error: OSError) -> str:
+    """Return the file that an error of the operating system is about; nothing where it names none.
+
+    A copy names two, first what is read, and it is the other one for which there is no room.
+    """
+    named = error.filename2 if error.errno in NO_ROOM and error.filename2 is not None else error.filename
+    return "" if named is None else str(named)
 
 
 def message_of(error: BaseException, longest: int = TOLD) -> str:

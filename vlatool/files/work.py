@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.files.edited import is_own, stamped, whole_file
+from vlatool.files.printable import file_of
 
 LOCK = "lock"
 FORGOTTEN_S = 7 * 24 * 3600
@@ -142,7 +143,7 @@ class Store:
         return self.place / ANSWER.format(hashlib.sha256(key.encode()).hexdigest()[:32])
 
     def _failed(self, error: OSError) -> None:
-        where = error.filename or self.place
+        where = file_of(error) or self.place
         self.problem = (
             f"What is finished cannot be kept, so a run that is interrupted would begin again: {where}: "
             f"{error.strerror or error}; make room there, or name another cache (VLATOOL_CACHE)."

@@ -62,7 +62,7 @@ class Inputs:
     @contextlib.contextmanager
     def file(self, count: int, purpose: int, number: int = 0) -> Iterator[Path]:
         """Yield a file of observations for a process, and remove it in the end."""
-        with scratch_directory("vlatool-gate-") as folder:
+        with scratch_directory() as folder:
             path = folder / "observations.npz"
             save_drawn(path, self.draw(count, purpose, number))
             yield path

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-from vlatool.bundle.bundle import LOCATION, MANIFEST, Bundle, hash_file
+from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
 from vlatool.files.scratch import scratch_directory
 from vlatool.files.writing import writing
@@ -32,6 +32,7 @@ UNUSABLE = "make the bundle again, with the command that made it"
 Entry = dict[str, Any]
 RECORDED_FILE = re.compile(r"(?P<name>.+) sha256:(?P<hash>[0-9a-f]{16})")
 """How a record names a file that an option gives."""
+GRAPHS = "graphs/"
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,31 @@ class Rebuilt:
         differing = [file for file in self.files if not file.identical]
         return min(differing, key=lambda file: _rank(file.file), default=None)
 
+    @property
+    def differs_since(self) -> str:
+        """The first stage that gave other graphs than the record names; empty when none did."""
+        return next((name for name, same in self.stages if not same), "")
+
+    @property
+    def machine_may_differ(self) -> bool:
+        """Whether all that differs is of the machine that made the bundle: golden outputs, and the manifest."""
+        return all(file.identical or file.file == MANIFEST or _is_golden(file.file) for file in self.files)
+
+    @property
+    def beside(self) -> tuple[str, ...]:
+        """What is in the bundle, and in no hash, so that nothing of it was compared."""
+        hashed = (MANIFEST, DIGEST, LEDGER)
+        return tuple(name for name in UNRECORDED if name not in hashed and (self.bundle.path / name).exists())
+
 
 def _rank(name: str) -> int:
     """Return how late in the making of a bundle a file comes: what differs first may be why later ones do."""
     folder = name.partition("/")[0]
     return MADE_LAST.index(folder) + 1 if folder in MADE_LAST else 0
+
+
+def _is_golden(file: str) -> bool:
+    return file.startswith("golden/")
 
 
 @dataclass(frozen=True)
@@ -174,7 +195,7 @@ def rebuild(
     entries = build_record(bundle)
     start = _start(bundle, entries, source, files, cache)
     same: list[tuple[str, bool]] = []
-    with scratch_directory("vlatool-rebuild-") as scratch:
+    with scratch_directory() as scratch:
         product = start.bundle
         for number, (entry, stage) in enumerate(start.stages):
             before, place = product, scratch / f"{number}-{entry['stage']}"

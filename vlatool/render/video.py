@@ -108,20 +108,26 @@ def check_video(path: Path, *, force: bool) -> None:
         raise OutputError(f"Cannot write {path}: the disk is full.", "free some space, or write elsewhere")
 
 
-def write_video(video: Video, path: Path) -> str:
-    """Write a video; the file appears whole or not at all.
+def write_video(video: Video, path: Path, *, force: bool = False) -> str:
+    """Write a video; the file appears whole or not at all, and not over one that came meanwhile.
+
+    Args:
+        video: What is written.
+        path: Of the file.
+        force: See ``check_video``.
 
     Returns:
         What it lacks, in a few words; nothing when it lacks nothing.
 
     Raises:
         UsageError, MissingExtra: see ``check_video``.
-        OutputError: when it cannot be written, or the encoder fails.
+        OutputError: when it cannot be written, the encoder fails, or there is a file that may not be replaced.
         OSError: other errors of the operating system.
     """
     written = format_of(path)
     with output_errors(path):
         with whole_file(path) as draft:
             lacks = written.write(video, draft)
+            refuse_file(path, force=force)
         note_file(path)
     return lacks

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.data import Observations
 from vlatool.errors import DataError, require
+from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, save
 from vlatool.graph.layers import Layer
 from vlatool.graph.qdq import Range
@@ -165,7 +166,8 @@ class Switchboard:
         ranges: Mapping[str, Mapping[str, Range]],
         threads: int | None = None,
     ) -> None:
-        self._scratch = tempfile.TemporaryDirectory(prefix="vlatool-")
+        self._opened = contextlib.ExitStack()
+        folder = self._opened.enter_context(scratch_directory())
         self._tape = _Tape()
         self._sessions: dict[str, _Switchable] = {}
         self._kept: Mapping[str, Array] = {}
@@ -179,7 +181,7 @@ class Switchboard:
                 with foreign_errors(name):
                     model, flags = add_switches(path, layers[name], ranges.get(name), stage.style)
                     self.shares.update({(name, layer): share for layer, share in _shares(path, layers[name]).items()})
-                    path = Path(self._scratch.name) / f"{name}.onnx"
+                    path = folder / f"{name}.onnx"
                     save(model, path)
             with risky(of_branches(), f"opened the graph '{name}' with switches"):
                 self._sessions[name] = _Switchable(of_branches()(path, threads), flags, self._tape)
@@ -189,7 +191,7 @@ class Switchboard:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._scratch.cleanup()
+        self._opened.close()
 
     def reference(self, observation: Mapping[str, Any]) -> Action:
         """Run in float32, and keep what the graphs gave for the ``run`` calls that follow."""

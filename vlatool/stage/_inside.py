@@ -52,7 +52,7 @@ def _job(stage: Stage, source: Bundle | None, context: Context) -> dict[str, Any
         "stage": stage.name(), "options": stage.given(), "workers": context.workers,
         "launcher": context.launcher,
         "source": str(source.path.absolute()) if source else "", "command": context.command,
-        "events": context.events, "video": context.video,
+        "events": context.events, "video": context.video, "force": context.force,
     }  # fmt: skip
 
 
@@ -115,4 +115,4 @@ def _blamed() -> Iterator[None]:
 
 def _context(job: Mapping[str, Any], tell: Callable[[str, float | None], None]) -> Context:
     return Context(tell, job["workers"], job["command"], events=job["events"], launcher=job["launcher"],
-                   video=job["video"])  # fmt: skip
+                   video=job["video"], force=job["force"])  # fmt: skip

@@ -53,6 +53,7 @@ class Context:
             Here when None.
         events: Folder into which a training writes events that TensorBoard reads; none when empty.
         video: File into which an evaluation writes a video of an episode; none when empty.
+        force: Whether a video that vlatool wrote there may be replaced.
         launcher: Who starts the workers that play episodes: an entry of the kind ``workers``.
         unfinished: Gets the folders of what is kept until the result is written (``files.work.Store``): whoever writes
             it forgets them. Nothing is kept when None.
@@ -67,6 +68,7 @@ class Context:
     elsewhere: Callable[[Mapping[str, Any], Sequence[Path], Tell], dict[str, Any]] | None = None
     events: str = ""
     video: str = ""
+    force: bool = False
     launcher: str = "processes"
     unfinished: list[Path] | None = None
     kept: Store | None = None

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from vlatool.files.edited import DRAFT_NAME, sweep_drafts
 from vlatool.files.kept import DIGEST, FILES, SHIPPED, STAGES, TAG
 from vlatool.files.locks import alone
 from vlatool.files.work import LOCK
@@ -34,7 +35,7 @@ NAMES = {
     SHIPPED: DIGEST,
 }
 STREAM_FILES = re.compile(
-    r"lock|data|journal|answer-[0-9a-f]{32}\.json|\.answer-[0-9a-f]{32}\.json\.\d+\.part|checkpoint\.safetensors|\.checkpoint\.safetensors\.\d+\.part|meeting|round-\d{3}\.json"
+    r"lock|data|journal|answer-[0-9a-f]{32}\.json|checkpoint\.safetensors|meeting|round-\d{3}\.json"
     r"|(held-out/)?(expert/)?(round|draft)-\d{3}/.+|trials\.db(-journal)?"
 )
 """What unfinished work is made of: a file that is written part by part, training, or the trials of ``optimize``."""
@@ -129,13 +130,19 @@ def contents(cache: Path) -> Contents:
                 continue
             if entry is not None:
                 entries.append(entry)
-            elif not DRAFT.fullmatch(path.name):
+            elif not DRAFT.fullmatch(path.name) and not _draft_of(folder, path.name):
                 unknown.append(path.relative_to(cache).as_posix())
     kept, others = _kept(cache)
     unknown += others
     known = (*NAMES, FILES, TAG)
     unknown += [path.name for path in _below(cache) if path.name not in known]
     return Contents(cache, tuple(sorted(entries, key=lambda entry: entry.used)), kept, tuple(sorted(unknown)))
+
+
+def _draft_of(folder: str, name: str) -> str:
+    """Return which of a folder's files a draft is of; nothing where the name is that of no draft."""
+    draft = DRAFT_NAME.fullmatch(name)
+    return draft["final"] if draft and NAMES[folder].fullmatch(draft["final"]) else ""
 
 
 def _kept(cache: Path) -> tuple[dict[str, tuple[Inode, int]], list[str]]:
@@ -213,7 +220,7 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
         files = _stage_files(path)
         return Entry(name, what, status.st_mtime, files) if files else None
     if folder == STREAMS:
-        files = _own_files(path, STREAM_FILES.fullmatch) if (path / LOCK).is_file() else {}
+        files = _own_files(path, _is_of_a_stream) if (path / LOCK).is_file() else {}
         used = (path / LOCK).stat().st_mtime if files else 0.0
         return Entry(name, "unfinished work", used, files) if files else None
     if not stat.S_ISREG(status.st_mode) or not is_workload(path):
@@ -224,6 +231,12 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
 def _stage_files(path: Path) -> dict[str, tuple[Inode, int]]:
     listing = read_listing(path) if path.is_dir() else None
     return {} if listing is None else _own_files(path, {*listing.files, LEDGER}.__contains__)
+
+
+def _is_of_a_stream(name: str) -> bool:
+    """Say whether unfinished work is made of files of that name, or the file is a draft of one."""
+    draft = DRAFT_NAME.fullmatch(name)
+    return bool(STREAM_FILES.fullmatch(draft["final"] if draft else name))
 
 
 def _own_files(path: Path, is_own: Callable[[str], object]) -> dict[str, tuple[Inode, int]]:
@@ -282,6 +295,9 @@ def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
 
 def _drafts(cache: Path) -> Iterator[Path]:
     """Remove drafts of stages whose writers are gone; yield unfinished shared files of such writers."""
+    for path in _below(cache / WORKLOADS):
+        if final := _draft_of(WORKLOADS, path.name):
+            sweep_drafts(path.with_name(final))
     for folder in (STAGES, SHIPPED):
         for final in {match["final"] for path in _below(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
             sweep(cache / folder / final)

@@ -14,6 +14,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
+from vlatool.files.printable import file_of
 from vlatool.files.work import forget, work_directory
 from vlatool.machine import host
 from vlatool.module.description import description_file
@@ -257,7 +258,7 @@ class TrainingStage(ModuleStage):
             with work_directory(self._place(source)) as place:
                 return self._trained(modules, source, place, context)
         except OSError as error:  # of what is kept until the bundle is written, not of the bundle
-            where = error.filename or self._place(source)
+            where = file_of(error) or self._place(source)
             raise OutputError(
                 f"The training cannot be kept: {where}: {error.strerror or error}.",
                 "make room there, or name another cache (VLATOOL_CACHE); the same command goes on from its last "

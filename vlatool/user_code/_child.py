@@ -26,7 +26,7 @@ import psutil
 
 from vlatool.errors import VlatoolError
 from vlatool.files.limits import limit
-from vlatool.files.printable import message_of
+from vlatool.files.printable import file_of, message_of
 from vlatool.machine import risky
 from vlatool.machine.processes import adopt_orphans, die_with_parent
 from vlatool.user_code import trust
@@ -194,8 +194,7 @@ def _answered(request: dict[str, Any], answers: IO[str]) -> dict[str, Any]:
     except OSError as error:
         if error.errno not in errno.errorcode or error.errno in ENDINGS:
             return _raised(error)
-        named = None if error.filename is None else str(error.filename)
-        return {"errno": error.errno, "message": str(error.strerror), "file": named}
+        return {"errno": error.errno, "message": str(error.strerror), "file": file_of(error) or None}
     except BaseException as error:  # the seam: a user's code may raise anything
         return _raised(error)
 

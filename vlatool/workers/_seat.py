@@ -16,6 +16,7 @@ from typing import Any
 from vlatool.errors import VlatoolError
 from vlatool.files.limits import VARIABLE
 from vlatool.files.messages import from_json, to_json
+from vlatool.files.printable import file_of
 from vlatool.machine.host import MAX_CPU_ISA, OLDER_MAX_CPU_ISA, architecture, versions
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.processes import SINGLE
@@ -149,8 +150,7 @@ class Seat:
         if isinstance(error, VlatoolError):
             return {"error": type(error).__name__, "message": error.message, "fix": error.fix}
         if isinstance(error, OSError) and error.errno in errno.errorcode:
-            named = None if error.filename is None else str(error.filename)
-            return {"errno": error.errno, "message": str(error.strerror), "file": named}
+            return {"errno": error.errno, "message": str(error.strerror), "file": file_of(error) or None}
         if isinstance(error, MemoryError):
             return {"memory": True}
         return {"raised": type(error).__name__, "message": str(error), "ours": True}
