@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vlatool.errors import OutputError
+from vlatool.files.scratch import named_as
 from vlatool.files.written import note_file
 
 
@@ -32,8 +33,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     target = path.resolve()
     draft = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        yield draft
-        draft.replace(target)
+        with named_as(draft, str(path)):
+            yield draft
+            draft.replace(target)
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to tell
             draft.unlink(missing_ok=True)
