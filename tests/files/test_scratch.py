@@ -17,6 +17,7 @@ import pytest
 from vlatool.data.npz import NpzReader
 from vlatool.errors import BundleError, GraphError, OutputError, VlatoolError
 from vlatool.files import scratch as scratch_module
+from vlatool.files.edited import whole_file
 from vlatool.files.scratch import scratch_directory
 from vlatool.files.writing import writing
 from vlatool.measurement.child import ended
@@ -140,6 +141,16 @@ def test_an_error_about_a_scratch_folder_names_the_file_alone(kind: Callable[[Pa
     assert "graphs/main.onnx" in told
     assert str(place) not in told
     assert not place.exists()
+
+
+def test_an_error_about_the_draft_of_a_file_names_the_file(tmp_path: Path):
+    with pytest.raises(OutputError) as caught, whole_file(tmp_path / "v.mp4") as draft:
+        raise OutputError(f"ffmpeg could not write the video: {draft}: it is full.", "write a .gif")
+    assert caught.value.message == f"ffmpeg could not write the video: {tmp_path}/v.mp4: it is full."
+    with pytest.raises(OSError, match="full") as met, whole_file(tmp_path / "v.mp4") as draft:
+        raise OSError(errno.ENOSPC, "full", str(draft))
+    assert met.value.filename == str(tmp_path / "v.mp4")
+    assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
 
 
 KILLED = """

@@ -487,6 +487,13 @@ def test_an_onnx_file_with_an_environment_beside_it_plays_the_closed_loop(model,
     assert made.closed_loop.episodes == 8
 
 
+def test_the_limit_on_calls_of_an_environment_reaches_the_episodes(model, tmp_path):
+    recipe = default_recipe(Limits(), Effort(episodes=8, environment_timeout=7), calibrated=True)
+    made = make_plan(str(model), load_profile("raspberry-pi-5"), recipe, tmp_path)
+    assert made.closed_loop is not None
+    assert made.closed_loop.environment_timeout == 7
+
+
 def test_calibration_data_is_found_beside_the_description(policy_dir, model):
     assert brings_calibration(str(policy_dir))
     assert brings_calibration(str(model))

@@ -80,6 +80,9 @@ def optimize(
     study: StudyPlace = None,
     recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
+    environment_timeout: Annotated[
+        float | None, typer.Option(min=0, max=1e6, help="seconds that a call of the environment may take (300)")
+    ] = None,
     every_candidate: Annotated[
         bool | None,
         typer.Option("--every-candidate", help="play the episodes of every candidate, not only until one is chosen"),
@@ -113,7 +116,10 @@ def optimize(
     limits = {"hz": hz, "max_latency_ms": max_latency_ms, "max_memory_mb": max_memory_mb}
     shares = {"max_distance": max_distance, "max_motion": max_motion, "worst_task": worst_task}
     asked = _limits(max_drop, shares, accept, limits)
-    effort = {"episodes": episodes, "iterations": iterations, "threads": threads, "every_candidate": every_candidate}
+    effort: dict[str, Any] = {
+        "episodes": episodes, "iterations": iterations, "threads": threads, "every_candidate": every_candidate,
+        "environment_timeout": environment_timeout,
+    }  # fmt: skip
     chosen = _recipe(recipe, source, board, asked, {name: value for name, value in effort.items() if value is not None})
     chosen = chosen.model_copy(update={"pruning": _pruning(chosen.pruning, trials, train_steps, study)})
     if search is not None:

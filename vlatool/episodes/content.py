@@ -9,6 +9,7 @@ import os
 import platform
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,8 @@ def circumstances(bundle: Bundle, engine: str, job: EpisodesJob) -> dict[str, An
 
 
 def key_of(around: dict[str, Any], job: EpisodesJob) -> str:
-    """Return the key of a job's outcomes: all that decides them."""
-    return json.dumps([around, to_json(job)], sort_keys=True)
+    """Return the key of a job's outcomes: all that decides them, which a limit in time does not."""
+    return json.dumps([around, to_json(replace(job, timeout_s=0.0))], sort_keys=True)
 
 
 def environment_hash(job: EpisodesJob) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -11,8 +12,51 @@ import numpy as np
 from vlatool.accuracy.success import truth_of
 from vlatool.bundle.spec import PolicySpec
 from vlatool.errors import DataError, instead, nearest
+from vlatool.files.limits import VARIABLE, limit
+from vlatool.machine.awaited import awaited
 
+SECONDS = "environment_seconds"
 GUIDE = "docs/guides/environment.md has a wrapper of ten lines"
+
+
+def timeout_of(environment: Mapping[str, Any]) -> float:
+    """Return how long a call may take, in seconds, as a declaration of an environment says it; 0 where it does not.
+
+    Raises:
+        DataError: when it is no number above 0.
+    """
+    value = environment.get("timeout", 0.0)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e9:
+        raise DataError(
+            f"'timeout' of the environment is {value!r:.60}; allowed: seconds above 0.",
+            f"write timeout: {limit(SECONDS)} under environment in policy.yaml, or leave it out",
+        )
+    return float(value)
+
+
+def limited(
+    call: str, task: str, seed: int | None = None, timeout_s: float = 0.0, when: str = "at"
+) -> contextlib.AbstractContextManager[None]:
+    """Let whoever watches this process end it where a call of an environment, the block, takes too long.
+
+    Args:
+        call: Its name: ``reset()``.
+        task: Of the environment.
+        seed: Of the episode; None before there is one.
+        timeout_s: Seconds that it may take; the limit ``environment_seconds`` when 0.
+        when: How the call is related to the seed: ``at`` or ``after``.
+    """
+    allowed = timeout_s or limit(SECONDS)
+    of = f"of task '{task}'" if seed is None else f"of task '{task}' {when} seed {seed}"
+    longer = f"{2 * allowed:g}"
+    everywhere = "" if timeout_s else f"{VARIABLE}={SECONDS}={longer}, or "
+    asked = f"--environment-timeout {longer} (evaluate closed-loop, optimize)"
+    raised = f"{everywhere}timeout: {longer} under environment in policy.yaml, or {asked}"
+    own = f"make(task={task!r})" + (f".reset(seed={seed})" if call in ("reset()", "step()") else "")
+    fix = f"where it needs longer, raise the limit: {raised}; else call {own} of the environment yourself and see where"
+    whose = f"{call} of the environment of task '{task}'"
+    at = "" if seed is None else f"{when} seed {seed}"
+    return awaited(f"{call} {of}", whose, at, f"{fix} it hangs", allowed)
 
 
 class World:
@@ -22,13 +66,16 @@ class World:
         environment: What ``make(task=...)`` returned.
         task: Of the environment, for messages.
         spec: Of the policy.
+        timeout_s: Seconds that a call may take; see ``limited``.
 
     Raises:
         DataError: when it has no ``reset`` and ``step``, or ``reset`` takes no ``seed``.
     """
 
-    def __init__(self, environment: Any, task: str, spec: PolicySpec) -> None:
+    def __init__(self, environment: Any, task: str, spec: PolicySpec, timeout_s: float = 0.0) -> None:
         self._environment = environment
+        self._task, self._timeout_s = task, timeout_s
+        self._seed: int | None = None
         self._name = f"the environment of task '{task}'"
         self._inputs = [tensor.name for tensor in spec.inputs]
         lacking = [name for name in ("reset", "step") if not callable(getattr(environment, name, None))]
@@ -49,7 +96,9 @@ class World:
         Raises:
             DataError: when it does not give an observation and an info.
         """
-        answer = self._environment.reset(seed=seed)
+        self._seed = seed
+        with self._limited("reset()"):
+            answer = self._environment.reset(seed=seed)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             raise DataError(
                 f"reset() of {self._name} gives {_told(answer)}; it must give (observation, info).",
@@ -65,7 +114,8 @@ class World:
         Raises:
             DataError: when it does not give the five values of gymnasium, or does not say whether the episode is over.
         """
-        answer = self._environment.step(action.copy() if isinstance(action, np.ndarray) else action)
+        with self._limited("step()"):
+            answer = self._environment.step(action.copy() if isinstance(action, np.ndarray) else action)
         if not (isinstance(answer, tuple | list) and len(answer) == 5):
             raise DataError(
                 f"step() of {self._name} gives {_told(answer)}; it must give five values: observation, reward, "
@@ -109,7 +159,12 @@ class World:
                 f"{self._name.capitalize()} offers no disturbance '{kind}'; {nearest(kind, known)}.",
                 instead(kind, known),
             )
-        self._own("disturb")(kind, strength, seed)
+        self._seed = seed
+        with self._limited("disturb()"):
+            self._own("disturb")(kind, strength, seed)
+
+    def _limited(self, call: str) -> contextlib.AbstractContextManager[None]:
+        return limited(call, self._task, self._seed, self._timeout_s)
 
     def _own(self, name: str) -> Any:
         """Return an attribute of the environment, or of what its wrappers wrap."""

@@ -55,8 +55,8 @@ def locate(
         under: Disturbance and strength; None where there is none.
     """
     message = str(error.message)
-    words = [] if f"task '{task}'" in message else [f"in task '{task}'"]
-    if seed is not None and f"seed {seed}" not in message:
+    words = [] if "task '" in message else [f"in task '{task}'"]
+    if seed is not None and " seed " not in message:
         words.append(f"at seed {seed}")
     elif seed is None and seeds:
         words.append(seeds)

@@ -31,12 +31,12 @@ class Filmed(World):
     """A world that keeps a picture of each moment of an episode: of the reset, and after each step.
 
     Args:
-        environment, task, spec: See ``World``.
+        environment, task, spec, timeout_s: See ``World``.
         folder: For ``NUMBER.npy``, uint8 (N, H, W, 3); it is made when absent.
     """
 
-    def __init__(self, environment: Any, task: str, spec: PolicySpec, folder: Path) -> None:
-        super().__init__(environment, task, spec)
+    def __init__(self, environment: Any, task: str, spec: PolicySpec, folder: Path, timeout_s: float = 0.0) -> None:
+        super().__init__(environment, task, spec, timeout_s)
         self._camera = Camera(environment, task, spec)
         self._roll = Roll(folder)
 
@@ -47,7 +47,8 @@ class Filmed(World):
             DataError: when there is nothing to take a picture of.
         """
         observation, info = super().reset(seed)
-        self._roll.take(self._camera, observation)
+        with self._limited("render()"):
+            self._roll.take(self._camera, observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Mapping[str, Any], bool, Any]:
@@ -57,15 +58,18 @@ class Filmed(World):
             DataError: when there is no picture, or one of another size than before.
         """
         observation, over, info = super().step(action)
-        self._roll.take(self._camera, observation)
+        with self._limited("render()"):
+            self._roll.take(self._camera, observation)
         if over:
             self._roll.write()
         return observation, over, info
 
 
-def world_of(environment: Any, task: str, spec: PolicySpec, film: str) -> World:
+def world_of(environment: Any, task: str, spec: PolicySpec, film: str, timeout_s: float = 0.0) -> World:
     """Return the world of an environment, filmed into a folder where one is named."""
-    return Filmed(environment, task, spec, Path(film)) if film else World(environment, task, spec)
+    if film:
+        return Filmed(environment, task, spec, Path(film), timeout_s)
+    return World(environment, task, spec, timeout_s)
 
 
 class Camera:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 from collections.abc import Generator, Iterator, Sequence, Set
 from dataclasses import replace
@@ -16,7 +17,7 @@ from vlatool.episodes import play
 from vlatool.episodes.content import circumstances, key_of
 from vlatool.episodes.disturbed import OWN
 from vlatool.episodes.faults import locate, under_way
-from vlatool.episodes.play import PRELOAD, RECORDINGS, EpisodesJob, Played, Request
+from vlatool.episodes.play import ENDED, PRELOAD, RECORDINGS, EpisodesJob, Played, Request
 from vlatool.episodes.progress import Tally
 from vlatool.errors import DataError, SourceError, VlatoolError
 from vlatool.files.messages import from_json, to_json
@@ -52,11 +53,11 @@ def run_jobs(
     tally = tally or Tally(sum(len(job.seeds) for job in jobs))
     kept = _Kept(bundle, engine, jobs, context)
     missing = [number for number in range(len(jobs)) if number not in kept.found]
-    played = _played(bundle, [jobs[number] for number in missing], engine, context, kept, missing)
+    played = _played(bundle, [kept.rest(number) for number in missing], engine, context, kept, missing)
     outcomes: list[Outcome] = []
     with contextlib.closing(played):
         for number in range(len(jobs)):
-            part = kept.found[number] if number in kept.found else next(played)
+            part = kept.found[number] if number in kept.found else kept.whole(number, next(played))
             outcomes += part
             tally.add(part)
             context.tell(tally.sentence(), tally.share)
@@ -75,13 +76,16 @@ def _played(
     name, count = (PROCESSES, 1) if alone and context.launcher != PROCESSES else (context.launcher, context.workers)
 
     def done(at: int, answer: Any) -> None:
-        kept.put(numbers[at], outcomes_of(answer, jobs[at]))
+        kept.put(numbers[at], kept.whole(numbers[at], outcomes_of(answer, jobs[at])))
 
     begun: set[str] = set()
     ours = {under_way(job.task, seed) for job in jobs for seed in job.seeds}
 
     def tell(what: str, share: float | None) -> None:
-        begun.add(what) if what in ours else context.tell(what, share)
+        if what.startswith(ENDED):
+            kept.one(what.removeprefix(ENDED))
+        else:
+            begun.add(what) if what in ours else context.tell(what, share)
 
     work = _work("play", bundle, jobs, engine, PRELOAD, "close", away=name != PROCESSES)
     answers = launcher(name, count).answers(work, tell, done, context.notes.append)
@@ -222,6 +226,8 @@ class _Kept:
 
     def __init__(self, bundle: Bundle, engine: str, jobs: Sequence[EpisodesJob], context: Context) -> None:
         self.found: dict[int, Outcomes] = {}
+        self._jobs = jobs
+        self._single: dict[tuple[str, int], Outcome] = {}
         self._context = context
         self._store = None if context.kept is None or jobs[0].record else context.kept
         if self._store is None:
@@ -229,19 +235,66 @@ class _Kept:
         around = circumstances(bundle, engine, jobs[0])
         self._keys = [self._store.turn(key_of(around, job)) for job in jobs]
         for number, job in enumerate(jobs):
-            with contextlib.suppress(DataError):  # not what that job gives: played again
-                if (value := self._store.get(self._keys[number])) is not None:
-                    self.found[number] = outcomes_of(value, job)
-        taken = sum(map(len, self.found.values()))
+            found = self._found(self._keys[number], job)
+            if found:
+                self.found[number] = found
+            elif len(job.seeds) > 1:
+                self._look_for_each(number)
+        taken = sum(map(len, self.found.values())) + len(self._single)
         self._store.taken += taken
         self._store.asked += sum(len(job.seeds) for job in jobs)
         if taken:
             context.tell(f"{taken} episodes are of an interrupted run", None)
 
+    def _found(self, key: str, job: EpisodesJob) -> Outcomes:
+        """Return what is kept of a job; nothing where there is none, or it is not what that job gives."""
+        value = None if self._store is None else self._store.get(key)
+        with contextlib.suppress(DataError):
+            return () if value is None else outcomes_of(value, job)
+        return ()
+
+    def _look_for_each(self, number: int) -> None:
+        """Take the first episodes of a job that was not finished."""
+        job = self._jobs[number]
+        for seed in job.seeds:
+            found = self._found(self._key_of_one(number, seed), replace(job, seeds=(seed,)))
+            if not found:
+                return
+            self._single[job.task, seed] = found[0]
+
+    def _key_of_one(self, number: int, seed: int) -> str:
+        return f"{self._keys[number]} seed {seed}"
+
+    def rest(self, number: int) -> EpisodesJob:
+        """Return what is to be played of a job: the episodes that are not there, one at least."""
+        job = self._jobs[number]
+        seeds = tuple(seed for seed in job.seeds if (job.task, seed) not in self._single)
+        return replace(job, seeds=seeds or job.seeds)
+
+    def whole(self, number: int, played: Outcomes) -> Outcomes:
+        """Return the outcomes of a job in order, of which some were there."""
+        job = self._jobs[number]
+        own = {outcome.seed: outcome for outcome in played}
+        return tuple(own.get(seed) or self._single[job.task, seed] for seed in job.seeds)
+
+    def one(self, text: str) -> None:
+        """Keep an episode of a job that is not finished, as a child tells it."""
+        if self._store is None:
+            return
+        with contextlib.suppress(ValueError, DataError):
+            outcome = from_json(Outcome, json.loads(text))
+            for number, job in enumerate(self._jobs):
+                if job.task == outcome.task and outcome.seed in job.seeds:
+                    value = to_json(Played((outcome,)))
+                    outcomes_of(value, replace(job, seeds=(outcome.seed,)))
+                    self._store.put(self._key_of_one(number, outcome.seed), value)
+
     def put(self, number: int, outcomes: Outcomes) -> None:
-        """Keep the outcomes of a job."""
+        """Keep the outcomes of a job as one, and no longer each."""
         if self._store is not None:
             self._store.put(self._keys[number], to_json(Played(outcomes)))
+            for seed in self._jobs[number].seeds:
+                self._store.drop(self._key_of_one(number, seed))
 
     def say(self) -> None:
         """Say it where outcomes cannot be kept."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from vlatool.bundle.spec import PolicySpec
 from vlatool.episodes.body import Body, series_of
 from vlatool.episodes.controls import Array, Blind, answers_of
 from vlatool.episodes.disturbed import OWN, Seen
-from vlatool.episodes.environment import GUIDE, World
+from vlatool.episodes.environment import GUIDE, World, limited
 from vlatool.episodes.faults import named, under_way
 from vlatool.episodes.film import world_of
 from vlatool.episodes.frames import KeepingEncoder, Noisy
@@ -36,6 +37,8 @@ from vlatool.motion.measure import measured
 from vlatool.runtime.chunks import ChunkQueue
 from vlatool.runtime.policy import FIRST_RUN_S, Policy
 
+ENDED = "ended: "
+"""How the progress begins that says how an episode ended: what comes after it in its job may never end."""
 SLICE = 10
 """Episodes of one task that a worker plays at a time."""
 STEP_LIMIT = 100_000
@@ -69,6 +72,7 @@ class EpisodesJob:
         latency_ms: How late actions come; 0 for at once.
         show: Whether the outcomes hold the path and the actions of each step.
         film: Folder for pictures of the episode, of which there is one then; none are taken when empty.
+        timeout_s: Seconds that a call of the environment may take; the limit ``environment_seconds`` when 0.
     """
 
     environment: str
@@ -84,6 +88,7 @@ class EpisodesJob:
     latency_ms: float = 0.0
     show: bool = False
     film: str = ""
+    timeout_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -159,6 +164,8 @@ class Worker:
         self._answers: Array | None = None
         self._key: tuple[str, ...] = ()
         self._environment: Any = None
+        self._job: EpisodesJob | None = None
+        """The last one of the open environment."""
         self._home = Path.cwd()
 
     def environment(self, job: EpisodesJob) -> Any:
@@ -167,8 +174,9 @@ class Worker:
         if key != self._key:
             self.close()
             arguments = {"task": job.task, **({} if job.instruction == "right" else {"instruction": job.instruction})}
-            self._environment = call_factory(job.environment, Path(job.folder), arguments)
-            self._key = key
+            with limited("make()", job.task, None, job.timeout_s):
+                self._environment = call_factory(job.environment, Path(job.folder), arguments)
+            self._key, self._job = key, job
         return self._environment
 
     def play(self, job: EpisodesJob, limit: int = STEP_LIMIT, tell: Tell = lambda *_: None) -> list[Outcome]:
@@ -177,13 +185,16 @@ class Worker:
         os.chdir(self._home)  # an environment before may have changed it, and the next one's file is named from here
         if job.control or job.noise:
             self._ask()
-        world = world_of(self.environment(job), job.task, spec, job.film)
+        world = world_of(self.environment(job), job.task, spec, job.film, job.timeout_s)
+        self._job = job
         with self._frames.kept(Path(job.record)) if job.record else contextlib.nullcontext():
             outcomes = []
             for seed in job.seeds:
                 tell(under_way(job.task, seed), None)
                 self._frames.begin()
                 outcomes.append(_episode(world, self._actor(job, seed), spec, job, seed, limit))
+                if len(job.seeds) > 1 and not job.show:
+                    tell(f"{ENDED}{json.dumps(to_json(outcomes[-1]))}", None)
             return outcomes
 
     def _actor(self, job: EpisodesJob, seed: int) -> Actor:
@@ -204,9 +215,8 @@ class Worker:
     def close(self) -> None:
         """Close the open environment; one that fails to close has done its work all the same."""
         environment, self._environment, self._key = self._environment, None, ()
-        if environment is not None:
-            with contextlib.suppress(Exception):
-                environment.close()
+        if environment is not None and self._job is not None:
+            _close(environment, self._job)
 
 
 def _opened(bundle: Bundle, engine: str) -> Policy:
@@ -249,13 +259,20 @@ def disturbances(request: Mapping[str, Any], _tell: Tell) -> list[str]:
     """Answer a ``Request`` in this process with the disturbances that the environment of its task offers."""
     asked = from_json(Request, request)
     spec = Bundle.described(asked.bundle).manifest.spec
-    environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
+    with limited("make()", asked.job.task, None, asked.job.timeout_s):
+        environment = call_factory(asked.job.environment, Path(asked.job.folder), {"task": asked.job.task})
     try:
         with named(asked.job.task):
             return list(World(environment, asked.job.task, spec).disturbances())
     finally:
-        with contextlib.suppress(Exception):
-            environment.close()
+        _close(environment, asked.job)
+
+
+def _close(environment: Any, job: EpisodesJob) -> None:
+    """Close an environment; one that fails to close has done its work all the same, one that never ends has not."""
+    last = job.seeds[-1] if job.seeds else None
+    with contextlib.suppress(Exception), limited("close()", job.task, last, job.timeout_s, "after"):
+        environment.close()
 
 
 def close(_request: Mapping[str, Any], _tell: Tell) -> None:

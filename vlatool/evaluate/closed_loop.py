@@ -18,6 +18,7 @@ from vlatool.accuracy.paired import Outcome, compare_success, repeated_starts, s
 from vlatool.accuracy.shown import with_episode
 from vlatool.bundle.bundle import MANIFEST, Bundle
 from vlatool.episodes.controls import CONTROLS
+from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
 from vlatool.errors import DataError, SourceError, UsageError, instead, nearest
@@ -87,6 +88,12 @@ class ClosedLoop(Measure):
         description="of the disturbances, or several, such as 0.5,1,2; 1: what an ordinary day brings",
     )
     latency_in_the_loop: bool = Field(False, description="let actions come as late as inferences take")
+    environment_timeout: float = Field(
+        0.0,
+        ge=0,
+        le=1e6,
+        description="seconds that a call of the environment may take; when 0, what policy.yaml says, or 300",
+    )
     board: str = Field(
         "",
         description="profile whose predicted latency that is; --profile sets it; measured here when empty",
@@ -127,6 +134,13 @@ class ClosedLoop(Measure):
         file = folder / where.rpartition(":")[0]
         code = sorted(file.parent.glob("*.py")) if file.is_file() else []
         return (*([self.baseline / MANIFEST] if self.baseline else []), *code)
+
+    def key(self, source_hash: str) -> str:
+        """A limit in time decides no outcome: what is finished of a run counts under another one, too."""
+        default = type(self).model_fields["environment_timeout"].default
+        if self.environment_timeout != default:
+            return self.model_copy(update={"environment_timeout": default}).key(source_hash)
+        return super().key(source_hash)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
         """Environment and tasks are named, the environment may run, and a limit has something to hold against."""
@@ -340,5 +354,6 @@ class ClosedLoop(Measure):
         for task in self.tasks:
             if known and task not in known and not self.environment:
                 raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.", instead(task, known))
-        job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control)
+        timeout = self.environment_timeout or timeout_of(named)
+        job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control, timeout_s=timeout)
         return jobs_for(job, tasks, self.episodes, self.first_seed)

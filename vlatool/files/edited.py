@@ -16,6 +16,7 @@ from pathlib import Path
 
 from vlatool.errors import OutputError
 from vlatool.files.locks import alone
+from vlatool.files.scratch import named_as
 from vlatool.files.written import note_file
 
 DRAFT = ".{}.vlatool-{}-{}.part"
@@ -47,10 +48,11 @@ def whole_file(path: Path) -> Iterator[Path]:
     lock = os.open(draft, os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        yield draft
-        if not draft.stat().st_size:
-            raise FileNotFoundError(errno.ENOENT, "nothing was written", str(draft))
-        draft.replace(target)
+        with named_as(draft, str(path)):
+            yield draft
+            if not draft.stat().st_size:
+                raise FileNotFoundError(errno.ENOENT, "nothing was written", str(draft))
+            draft.replace(target)
     except BaseException:
         with contextlib.suppress(OSError):  # the first error is the one to tell
             draft.unlink(missing_ok=True)

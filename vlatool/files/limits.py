@@ -56,6 +56,7 @@ LIMITS = {
     "target_bytes": Limit(256 * MIB, "bytes", "all that the target of a benchmark sends"),
     "target_seconds": Limit(6 * 3600, "seconds", "a benchmark on a target, beside the time that was asked for"),
     "engine_seconds": Limit(3600, "seconds", "an engine that opens or runs a graph once where nobody has run it yet"),
+    "environment_seconds": Limit(300, "seconds", "one call of an environment: make(), reset(), step() or close()"),
     "study_seconds": Limit(60, "seconds", "waiting for another process to write a trial into the file of a study"),
     "shipped_files": Limit(20_000, "files", "files of a folder that are sent to workers on other machines"),
     "shipped_bytes": Limit(16 * GIB, "bytes", "a folder that is sent to workers on other machines"),

@@ -139,6 +139,11 @@ class Store:
         except OSError as error:
             self._failed(error)
 
+    def drop(self, key: str) -> None:
+        """Keep nothing under a key any more."""
+        with contextlib.suppress(OSError):
+            self._file(key).unlink(missing_ok=True)
+
     def _file(self, key: str) -> Path:
         return self.place / ANSWER.format(hashlib.sha256(key.encode()).hexdigest()[:32])
 

@@ -44,7 +44,8 @@ class Description:
         factory: ``path.py:make`` or ``package.module:make``; empty for a policy that is an ONNX file.
         arguments: Keyword arguments of the factory.
         program: How the graphs are run.
-        environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation.
+        environment: ``make`` (factory of a gymnasium environment) and ``tasks`` for closed-loop evaluation, and
+            ``timeout``: seconds that a call of it may take.
         parts: Part name -> globs of module names.
         calibration, evaluation: Recorded observations, or None.
         weights: Glob of safetensors files whose tensors have the names of ``state_dict()``; the factory then builds the
@@ -121,6 +122,7 @@ def read_description(path: Path) -> Description:
     for key in ("name", "version"):
         _check_label(file, key, data.get(key, "0.0.0"))
     _check_code(file, data)
+    _check_timeout(file, data)
     spec = PolicySpec.from_dict(data["spec"])
     _check_labels(file, spec)
     program = program_from(data["program"]) if "program" in data else single_graph(spec)
@@ -166,6 +168,16 @@ def _check_code(file: Path, data: Mapping[str, Any]) -> None:
                 f"{file}: '{key}' names a file outside the folder of the policy: {shortened(str(factory), 200)}.",
                 "copy or link what runs into the folder, or name an importable package: package.module:make",
             )
+
+
+def _check_timeout(file: Path, data: Mapping[str, Any]) -> None:
+    """Refuse what is no time that a call of the environment may take."""
+    seconds = (data.get("environment") or {}).get("timeout", 1)
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
+        raise SourceError(
+            f"{file}: 'timeout' under environment is {seconds!r:.60}; allowed: seconds above 0, up to 1,000,000.",
+            "write it as timeout: 60, or leave it out",
+        )
 
 
 def _check_labels(file: Path, spec: PolicySpec) -> None:

@@ -69,7 +69,10 @@ class Plan:
         described = read_description(self.source.policy)
         if not described.environment:
             return None
-        return ClosedLoop(policy=self.source.policy, episodes=self.recipe.effort.episodes)
+        effort = self.recipe.effort
+        return ClosedLoop(
+            policy=self.source.policy, episodes=effort.episodes, environment_timeout=effort.environment_timeout
+        )
 
     def lines(self) -> Iterator[str]:
         """Describe the plan, a line for each stage."""

@@ -67,6 +67,9 @@ class Effort(Numeric):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     episodes: int = Field(200, ge=0, description="closed-loop episodes of each candidate; 0 for none")
+    environment_timeout: float = Field(
+        0.0, ge=0, le=1e6, description="seconds that a call of the environment may take; when 0, what policy.yaml says"
+    )
     iterations: int = Field(200, ge=20, description="timed inferences of each candidate")
     threads: int = Field(1, ge=1, description="intra-op threads while timing")
     every_candidate: bool = Field(

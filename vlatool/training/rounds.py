@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from vlatool.bundle.bundle import Bundle
+from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.frames import file_of
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, require
@@ -35,7 +36,10 @@ def scene_of(source: Bundle) -> tuple[EpisodesJob, tuple[str, ...]] | None:
     """Return where a policy's description says that it acts, and the tasks; None when it names no environment."""
     origin = origin_of(source)
     make, tasks = origin.environment.get("make"), origin.environment.get("tasks")
-    return (EpisodesJob(str(make), str(origin.folder), "", ()), tuple(tasks)) if make and tasks else None
+    if not make or not tasks:
+        return None
+    timeout = timeout_of(origin.environment)
+    return EpisodesJob(str(make), str(origin.folder), "", (), timeout_s=timeout), tuple(tasks)
 
 
 class Counted(Protocol):

@@ -28,11 +28,12 @@ from vlatool.errors import VlatoolError
 from vlatool.files.limits import limit
 from vlatool.files.printable import file_of, message_of
 from vlatool.machine import risky
+from vlatool.machine.awaited import noted_on
 from vlatool.machine.processes import adopt_orphans, die_with_parent
 from vlatool.user_code import trust
 from vlatool.user_code._answers import ENDINGS
 
-FDS = 3
+FDS = 4
 MESSAGE = 1 << 16
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -105,13 +106,13 @@ def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket
         return
     gc.collect()
     gc.freeze()
-    talk, output, status = fds
+    talk, output, status, page = fds
     server = os.getpid()
     pid = os.fork()
     if pid:
         children[pid] = socket.socket(fileno=status)
-        os.close(talk)
-        os.close(output)
+        for fd in (talk, output, page):
+            os.close(fd)
         return
     code = 1
     try:
@@ -121,6 +122,7 @@ def _start(preload: list[str], fds: list[int], children: dict[int, socket.socket
             for fd in (status, *own, *(other.fileno() for other in children.values())):
                 os.close(fd)
             _stand_alone(output)
+            noted_on(page)
             code = _converse(socket.socket(fileno=talk))
     finally:
         os._exit(code)

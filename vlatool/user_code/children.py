@@ -16,6 +16,7 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +25,7 @@ from typing import Any
 
 from vlatool.errors import SourceError
 from vlatool.files.printable import shortened
+from vlatool.machine.awaited import Page, new_page
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.processes import SINGLE, import_path, python_command
 from vlatool.user_code import trust
@@ -37,6 +39,8 @@ Tell = Callable[[str, float | None], None]
 LONGEST_ANSWER = 1 << 28
 """Bytes of one line of an answer."""
 PATIENCE_S = 5.0
+LOOK_S = 0.2
+"""How often a call that may never return is looked at; from a second on it is said."""
 
 
 class _Server:
@@ -126,17 +130,21 @@ class Apart:
         self._talk, talk = socket.socketpair()
         self._status, status = socket.socketpair()
         self._output, output = os.pipe()
+        page = new_page()
+        self._page = Page(page)
         self._open: list[Any] = [self._talk, self._output, self._status]
         self._last = Last()
         self._said = Said(about, self._last)
         self._received = b""
+        self._said_s = 0
         variables = {**os.environ, **(environment or {})}
         try:
-            _forked(preload, [talk.fileno(), output, status.fileno()], variables)
+            _forked(preload, [talk.fileno(), output, status.fileno(), page], variables)
         finally:
             talk.close()
             status.close()
             os.close(output)
+            os.close(page)
         hello = {
             "folder": os.getcwd(), "environment": variables, "path": import_path(),
             "processors": sorted(os.sched_getaffinity(0)), "named": trust.named_so_far(),
@@ -155,6 +163,7 @@ class Apart:
         for stream in (self._talk, self._status):
             stream.close()
         os.close(self._output)
+        self._page.close()
 
     def end(self) -> None:
         """End the child, from any thread; a call that waits for it ends too."""
@@ -180,7 +189,7 @@ class Apart:
         self._last.own, self._last.doing, self._last.told = own, None, ""
         self._send({"call": function, "job": dict(job)})
         while True:
-            for line in self._lines():
+            for line in self._lines(tell):
                 if "progress" in line:
                     self._last.told = plain(line["progress"][0])
                     tell(self._last.told, line["progress"][1])
@@ -197,12 +206,19 @@ class Apart:
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # how it ended is found by reading
             self._talk.sendall(json.dumps(line).encode() + b"\n")
 
-    def _lines(self) -> Iterable[dict[str, Any]]:
+    def _lines(self, tell: Tell) -> Iterable[dict[str, Any]]:
         """Wait for the child; return what it says, and show what it prints.
+
+        What it calls that may never return is looked at from here: a library may let no thread of its process run.
 
         Lines are read one by one: what was said before a line that is nonsense counts, though both came together.
         """
-        ready = select.select(self._open, [], [], None if self._talk in self._open else PATIENCE_S)[0]
+        waits = self._talk in self._open
+        ready = select.select(self._open, [], [], LOOK_S if waits else PATIENCE_S)[0]
+        if waits and not {self._talk, self._status}.intersection(ready):
+            self._look(tell)
+            if not ready:
+                return []
         if self._output in ready:
             self._print()
         if self._talk in ready:
@@ -216,6 +232,22 @@ class Apart:
         if not ready:
             raise SourceError(f"{self.about} closed what its process answers with.", "let it close its own files alone")
         return []
+
+    def _look(self, tell: Tell) -> None:
+        """Say what the child waits for, and end it where a call takes longer than it may.
+
+        Raises:
+            SourceError: naming the call, its limit and how to raise it.
+        """
+        call = self._page.read()
+        waited = 0.0 if call is None else time.monotonic() - call.begun
+        if call is not None and waited > call.limit_s:
+            self.end()
+            at = f" {plain(call.at)}" if call.at else ""
+            raise SourceError(f"{plain(call.whose)} did not return within {call.limit_s:g} s{at}.", plain(call.fix))
+        if call is not None and int(waited) > self._said_s:
+            tell(f"waiting for {plain(call.waiting)}, {int(waited)} s of {call.limit_s:g} s", None)
+        self._said_s = int(waited)
 
     def _receive(self) -> bool:
         """Read what the child says; say whether there was anything."""
