@@ -87,6 +87,14 @@ def text_input(**values: Any) -> Change:
     return change
 
 
+def float_input(**values: Any) -> Change:
+    def change(before: Manifest) -> Manifest:
+        place = next(place for place, each in enumerate(before.spec.inputs) if each.dtype == "float32")
+        return tensor("inputs", place, **values)(before)
+
+    return change
+
+
 COMPARED: dict[str, tuple[Change, str]] = {
     "TensorSpec.name": (renamed, "input image: it is in the baseline alone"),
     "TensorSpec.shape": (tensor("outputs", 0, shape=(1, 2, 2)), "shape"),
@@ -96,6 +104,7 @@ COMPARED: dict[str, tuple[Change, str]] = {
     "TensorSpec.labels": (tensor("outputs", 0, labels=("dy", "dx")), "labels"),
     "TensorSpec.mode": (tensor("outputs", 0, mode="absolute"), "mode 'absolute'"),
     "TensorSpec.max_tokens": (text_input(max_tokens=1), "max_tokens 1 in the candidate"),
+    "TensorSpec.finite": (float_input(finite=False), "finite False in the candidate, True in the baseline"),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),
         "input gripper: it is in the candidate alone",

@@ -15,7 +15,7 @@ from vlatool.gate.config import Gate
 from vlatool.graph.draws import drawing
 from vlatool.graph.files import read
 
-MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens")
+MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
 """What a robot relies on; files of statistics and tokenizers may differ."""
 RATE = ("control_hz", "chunk", "executed")
 FEWER_STEPS = "prune.steps"
