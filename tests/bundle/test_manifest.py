@@ -256,9 +256,11 @@ def test_what_the_manifest_names_needs_a_record():
             check_files(manifest)
 
 
-def test_a_kept_value_needs_a_shape():
-    with pytest.raises(SpecError, match="'memory'"):
-        step(keep={"memory": {}})
+@pytest.mark.parametrize(("kept", "got"), [({}, "None"), ({"shape": []}, r"\[\]"), ([1, 2], r"\[1, 2\]"), (0, "0")])
+def test_a_kept_value_needs_a_shape(kept: object, got: str):
+    with pytest.raises(SpecError, match=f"'memory' needs a shape of one axis or more; got {got}") as caught:
+        step(keep={"memory": kept})
+    assert caught.value.fix.startswith("write it as memory: {shape: [1], dtype: float32}")
 
 
 @pytest.mark.parametrize(

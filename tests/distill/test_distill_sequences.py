@@ -12,13 +12,14 @@ from _recurrent import BATCHES, ENVIRONMENT, LENGTH, recorded, recurrent_bundle
 from _trainings import Killed, digest, distilled, killed_after, raise_killed, training_of
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import DataError, RecipeError
+from vlatool.errors import DataError, RecipeError, SourceError
 from vlatool.module.batched import BatchedProgram
 from vlatool.module.torch_policy import torch_policy
 from vlatool.report import read_report
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
+from vlatool.training.report import along_lines
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 LEARNS = {"steps": 400, "batch": 96, "window": 6, "learning_rate": 0.01, "average": 0.9}
@@ -116,6 +117,35 @@ def test_without_what_is_kept_it_learns_nothing(tmp_path: Path, learnt: Any, mon
     source, named = pair(tmp_path, count=60)
     made = distilled(source, tmp_path / "out", **{**LEARNS, **named})
     assert apart(made, learnt[2]) > 0.8
+
+
+def test_windows_that_begin_at_zero_lose_what_was_remembered_and_the_command_says_so(
+    tmp_path: Path, learnt: tuple[Bundle, Bundle, Bundle]
+):
+    """Each row as if it were the first of its episode; the student that knew better forgets."""
+    _, made, teacher = learnt
+    alone = {**LEARNS, "steps": 150, "loss": "l2", "window": 1, "burn_in": 0, "teacher": str(teacher.path)}
+    forgetful = distilled(made, tmp_path / "out", **alone)
+    assert apart(forgetful, teacher) > 2 * apart(made, teacher)
+    stage = build_stage("distill.policy", {})
+    (said,) = [line for line in stage.lines(forgetful) if line.startswith("warning")]
+    assert "over whole episodes it is further from its teacher than before the training" in said
+    assert said.endswith("(--burn-in 0): leave --burn-in out")
+    assert said in read_report(forgetful.path / "reports").summary
+    assert not [line for line in stage.lines(made) if line.startswith("warning")]
+
+
+@pytest.mark.parametrize(("after", "in_windows", "more", "wanted"), [
+    (0.1, 0.09, {}, ()), (0.3, 0.1, {}, ("3.0 times as far", "take a longer --window")),
+    (1.5, 1.5, {}, ("further", "take a longer --window")), (0.3, 0.1, {"burn_in": 4}, ("3.0 times", "--burn-in 4")),
+])  # fmt: skip
+def test_a_loss_in_windows_that_is_not_that_of_episodes_is_said(
+    after: float, in_windows: float, more: dict[str, int], wanted: tuple[str, ...]
+):
+    along = {"episodes": 2, "observations": 24, "before": 1.0, "after": after, **more}
+    lines = along_lines({"loss": "l1", "losses": [9.0] * 38 + [in_windows] * 2, "along": along})
+    assert len(lines) == 1 + bool(wanted)
+    assert all(part in lines[-1] for part in wanted)
 
 
 @pytest.mark.parametrize("burn_in", [0, 2])
@@ -254,3 +284,13 @@ def test_qat_trains_along_episodes_and_calibrates_on_some(tmp_path: Path):
     with np.load(made.path / "data/played.npz") as played:
         assert len(played["target"]) == 120
         assert np.flatnonzero(played["(begins)"]).tolist() == list(range(0, 120, LENGTH))
+
+
+@pytest.mark.parametrize("stage", ["quantize.qat", "prune.structured", "prune.magnitude"])
+def test_a_state_that_is_not_declared_is_refused_before_anything_is_changed(stage: str, tmp_path: Path):
+    """A trace would hold for ever what it was, and a training would learn nothing of it."""
+    source = recurrent_bundle(tmp_path / "hiding", "hiding", count=4)
+    with pytest.raises(SourceError, match=r"would forget: forward\(\) changes 'before' from call") as caught:
+        run_transform(build_stage(stage, {}), source, tmp_path / "out", Context())
+    assert "declare it with 'keep'" in caught.value.fix
+    assert not (tmp_path / "out").exists()

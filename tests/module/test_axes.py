@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -390,3 +391,44 @@ def test_factors_are_divided_alike():
     factors.divide(third[0], 3)
     factors.unite(one, third)
     assert all(factors.is_frozen(leaf) for leaf in (*factors.leaves(one), *factors.leaves(third)))
+
+
+@pytest.mark.parametrize(("count", "forward"), [
+    (2, lambda self, *values: self.down(self.up(sum(values)))),
+    (1, lambda self, first, *others: self.down(self.up(sum(others, first)))),
+    (3, lambda self, first, *others: self.down(self.up(sum(others, first)))),
+    (2, lambda self, first, second, *others: self.down(self.up(sum(others, first - second)))),
+])  # fmt: skip
+def test_a_forward_may_take_what_is_kept_as_further_arguments(count: int, forward: Callable[..., torch.Tensor]):
+    module = type("Further", (nn.Sequential,), {"forward": forward})()
+    module.up, module.down = nn.Linear(4, 6), nn.Linear(6, 2)
+    small = cut(module.eval(), [torch.randn(1, 4)] * count, [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
+    batch = [torch.randn(3, 4) for _ in range(count)]
+    with torch.no_grad():
+        module.down.weight[:, [1, 3, 5]] = 0
+    torch.testing.assert_close(small(*batch), module(*batch))
+
+
+@pytest.mark.parametrize("convert", [
+    torch.Tensor.float, torch.Tensor.double, lambda x: x.to(torch.float32), lambda x: x.type(torch.float64),
+])  # fmt: skip
+def test_a_cut_module_computes_in_the_dtype_that_a_training_asks_for(convert: Callable[..., torch.Tensor]):
+    """The trace is of float32; conversions in it are of whatever they are given, as in the module."""
+
+    class Converting(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.up, self.down = nn.Linear(4, 6), nn.Linear(6, 2)
+
+        def forward(self, x):
+            return self.down(convert(self.up(x)).float().relu())
+
+    torch.manual_seed(0)
+    module = Converting().eval()
+    small = cut(module, [torch.randn(1, 4)], [Edit("main", "up.weight", "units 0.0", (0, 2, 4))])
+    with torch.no_grad():
+        module.down.weight[:, [1, 3, 5]] = 0
+    x = torch.randn(3, 4)
+    torch.testing.assert_close(small(x), module(x))
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(small(x), module(x), atol=0.02, rtol=0.02)

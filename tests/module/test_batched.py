@@ -128,3 +128,39 @@ def test_a_kept_value_of_another_shape_is_named():
     batched = BatchedProgram(kept_steps([2, 1, 4]), {"main": lambda x, memory, count: (x, memory[:1], count)})
     with pytest.raises(SourceError, match=r"kept value 'memory' is \[1, 1, 4\]; the program declares \[2, 1, 4\]"):
         batched.run({"x": torch.ones(1, 3)}, {})
+
+
+def test_what_a_training_mixes_with_bfloat16_has_a_remedy_of_its_own():
+    """A kept window in float32 does not take what a product in bfloat16 gives."""
+    layer = nn.Linear(3, 3)
+    steps = (ProgramStep("main", {"x": "x", "w": "w"}, {"y": "y", "n": "w"}, keep={"w": {"shape": [1, 2, 3]}}),)
+
+    def scattered(x, window):
+        window = window.scatter(1, torch.zeros(len(x), 1, 3, dtype=torch.int64), layer(x)[:, None])
+        return window.sum(1), window
+
+    batched = BatchedProgram(steps, {"main": scattered})
+    assert batched.run({"x": torch.ones(1, 3)}, {})["y"].shape == (1, 3)
+    with torch.autocast("cpu", torch.bfloat16), pytest.raises(SourceError, match="dtype") as caught:
+        batched.run({"x": torch.ones(1, 3)}, {})
+    assert caught.value.fix == "train in float32: --precision float32"
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float64", "int64", "bool"])
+@pytest.mark.parametrize("rows", [1, 2])
+def test_values_of_any_dtype_are_kept_while_a_training_casts(dtype: str, rows: int):
+    """Autocast itself knows no float16 on a processor, which is no matter of what is kept."""
+    layer = nn.Linear(3, 3)
+    keep = {"w": {"shape": [1, 3], "dtype": dtype}}
+    steps = (ProgramStep("main", {"x": "x", "w": "w"}, {"y": "y", "n": "w"}, keep=keep),)
+
+    def forward(x, kept):
+        assert len(x) == 1, "takes no batch"
+        return layer(x + kept.float()), (kept.float() + x).to(kept.dtype)
+
+    batched, kept = BatchedProgram(steps, {"main": forward}), {}
+    with torch.autocast("cpu", torch.bfloat16):
+        for _ in range(3):
+            kept = batched.kept_of(batched.run({"x": torch.ones(rows, 3)}, kept))
+    assert kept["w"].dtype == getattr(torch, dtype)
+    assert kept["w"].float().unique().tolist() == [1.0 if dtype == "bool" else 3.0]

@@ -1,5 +1,7 @@
 """What forward() remembers is found, whenever it takes effect; what nothing depends on is left alone."""
 
+import dataclasses
+import types
 from collections import deque
 
 import numpy as np
@@ -82,7 +84,34 @@ def rate(self, x):
     return self.linear(x * min(1.0, 10.0 + self.kept))
 
 
+@dataclasses.dataclass
+class State:
+    """What a policy may keep, under names."""
+
+    memory: torch.Tensor = dataclasses.field(default_factory=lambda: torch.zeros(1, 3))
+    step: int = 0
+
+
+def in_a_record(self, x):
+    self.kept.memory = 0.5 * self.kept.memory + x
+    return self.linear(self.kept.memory)
+
+
+def counted_in_a_record(self, x):
+    self.kept = dataclasses.replace(self.kept, step=self.kept.step + 1)
+    return self.linear(x if self.kept.step < 700 else 2 * x)
+
+
+def counted_in_a_dict(self, x):
+    self.kept["step"] += 1
+    return self.linear(x if self.kept["step"] < 700 else 2 * x)
+
+
 REMEMBER = {
+    "a counter in a mapping": (lambda: {"step": 0}, counted_in_a_dict),
+    "a field of a dataclass": (State, in_a_record),
+    "a counter in a dataclass": (State, counted_in_a_record),
+    "a field of a namespace": (lambda: types.SimpleNamespace(memory=torch.zeros(1, 3)), in_a_record),
     "a counter": (0, counted),
     "a counter in a part": (0, counted_in_a_part),
     "a counter that is a tensor": (torch.zeros(()), counted_tensor),
@@ -125,7 +154,13 @@ def appended(self, x):
     return self.linear(x)
 
 
+def logged_in_a_record(self, x):
+    self.kept.step += 1
+    return self.linear(x)
+
+
 HARMLESS = {
+    "a counter for the log in a dataclass": (State, logged_in_a_record),
     "a counter for the log": (0, logged),
     "what is shown": (None, shown),
     "a table that is made once": (dict, cached),
@@ -145,8 +180,15 @@ def test_what_no_output_depends_on_is_left_as_it_was(name):
 
 def test_a_buffer_that_changes_is_found_in_the_trace():
     for buffer, body in ((torch.zeros(()), counted_tensor), (torch.zeros(1, 3), smoothed)):
-        with pytest.raises(SourceError, match="changes the buffer 'kept' from call to call"):
+        with pytest.raises(SourceError, match="changes the buffer 'kept' from call to call") as caught:
             exported_by_torch(Remembering(buffer, body), [torch.ones(1, 3)], STEP, 20)
+        assert caught.value.fix.startswith("let forward() take it as an input and return it")
+
+
+def test_a_normalisation_in_training_mode_is_to_leave_it():
+    with pytest.raises(SourceError, match="would forget") as caught:
+        exported_by_torch(nn.Sequential(nn.BatchNorm1d(3)).train(), [torch.ones(4, 3)], STEP, 20)
+    assert caught.value.fix.startswith("leave the module in evaluation mode")
 
 
 def test_a_buffer_that_is_only_written_is_no_memory():

@@ -13,9 +13,11 @@ from vlatool.data import calibration_recording
 from vlatool.quantize import _calibrated
 from vlatool.quantize._calibrate import calibrate
 from vlatool.quantize._moments import led_to, recorded_moments
+from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.static_int8 import StaticInt8
 from vlatool.quantize.weight_only import WeightOnly
-from vlatool.stage.base import Context, SampleSet
+from vlatool.stage.base import Context, SampleSet, Transform
+from vlatool.stage.run import run_transform
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*calibration samples:UserWarning")
 
@@ -86,3 +88,16 @@ def test_gptq_gives_layers_what_is_kept(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "out").mkdir()
     stage.run(bundle, tmp_path / "out", Context())
     assert np.concatenate(seen).reshape(-1, 2)[:, 0].tolist() == 2 * list(range(1, LENGTH + 1))
+
+
+@pytest.mark.parametrize("stage", [StaticInt8(), DynamicInt8()])
+def test_a_recurrent_layer_that_stays_float32_is_named(tmp_path: Path, stage: Transform):
+    """ONNX has one operator for nn.GRU, and none that multiplies its weights in int8."""
+    said = {}
+    for kind in ("gru", "elman"):
+        bundle, context = exported(tmp_path / kind, kind, count=2), Context()
+        made = run_transform(stage, bundle, tmp_path / f"{kind}-int8", context)
+        said[kind] = [line for line in context.said if "recurrent layer" in line]
+        assert (made.manifest.graphs["main"].precision.get("float32", 0) > 0.5) is (kind == "gru")
+    assert "gru/GRU, gru/GRU_1 computed in float32" in said["gru"][0]
+    assert not said["elman"]

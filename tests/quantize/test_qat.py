@@ -20,7 +20,7 @@ from vlatool.errors import BundleError, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.hardware.profile import load_profile
 from vlatool.module.to_onnx import quiet_exporter
-from vlatool.module.torch_policy import torch_policy
+from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.quantize._blocks import METHODS, Format, Scratch, dequantize, planes_of_rows, quantize_planes
 from vlatool.quantize.qat import Qat
 from vlatool.rebuild.rebuild import rebuild
@@ -31,6 +31,7 @@ from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
 from vlatool.stage.run import run_transform
 from vlatool.training.fake_quantization import fake_quantization, in_blocks, per_channel, per_tensor
+from vlatool.user_code import trust
 
 
 @pytest.fixture(autouse=True)
@@ -116,6 +117,61 @@ def test_what_rounding_costs_is_learnt_away(policy_dir: Path, tmp_path: Path, we
     assert errors[1] < 0.8 * errors[0]
     assert [entry["stage"] for entry in start.manifest.build][-3:-1] == ["quantize.qat", "export.onnx"]
     assert rebuild(start, Context(), source=str(policy_dir), cache=tmp_path / "cache").identical
+
+
+NORMALISED = """\
+import torch
+from torch import nn
+
+
+def make():
+    torch.manual_seed(0)
+    body = nn.Sequential(
+        nn.Conv1d(4, 8, 3, padding=1, bias=False), nn.BatchNorm1d(8, momentum=None), nn.ReLU(),
+        nn.Conv1d(8, 8, 3, padding=1, groups=4), nn.BatchNorm1d(8, affine=False), nn.ReLU(), nn.BatchNorm1d(8),
+        nn.Conv1d(8, 8, 1), nn.BatchNorm1d(8, track_running_stats=False), nn.Flatten(),
+        nn.Linear(48, 8), nn.BatchNorm1d(8), nn.ReLU(), nn.Linear(8, 2), nn.Unflatten(1, (1, 2)),
+    )
+    for layer in body:
+        if getattr(layer, "running_var", None) is not None:
+            layer.running_mean.normal_()
+            layer.running_var.uniform_(0.2, 4)
+    body[1].running_mean[0], body[1].running_var[0] = 0, 1e-14  # of a channel that is nearly always the same
+    body[0].weight.data[0] *= 1e-7
+    return body.train()
+"""
+NORMALISED_YAML = """\
+schema: 1
+name: normalised
+version: 1.0.0
+source: policy.py:make
+spec:
+  inputs: [{name: seen, shape: [1, 4, 6], dtype: float32, unit: m}]
+  outputs: [{name: action, shape: [1, 1, 2], dtype: float32, unit: m, labels: [dx, dy], mode: delta}]
+  control_hz: 10
+  chunk: 1
+calibration: calibration.npz
+"""
+
+
+def test_statistics_of_normalisations_stay_and_the_export_is_what_was_trained(tmp_path: Path):
+    """Whatever mode make() leaves the module in: what is trained are weights, with the statistics that are exported."""
+    policy = tmp_path / "policy"
+    policy.mkdir()
+    (policy / "policy.py").write_text(NORMALISED)
+    (policy / "policy.yaml").write_text(NORMALISED_YAML)
+    np.savez(policy / "calibration.npz", seen=np.random.default_rng(0).normal(size=(40, 4, 6)).astype(np.float32))
+    trust.name(policy)
+    source = run_transform(TorchModule(policy=policy), None, tmp_path / "source", Context())
+    options = {"steps": 8, "batch": 6, "average": 0.5, "episodes": 0, "student_episodes": 0, "learning_rate": 0.01}
+    tuned = run_transform(build_stage("quantize.qat", {**options, "threads": 1}), source, tmp_path / "tuned", Context())
+    before, after = (load_modules(bundle)["main"].state_dict() for bundle in (source, tuned))
+    for name, value in before.items():
+        assert torch.equal(value, after[name]) is not name.endswith(("weight", "bias")), name
+    exported = run_transform(ExportOnnx(), tuned, tmp_path / "float32", Context())
+    trained = torch_policy(tuned, 0)
+    assert error(load(exported.path), trained, source) < 1e-5
+    assert error(trained, torch_policy(source, 0), source) > 1e-3
 
 
 def test_the_policy_need_not_be_changed_before(source_bundle: Bundle):

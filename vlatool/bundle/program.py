@@ -64,11 +64,19 @@ def _check_noise(value: str, noise: Any) -> None:
 
 
 def _check_kept(value: str, kept: Any) -> None:
-    if not isinstance(kept, Mapping) or not kept.get("shape"):
-        raise SpecError(f"The kept value '{value}' needs a shape.")
+    shape = kept.get("shape") if isinstance(kept, Mapping) else kept
+    if not isinstance(kept, Mapping) or not shape:
+        raise SpecError(
+            f"The kept value '{value}' needs a shape of one axis or more; got {shown(shape)}.",
+            f"write it as {value}: {{shape: [1], dtype: float32}}; a single number is such a value, too, and "
+            "forward() takes and returns it with that axis",
+        )
     known(kept, ("shape", "dtype"), f"The kept value '{value}'", SpecError)
     if kept.get("dtype", "float32") not in DTYPES:
-        raise SpecError(f"The kept value '{value}' has the dtype {shown(kept['dtype'])}; allowed: {', '.join(DTYPES)}.")
+        raise SpecError(
+            f"The kept value '{value}' has the dtype {shown(kept['dtype'])}; allowed: {', '.join(DTYPES)}.",
+            "keep it as one of them, bfloat16 as float32, and let forward() convert it when it takes and returns it",
+        )
     elements = axes(kept["shape"], f"the shape of the kept value '{value}'", SpecError)
     check("elements", elements, f"The kept value '{value}'", SpecError)
 

@@ -110,7 +110,7 @@ class BatchedProgram:
         if size == 1 or self._batches:
             return run(inputs, others)
         rows = [run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(size)]
-        return {name: require("torch", "build").cat([row[name] for row in rows]) for name in rows[0]}
+        return _together(rows)
 
     def look(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> None:
         """Find out with a first batch whether the modules take batches; where runs are changed, look before that."""
@@ -141,7 +141,7 @@ class BatchedProgram:
     def _alone(self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return what the first two rows give, each for itself."""
         rows = [self._run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(2)]
-        return {name: require("torch", "build").cat([row[name] for row in rows]) for name in rows[0]}
+        return _together(rows)
 
     def _is_same(
         self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor], wanted: Mapping[str, Tensor]
@@ -257,6 +257,13 @@ def _dtype_of(numbers: Sequence[float]) -> Any:
     return torch.int64 if all(isinstance(number, int) for number in numbers) else torch.float32
 
 
+def _together(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Put single rows behind each other, whatever their dtype: autocast refuses float16 on a processor."""
+    torch = require("torch", "build")
+    with torch.autocast("cpu", enabled=False):
+        return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+
+
 def _rows(values: Mapping[str, Tensor], start: int, end: int) -> dict[str, Tensor]:
     return {name: value[start:end] for name, value in values.items()}
 
@@ -281,7 +288,7 @@ def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
         raise SourceError(
             f"The policy fails on an observation that fits its spec: {type(error).__name__}: "
             f"{(message_of(error).splitlines() or [''])[0]} (given {shapes}).",
-            remedy_for(error) or FITS,
+            _remedy_of_casting(error) or remedy_for(error) or FITS,
         ) from error
     outputs = outputs_of(result, step)
     for name, value in zip(step.gives, outputs, strict=True):
@@ -291,6 +298,14 @@ def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
                 "return a tensor, or a tuple of tensors in the order of 'gives'",
             )
     return outputs
+
+
+def _remedy_of_casting(error: Exception) -> str:
+    """Say what helps where a module mixes what a training casts to bfloat16 with what it leaves in float32."""
+    torch = require("torch", "build")
+    cast = torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")
+    about = any(word in message_of(error) for word in ("dtype", "autocast"))
+    return "train in float32: --precision float32" if cast and about else ""
 
 
 def drawn(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.Generator) -> dict[str, Tensor]:

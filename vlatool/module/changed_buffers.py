@@ -11,6 +11,13 @@ REMEDY = (
     "docs/guides/recurrent-policy.md"
 )
 
+STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
+"""Buffers of torch's normalisations, which change in training mode."""
+EVALUATION = (
+    "leave the module in evaluation mode: let forward() call no train(), nor a normalisation with training=True; "
+    "statistics that shall change on the robot are declared with 'keep': docs/guides/recurrent-policy.md"
+)
+
 
 def refuse_changed_buffers(exported: Any, graph: str) -> None:
     """Look for buffers that a traced module changes and whose old value an output depends on.
@@ -26,7 +33,8 @@ def refuse_changed_buffers(exported: Any, graph: str) -> None:
     changed = {*signature.buffers_to_mutate.values()}
     for placeholder, buffer in signature.inputs_to_buffers.items():
         if buffer in changed and _reached(exported.graph, placeholder) & {*signature.user_outputs}:
-            raise forgets(graph, f"the buffer '{buffer}'")
+            fix = EVALUATION if buffer.rpartition(".")[2] in STATISTICS else REMEDY
+            raise forgets(graph, f"the buffer '{buffer}'", fix)
 
 
 def _reached(graph: Any, start: str) -> set[str]:
@@ -38,10 +46,10 @@ def _reached(graph: Any, start: str) -> set[str]:
     return reached
 
 
-def forgets(graph: str, what: str) -> SourceError:
+def forgets(graph: str, what: str, fix: str = REMEDY) -> SourceError:
     """Return the error for a graph whose module remembers something that its outputs depend on."""
     return SourceError(
         f"The graph '{graph}' would forget: forward() changes {what} from call to call, and its outputs depend on it; "
         "an exported graph sees it as it is now, for ever.",
-        REMEDY,
+        fix,
     )

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from vlatool.module.edit import Edit
 
+ASSERTED = "_assert_tensor_metadata"
+"""Operator that a trace has before each conversion: dtype and device as they were then, other ones in a training."""
 RETRACE = "vlatool_retrace"
 """Attribute of a cut module that takes one batch size alone: gives the same module for another size."""
 
@@ -37,8 +39,8 @@ def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
     """
     torch = require("torch", "build")
     axes = tuple({0: torch.export.Dim.AUTO} if feed.dim() and len(feed) > 1 else None for feed in feeds)
-    kinds = [parameter.kind for parameter in inspect.signature(module.forward).parameters.values()]
-    free = (axes,) if inspect.Parameter.VAR_POSITIONAL in kinds else axes
+    named = _named_arguments(module, len(feeds))
+    free = axes if named == len(feeds) else (*axes[:named], axes[named:])
     try:
         with quiet_exporter(), torch.no_grad(), exits_caught("the policy's forward()"):
             return torch.export.export(module, tuple(feeds), dynamic_shapes=free, strict=False)
@@ -50,6 +52,13 @@ def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
             f"torch.export cannot trace {type(module).__name__}: {type(error).__name__}: {reason}.",
             "prune what needs no trace: vlatool prune depth, vlatool prune neurons",
         ) from error
+
+
+def _named_arguments(module: nn.Module, count: int) -> int:
+    """Return how many of so many arguments have a name in ``forward``; the others go to its ``*arguments``."""
+    kinds = [parameter.kind for parameter in inspect.signature(module.forward).parameters.values()]
+    several = inspect.Parameter.VAR_POSITIONAL
+    return min(count, kinds.index(several)) if several in kinds else count
 
 
 def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn.Module:
@@ -121,7 +130,10 @@ def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> n
     keep = {_leaf(walk, edit): edit.keep for edit in edits}
     resizer = Resizer(walk, keep)
     for node in list(program.graph.nodes):
-        resizer.resize(node)
+        if getattr(node.target, "_opname", "") == ASSERTED:
+            program.graph.erase_node(node)
+        else:
+            resizer.resize(node)
     state, cut_once = program.state_dict, dict[int, Any]()
     for name, shape in walk.weights.items():
         holder = state if name in state else program.constants

@@ -7,14 +7,21 @@ putting other values into those that changed.
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import types
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
+from vlatool.data import observations_for
 from vlatool.errors import VlatoolError, require
 from vlatool.module.changed_buffers import forgets
 from vlatool.module.torch_policy import TorchSession
+from vlatool.runtime.observation import ObservationEncoder
+from vlatool.runtime.program import Program
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -27,6 +34,30 @@ LONGER = 32
 """How many times as long a list is made: it may take effect once it is full."""
 SAME = 1e-5
 """Relative and absolute difference of outputs up to which they are equal."""
+
+
+def refuse_hidden_state(bundle: Bundle, modules: Mapping[str, nn.Module]) -> None:
+    """Run a policy on two observations and look at all its modules with ``refuse_kept_values``.
+
+    What changes modules looks before it begins: a trace holds for ever what an attribute was, and a training of single
+    observations learns nothing of it.
+
+    Args:
+        bundle: Of the policy.
+        modules: Graph name -> module.
+
+    Raises:
+        SourceError: naming the attribute.
+    """
+    sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
+    program, encode = (
+        Program(bundle.manifest.program, sessions, seed=0),
+        ObservationEncoder(bundle.manifest.spec, bundle),
+    )
+    for observation in observations_for(bundle, 2):
+        program.run(encode(observation))
+    for session in sessions.values():
+        refuse_kept_values(session.module, session.step, session.last_feeds)
 
 
 def refuse_kept_values(module: nn.Module, step: ProgramStep, feeds: Sequence[Mapping[str, Any]]) -> None:
@@ -77,7 +108,25 @@ def _plain(value: Any) -> Any:
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, deque)):
         return [_plain(item) for item in value]
-    return None
+    return _plain(_fields(value)) if _is_record(value) else None
+
+
+def _is_record(value: Any) -> bool:
+    """Say whether a value is an object of named fields."""
+    return isinstance(value, types.SimpleNamespace) or (dataclasses.is_dataclass(value) and not isinstance(value, type))
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    if isinstance(record, types.SimpleNamespace):
+        return vars(record)
+    return {each.name: getattr(record, each.name) for each in dataclasses.fields(record)}
+
+
+def _record_of(like: Any, fields: Mapping[str, Any]) -> Any:
+    made = copy.copy(like)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
 def _differ(one: Any, other: Any) -> bool:
@@ -99,7 +148,7 @@ def _copy(value: Any) -> Any:
         return {key: _copy(item) for key, item in value.items()}
     if isinstance(value, (list, deque)):
         return _filled(value, [_copy(item) for item in value])
-    return value
+    return _record_of(value, _copy(_fields(value))) if _is_record(value) else value
 
 
 def _others(value: Any) -> Iterator[Any]:
@@ -120,7 +169,15 @@ def _others(value: Any) -> Iterator[Any]:
             yield _filled(value, [_one_of(item, place) for item in value] * LONGER)
     elif isinstance(value, dict):
         yield {}
-        yield from ({key: _one_of(item, place) for key, item in value.items()} for place in range(len(FACTORS)))
+        yield from _with_others(value)
+    elif _is_record(value):
+        yield from (_record_of(value, fields) for fields in _with_others(_fields(value)))
+
+
+def _with_others(fields: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield a mapping with other values."""
+    most = max((len([*_others(item)]) for item in fields.values()), default=0)
+    yield from ({key: _one_of(item, place) for key, item in fields.items()} for place in range(most))
 
 
 def _filled(like: Any, items: list[Any]) -> Any:

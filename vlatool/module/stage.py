@@ -20,6 +20,7 @@ from vlatool.module.description import read_location
 from vlatool.module.edits import FOLDER, Edit, apply, holds_weights, joined_edits, read_edits, write_module
 from vlatool.module.failures import remedy_for
 from vlatool.module.faked import as_float32, run_faked
+from vlatool.module.memory import refuse_hidden_state
 from vlatool.module.origin import factory_of
 from vlatool.module.stored import stored_modules, takes_shards, weights_read
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy
@@ -126,6 +127,7 @@ class ModuleStage(Transform):
     def _changed(self, bundle: Bundle, out: Path, context: Context) -> Bundle:
         """Change the modules and write them; nothing keeps them while what was written runs."""
         modules = load_modules(bundle)
+        refuse_hidden_state(bundle, modules)
         done = self.change(modules, bundle, context)
         return self._written(bundle, out, done, apply(modules, done.edits, bundle), context)
 

@@ -39,6 +39,8 @@ Reduced = TypeVar("Reduced", bound="Quantization")
 QuantizeGraph = Callable[[str, Path, Path], str | None]
 """Graph name, original file, new file -> dtype of what is not quantized (float32 when None)."""
 QUANTIZED_OPS = ("MatMul", "Gemm", "Conv")
+RECURRENT = ("GRU", "LSTM", "RNN")
+"""Operators that are several products and gates at once; those with int8 products are written in other ones."""
 TRAINED = "quantize.qat"
 """Stage after which the command line quantizes at once."""
 REDUCE_RANGE = (
@@ -223,6 +225,22 @@ def check_ops(ops: Iterable[str]) -> None:
                 f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.",
                 instead(name, QUANTIZED_OPS),
             )
+
+
+def left_whole(name: str, model: Any) -> list[str]:
+    """Say which recurrent layers of a graph keep their products in float32; nothing where there are none.
+
+    Args:
+        name: Of the graph.
+        model: An ``onnx.ModelProto``.
+    """
+    layers = [node.name for node in model.graph.node if node.op_type in RECURRENT]
+    if not layers:
+        return []
+    return [
+        f"{name}: {', '.join(layers)} computed in float32: a recurrent layer is one operator of ONNX, whose products "
+        "cannot be quantized; those of cells can (nn.GRUCell, nn.LSTMCell)"
+    ]
 
 
 def reduced_on_this_host(stage: Reduced, engine: str) -> Reduced:

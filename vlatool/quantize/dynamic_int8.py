@@ -14,7 +14,14 @@ from vlatool.graph.layers import Layer, check_weights, part_inner_gemms, split_g
 from vlatool.graph.onnx_graph import OnnxGraph
 from vlatool.graph.qdq import quantize_weight
 from vlatool.machine.instruction_sets import saturates
-from vlatool.quantize._base import REDUCE_RANGE, REDUCED, Quantization, quiet_quantizer, reduced_on_this_host
+from vlatool.quantize._base import (
+    REDUCE_RANGE,
+    REDUCED,
+    Quantization,
+    left_whole,
+    quiet_quantizer,
+    reduced_on_this_host,
+)
 from vlatool.runtime.engines import build_tool
 from vlatool.stage.base import Context, source_of
 from vlatool.weights.pairs import largest_sums
@@ -48,13 +55,14 @@ class DynamicInt8(Quantization):
         layers = self.layers_of(bundle, OPS)
 
         def quantize(name: str, original: Path, target: Path) -> None:
-            self._quantize(original, target, layers[name])
+            model = load(original)
+            context.said.extend(left_whole(name, model))
+            self._quantize(model, target, layers[name])
 
         return self.transform(bundle, out, context, quantize)
 
-    def _quantize(self, original: Path, target: Path, layers: list[Layer]) -> None:
-        quantization = build_tool("quantization")
-        model, names = load(original), {layer.name for layer in layers}
+    def _quantize(self, model: Any, target: Path, layers: list[Layer]) -> None:
+        quantization, names = build_tool("quantization"), {layer.name for layer in layers}
         check_weights(model, layers)
         split_gemm(model)  # ONNX Runtime's own way turns a weight in place for each of its readers
         part_inner_gemms(model)

@@ -23,7 +23,14 @@ from vlatool.graph.layers import (
 )
 from vlatool.graph.qdq import Range, insert_qdq
 from vlatool.machine.instruction_sets import saturates
-from vlatool.quantize._base import QUANTIZED_OPS, REDUCE_RANGE, REDUCED, check_ops, reduced_on_this_host
+from vlatool.quantize._base import (
+    QUANTIZED_OPS,
+    REDUCE_RANGE,
+    REDUCED,
+    check_ops,
+    left_whole,
+    reduced_on_this_host,
+)
 from vlatool.quantize._calibration import Calibrated
 from vlatool.quantize._conv1x1 import use_convolutions
 from vlatool.quantize._early import quantize_early
@@ -169,6 +176,7 @@ class StaticInt8(Calibrated):
 
         def quantize(name: str, original: Path, target: Path) -> str:
             model = load(original)
+            context.said.extend(left_whole(name, model))
             pixels: dict[str, Range] = {}
             if self.form.integer:
                 split_gemm(model)

@@ -14,7 +14,7 @@ from vlatool.render import write_reports
 from vlatool.report import TEACHER, TRAINED, TRAINING_TIME, Measurement, Report, Row
 from vlatool.training.forecast import duration
 from vlatool.training.supervision import teacher_lines, teacher_record
-from vlatool.training.unseen import BEFORE, KEY, NEW
+from vlatool.training.unseen import APART, BEFORE, KEY, NEW
 
 Record = dict[str, Any]
 
@@ -61,7 +61,24 @@ def along_lines(training: Mapping[str, Any]) -> tuple[str, ...]:
         return ()
     of = f"{about['observations']} observations of {about['episodes']} whole episodes"
     losses = f"{training['loss']} {about['before']:.4g} -> {about['after']:.4g}"
-    return (f"{losses} over {of}, with what is kept carried along",)
+    return (f"{losses} over {of}, with what is kept carried along", *_warning(training))
+
+
+def _warning(training: Mapping[str, Any]) -> tuple[str, ...]:
+    """Say whether a student that keeps values does worse along episodes than before, or than in its windows."""
+    about, losses = training["along"], training["losses"]
+    few = max(1, len(losses) // 20)
+    in_windows = sum(losses[-few:]) / few
+    if about["after"] > about["before"]:
+        worse = "it is further from its teacher than before the training"
+    elif about["after"] > APART * in_windows:
+        worse = f"it is {about['after'] / in_windows:.1f} times as far from its teacher as in its windows"
+    else:
+        return ()
+    cut = about.get("burn_in")
+    shorter = f"what a robot keeps by then is not what it had there (--burn-in {cut}): leave --burn-in out"
+    remedy = "take a longer --window, or a lower --learning-rate" if cut is None else shorter
+    return (f"warning: over whole episodes {worse} ({in_windows:.4g} in windows): {remedy}",)
 
 
 def _round(about: Record) -> Record:

@@ -183,8 +183,10 @@ class Session:
         if when == "after" or not self._trainer.step:
             places = self._frames.sample((0,), MOST)
             how = self._lesson.examined, self._plan.batch, self._settings.device
-            about[ALONG] = {**about.get(ALONG, {}), "episodes": len(places), "observations": self._frames.weigh(places),
-                            when: mean_loss(self._frames, places, *how)}  # fmt: skip
+            counts = {"episodes": len(places), "observations": self._frames.weigh(places)}
+            cut = {} if self._lesson.unroll.burn_in is None else {"burn_in": self._lesson.unroll.burn_in}
+            far = {when: mean_loss(self._frames, places, *how)}
+            about[ALONG] = {**about.get(ALONG, {}), **counts, **cut, **far}
             self._keep(0, about)
 
     def _train(self, end: int) -> None:
