@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,7 @@ from vlatool.report import Measurement, Report, Row
 from vlatool.stage.base import Context
 from vlatool.stage.build import build_stage
 from vlatool.stage.run import cached_measure
+from vlatool.user_code import trust
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +112,27 @@ def test_disturbances_are_the_same_again_and_change_with_their_strength(bundles:
 
     assert path(1.0) == path(1.0)
     assert evaluated(bundles, "good", 6, disturb=("push",), strength=0.0).rows[-1].value("success_disturbed") == 1.0
+
+
+IDLE = "under push, strength 1, all 6 episodes of .* went as without it, step for step"
+
+
+@pytest.mark.parametrize(("change", "strength", "warned"), [
+    (("def disturb(", "def disturb(self, *_):\n        pass\n\n    def earlier("), 1.0, True),
+    (("", ""), 1.0, False), (("", ""), 0.0, False),
+], ids=["does nothing", "pushes", "strength 0"])  # fmt: skip
+def test_a_disturbance_that_changes_nothing_is_told(
+    bundles: dict[str, Bundle], tmp_path: Path, change: tuple[str, str], strength: float, warned: bool
+):
+    """Otherwise a policy would seem to bear what it never met."""
+    folder = Path(shutil.copytree(bundles["good"].path.parent / "policy", tmp_path / "policy"))
+    code = (folder / "environment.py").read_text()
+    assert change[0] in code
+    (folder / "environment.py").write_text(code.replace(*change, 1) if change[0] else code)
+    trust.name(folder)
+    stage = ClosedLoop(policy=folder, episodes=6, disturb=("push",), strength=strength)
+    told = " ".join(stage.run(bundles["good"], Context()).warnings)
+    assert bool(re.search(IDLE, told)) == warned, told
 
 
 def test_disturbances_follow_each_other_with_commas_or_one_by_one(bundles: dict[str, Bundle]):

@@ -177,6 +177,15 @@ def test_what_was_just_made_stays(kept: Bundle, cache: Path):
     assert prune(cache, older_than_s=0).stays[f"stages/{kept.path.name}"] == "was made or used in the last 60 s"
 
 
+def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch):
+    """Its folder is as old as the last file in it, but nobody has had the time to lock it."""
+    monkeypatch.setattr("vlatool.files.writing._flush", lambda folder: os.utime(folder, (0, 0)))
+    monkeypatch.setattr("vlatool.stage.run.hold", lambda path: False)
+    made = cached_transform(DynamicInt8(), float_bundle, cache, Context())
+    assert prune(cache, older_than_s=DAY).entries == ()
+    assert Bundle.open(made.path)
+
+
 def test_an_entry_that_is_gone_cannot_be_held(kept: Bundle, cache: Path):
     prune(cache, older_than_s=0)
     assert not hold(kept.path)

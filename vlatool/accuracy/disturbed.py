@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -58,6 +58,27 @@ def with_disturbed(
     rate = Measurement("success_disturbed", wins / count, "1", samples=count, low=low, high=high, note=note)
     measurements, details = (*row.measurements, rate), {**row.details, TABLE: records}
     return replace(row, measurements=measurements, raw={**row.raw, **raw}, details=details)
+
+
+def without_effect(name: str, played: Mapping[Disturbance, Played], undisturbed: Played) -> Iterator[str]:
+    """Yield a warning for each disturbance that changed nothing, so that what is kept under it shows nothing.
+
+    Args:
+        name: Of the variant.
+        played: Disturbance -> its episodes, of one seed after the other.
+        undisturbed: Those of the same seeds without any.
+    """
+    for (kind, strength), outcomes in played.items():
+        if strength and list(map(_course, outcomes)) == list(map(_course, undisturbed)):
+            yield (
+                f"under {kind}, strength {strength:g}, all {len(outcomes)} episodes of {name} went as without it, step "
+                "for step, so that they do not show what it costs; see that it changes what the policy is given"
+            )
+
+
+def _course(outcome: Outcome) -> tuple[Any, ...]:
+    """Return what tells two episodes of a seed apart."""
+    return outcome.task, outcome.seed, outcome.success, outcome.steps, outcome.start, dict(outcome.motion)
 
 
 def worst_record(row: Row) -> tuple[Mapping[str, Any], str] | None:

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 from pydantic_core import PydanticCustomError
 
 from vlatool.accuracy.credibility import Credibility, credibility
-from vlatool.accuracy.disturbed import with_disturbed
+from vlatool.accuracy.disturbed import with_disturbed, without_effect
 from vlatool.accuracy.moved import START
 from vlatool.accuracy.paired import Outcome, compare_success, repeated_starts, success_row, with_chance
 from vlatool.accuracy.shown import with_episode
@@ -212,6 +212,7 @@ class ClosedLoop(Measure):
             played = [self._disturbed(kinds, late(jobs, wait), one, context, whose)
                       for one, wait, whose in zip(bundles, waits, self._whose(names), strict=True)]  # fmt: skip
             row = with_disturbed(row, played[-1], played[0] if self.baseline else None)
+            context.notes.extend(without_effect(names[-1], played[-1], outcomes))
         again = played_again(jobs[0], [*reference, outcomes], plays, bundles, context)
         if again.outcomes:
             rows, row = [with_episode(rows[0], again.outcomes[0])], with_episode(row, again.outcomes[1])

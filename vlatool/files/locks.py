@@ -25,7 +25,7 @@ def hold(directory: Path) -> bool:
         return not isinstance(error, FileNotFoundError | NotADirectoryError)  # too many files are open: unlocked then
     try:
         fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        if not _is_at(handle, name):
+        if not is_at(handle, name):
             os.close(handle)
             return False
     except OSError:
@@ -55,7 +55,7 @@ def alone(path: Path) -> Iterator[bool]:
         return
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        got = _is_at(handle, os.fspath(path))
+        got = is_at(handle, os.fspath(path))
     except OSError:
         got = False
     try:
@@ -64,7 +64,7 @@ def alone(path: Path) -> Iterator[bool]:
         os.close(handle)
 
 
-def _is_at(handle: int, path: str) -> bool:
+def is_at(handle: int, path: str) -> bool:
     """Say whether an open directory is still the one of that name."""
     with contextlib.suppress(OSError):
         return os.path.samestat(os.fstat(handle), os.lstat(path))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.files.edited import is_own, stamped, whole_file
+from vlatool.files.locks import is_at
 from vlatool.files.printable import file_of
 
 LOCK = "lock"
@@ -32,14 +33,27 @@ def work_directory(place: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _locked(place: Path, how: int) -> Iterator[None]:
-    place.mkdir(parents=True, exist_ok=True)
-    _sweep(place)
-    handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    handle = _lock_of(place, how)
     try:
-        fcntl.flock(handle, how)
         os.utime(place / LOCK)
         yield
     finally:
+        os.close(handle)
+
+
+def _lock_of(place: Path, how: int) -> int:
+    """Wait for the lock of a work directory; a run that had it may have removed both, and others have made it anew."""
+    while True:
+        place.mkdir(parents=True, exist_ok=True)
+        _sweep(place)
+        handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, how)
+            if is_at(handle, os.fspath(place / LOCK)):
+                return handle
+        except BaseException:
+            os.close(handle)
+            raise
         os.close(handle)
 
 

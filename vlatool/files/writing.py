@@ -142,6 +142,7 @@ def writing(final: Path, *, force: bool = False, damaged: bool = False) -> Itera
             yield draft.content
             note(draft.content)
             _flush(draft.content)
+            os.utime(draft.content)  # flushing may take minutes, and what is old may be pruned
             _move(draft, final, force, damaged)
     finally:
         os.close(lock)
