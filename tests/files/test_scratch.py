@@ -201,12 +201,16 @@ def test_what_a_killed_process_left_is_removed_by_the_next(temporary: Path) -> N
         assert list(temporary.iterdir()) == [folder]
 
 
-@pytest.mark.parametrize("name", [f"vlatool-{os.getpid()}-12345678", "vlatool-12345678", "vlatool-x-12345678",
-                                  f"vlatool-{GONE}-1234567", f"vlatool-{GONE}-12345678.bak"])  # fmt: skip
+OTHERS = ("vlatool-{own}-12345678", "vlatool-12345678", "vlatool-x-12345678", "vlatool-{gone}-1234567",
+          "vlatool-{gone}-12345678.bak")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHERS)
 def test_what_is_in_use_or_somebody_elses_stays(temporary: Path, name: str) -> None:
-    (temporary / name).mkdir()
+    place = temporary / name.format(own=os.getpid(), gone=GONE)
+    place.mkdir()
     with scratch_directory():
-        assert (temporary / name).is_dir()
+        assert place.is_dir()
 
 
 def test_a_link_is_not_followed_and_a_held_lock_counts(temporary: Path, tmp_path: Path) -> None:
