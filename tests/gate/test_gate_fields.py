@@ -96,6 +96,7 @@ COMPARED: dict[str, tuple[Change, str]] = {
     "TensorSpec.labels": (tensor("outputs", 0, labels=("dy", "dx")), "labels"),
     "TensorSpec.mode": (tensor("outputs", 0, mode="absolute"), "mode 'absolute'"),
     "TensorSpec.max_tokens": (text_input(max_tokens=1), "max_tokens 1 in the candidate"),
+    "TensorSpec.finite": (tensor("inputs", 1, finite=False), "finite False in the candidate"),
     "PolicySpec.inputs": (
         lambda before: spec(inputs=(*before.spec.inputs, TensorSpec("gripper", (1, 1))))(before),
         "input gripper: it is in the candidate alone",

@@ -15,7 +15,7 @@ from vlatool.gate.config import Gate
 from vlatool.graph.draws import drawing
 from vlatool.graph.files import read
 
-MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens")
+MEANING = ("shape", "dtype", "kind", "unit", "labels", "mode", "max_tokens", "finite")
 """What a robot relies on; files of statistics and tokenizers may differ."""
 RATE = ("control_hz", "chunk", "executed")
 FEWER_STEPS = "prune.steps"
@@ -72,7 +72,7 @@ def _scene(mine: Manifest, theirs: Manifest) -> str:
     """
     if not mine.environment:
         return ""
-    keys = dict.fromkeys((*theirs.environment, *mine.environment))
+    keys = [key for key in dict.fromkeys((*theirs.environment, *mine.environment)) if key != "timeout"]
     pairs = [(key, mine.environment.get(key), theirs.environment.get(key)) for key in keys]
     return "; ".join(text for key, one, two in pairs if (text := _told(f"environment: {key}", one, two)))
 
