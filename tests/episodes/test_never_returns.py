@@ -129,13 +129,13 @@ def test_what_is_waited_for_is_said(tmp_path: Path, float_bundle: Bundle):
     told: list[str] = []
     folder = world(tmp_path / "world", "reset()", "time.sleep(2.5)")
     outcomes = run_jobs(
-        float_bundle, [job(folder, timeout_s=60.0)], "", Context(lambda what, _share: told.append(what))
+        float_bundle, [job(folder, timeout_s=10.0)], "", Context(lambda what, _share: told.append(what))
     )
     assert len(outcomes) == 2
     waiting = [what for what in told if what.startswith("waiting")]
     assert waiting[:2] == [
-        "waiting for reset() of task 'reach' at seed 17, 1 s of 60 s",
-        "waiting for reset() of task 'reach' at seed 17, 2 s of 60 s",
+        "waiting for reset() of task 'reach' at seed 17, 1 s of 10 s",
+        "waiting for reset() of task 'reach' at seed 17, 2 s of 10 s",
     ]
     assert not [what for what in told if what.startswith("ended")]
 

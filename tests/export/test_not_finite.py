@@ -11,7 +11,7 @@ import pytest
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import PolicySpec, TensorSpec
-from vlatool.data import calibration_recording, observations_for, synthetic_observations, with_not_finite
+from vlatool.data import Drawer, calibration_recording, observations_for, synthetic_observations, with_not_finite
 from vlatool.errors import DataError, GraphError, RecipeError, SpecError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.export.onnx import ExportOnnx
@@ -207,6 +207,14 @@ def test_a_recording_may_hold_them_in_that_input_alone(tmp_path: Path):
         match=rf"'state' in {tmp_path}/other/calibration.npz is not finite in 1 of 24 samples; the first is sample 5",
     ):
         source(tmp_path / "other", POLICIES["where"], **arrays)
+
+
+def test_drawn_observations_of_a_gate_hold_them_in_that_input_alone(tmp_path: Path):
+    bundle = source(tmp_path / "policy", POLICIES["where"])
+    drawn = [each.observation for each in Drawer(bundle).draw(32, np.random.default_rng(0))]
+    whole = [bool(np.isfinite(each["depth"]).all()) for each in drawn]
+    assert 0 < sum(whole) < 32
+    assert all(np.isfinite(each["state"]).all() for each in drawn)
 
 
 def test_a_recording_with_them_evaluates(tmp_path: Path):

@@ -84,6 +84,15 @@ def test_int4_blocks_lie_on_the_grid_of_weight_only():
     assert in_blocks(torch.randn(3, 40)).shape == (3, 40)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_values_that_are_not_finite_stay_as_they_are(value):
+    values = torch.tensor([0.1, value, 3.3], requires_grad=True)
+    given = per_tensor(values)
+    assert torch.equal(torch.nan_to_num(given), torch.nan_to_num(values))
+    torch.nan_to_num(given, 0.0, 0.0, 0.0).sum().backward()
+    assert values.grad.tolist() == [1, 0, 1]
+
+
 def test_uint8_values_hold_zero():
     values = per_tensor(torch.tensor([0.0, 0.5, 3.0, 10.0]))
     assert float(values[0]) == 0

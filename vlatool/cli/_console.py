@@ -269,7 +269,10 @@ def _printable(value: Any) -> Any:
 
 
 MISSED = "change the policy, the options or the limit: each limit stands above with what was measured"
-UNDECIDED = "measure more: the report says what would decide (--episodes, --samples, --iterations)"
+UNDECIDED = (
+    "where samples are missing, measure more (--episodes, --samples, --iterations); where the reference fails, look at "
+    "its wrapper and data first: vlatool verify; the report says which"
+)
 
 
 def raise_verdict(report: Report) -> None:

@@ -76,9 +76,8 @@ def failure(error: BaseException, words: Sequence[str]) -> Failure:
         return Failure("OSError", "the reader of the output is gone.", "", OK)
     if isinstance(error, OSError):
         where = file_of(error) or ("standard output" if _printing(error) else "a file")
-        return Failure(
-            "OSError", f"{where}: {error.strerror or error}.", OF_SYSTEM.get(error.errno or 0, READABLE), INPUT
-        )
+        fix = OF_SYSTEM.get(error.errno or 0, READABLE) if file_of(error) else ""
+        return Failure("OSError", f"{where}: {error.strerror or error}.", fix, INPUT)
     if isinstance(error, MemoryError):
         return Failure("MemoryError", "out of memory.", "use a machine with more memory, or a smaller policy", INPUT)
     if isinstance(error, SystemExit):

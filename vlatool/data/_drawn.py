@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.spec import TensorSpec
-from vlatool.data._not_finite import KINDS, with_not_finite
+from vlatool.data._not_finite import KINDS, takes_not_finite, with_not_finite
 from vlatool.data._recording import Recording
 from vlatool.errors import DataError
 from vlatool.runtime.statistics import Normaliser, load_normaliser
@@ -92,6 +92,8 @@ class Drawer:
         values = {
             tensor.name: self._value(tensor, like.get(tensor.name), random, structured) for tensor in self._inputs
         }
+        if not takes_not_finite(self._spec):
+            return values
         return with_not_finite(self._spec, [values], int(random.integers(len(KINDS))))[0]
 
     def _value(self, tensor: TensorSpec, like: Any, random: np.random.Generator, structured: Structures) -> Any:

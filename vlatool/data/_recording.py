@@ -20,6 +20,7 @@ Array = NDArray[Any]
 Values = Array | Rows
 """An input of all samples: in memory, or on the disk, where it is large."""
 RECORD_ALL = "record every input of the spec under its name, a row for each sample"
+REPAIR = "remove those samples, or repair the recording"
 EXPERT = ("action", "episode")
 """Arrays that a recording may hold beside the inputs."""
 
@@ -224,7 +225,7 @@ def _checked_input(path: Path, tensor: TensorSpec, values: Values, spec: PolicyS
         )
     _check_type(where, tensor, values)
     if tensor.finite:
-        _check_finite(where, values)
+        _check_finite(where, values, f"{REPAIR}; where the policy handles them: finite: false in its spec")
     return values
 
 
@@ -286,7 +287,7 @@ def _numbers(where: str, values: Array, spec: PolicySpec) -> Array:
             f"{where} has {last} elements; the policy gives {width}.",
             f"store [N, {spec.chunk}, {width}], or [N, {width}] for the first action alone; got {got}",
         )
-    _check_finite(where, values)
+    _check_finite(where, values, REPAIR)
     return values.reshape(len(values), math.prod(got[1:-1]), width)
 
 
@@ -307,7 +308,7 @@ def _indices(where: str, values: Array, labels: int) -> Array:
     return values
 
 
-def _check_finite(where: str, values: Values) -> None:
+def _check_finite(where: str, values: Values, fix: str) -> None:
     if values.dtype.kind != "f":
         return
     bad: list[int] = []
@@ -318,5 +319,5 @@ def _check_finite(where: str, values: Values) -> None:
     if bad:
         raise DataError(
             f"{where} is not finite in {len(bad)} of {len(values)} samples; the first is sample {bad[0]}.",
-            "remove those samples, or repair the recording; where the policy handles them: finite: false in its spec",
+            fix,
         )

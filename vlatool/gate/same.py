@@ -72,7 +72,7 @@ def _scene(mine: Manifest, theirs: Manifest) -> str:
     """
     if not mine.environment:
         return ""
-    keys = dict.fromkeys((*theirs.environment, *mine.environment))
+    keys = [key for key in dict.fromkeys((*theirs.environment, *mine.environment)) if key != "timeout"]
     pairs = [(key, mine.environment.get(key), theirs.environment.get(key)) for key in keys]
     return "; ".join(text for key, one, two in pairs if (text := _told(f"environment: {key}", one, two)))
 

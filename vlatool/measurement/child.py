@@ -22,7 +22,9 @@ from vlatool.measurement.jobs import Limits
 from vlatool.measurement.limited import command, ran_out
 
 REINSTALL = "see whether this Python runs vlatool at all: python -m vlatool doctor"
-CRASHES = "look for a library that crashes: an engine's other release may not; vlatool doctor lists what is installed"
+CRASHES = (
+    "look for a library that crashes; another release of the engine may not: vlatool doctor lists what is installed"
+)
 
 T = TypeVar("T")
 LAST_WORDS = 240

@@ -126,15 +126,14 @@ def per_channel(weight: Any, outputs: int = 0) -> Any:
 
 
 def per_tensor(values: Any) -> Any:
-    """Return values on a uint8 grid over their range, which holds zero."""
-    with require("torch", "build").no_grad():
+    """Return values on a uint8 grid over their range, which holds zero; as they are where one is NaN or infinite."""
+    torch = require("torch", "build")
+    with torch.no_grad():
         low, high = values.detach().float().amin().clamp_max(0), values.detach().float().amax().clamp_min(0)
-        if not bool((high - low).isfinite()):  # of an input that takes NaN and infinity: it stays in floats
-            return values
         step = ((high - low) / UINT8).clamp_min(TINY)
         zero = (-low / step).round()
         rounded = (((values.float() / step).round() + zero).clamp(0, UINT8) - zero) * step
-    return _through(values, rounded)
+    return torch.where((high - low).isfinite(), _through(values, rounded), values)
 
 
 def in_blocks(weight: Any) -> Any:

@@ -39,8 +39,8 @@ Tell = Callable[[str, float | None], None]
 LONGEST_ANSWER = 1 << 28
 """Bytes of one line of an answer."""
 PATIENCE_S = 5.0
-LOOK_S = 0.2
-"""How often a call that may never return is looked at; from a second on it is said."""
+LOOK_S, SAID_S = 0.2, 10.0
+"""How often a call that may never return is looked at, and from when on it is said; earlier where it may take less."""
 
 
 class _Server:
@@ -245,7 +245,7 @@ class Apart:
             self.end()
             at = f" {plain(call.at)}" if call.at else ""
             raise SourceError(f"{plain(call.whose)} did not return within {call.limit_s:g} s{at}.", plain(call.fix))
-        if call is not None and int(waited) > self._said_s:
+        if call is not None and waited >= min(SAID_S, call.limit_s / 10) and int(waited) > self._said_s:
             tell(f"waiting for {plain(call.waiting)}, {int(waited)} s of {call.limit_s:g} s", None)
         self._said_s = int(waited)
 
