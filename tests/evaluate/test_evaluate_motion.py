@@ -221,6 +221,8 @@ def test_an_evaluation_with_motion_is_kept_and_found_again(bundles: dict[str, Bu
 
 
 @pytest.mark.parametrize(("options", "says"), [
+    ({"control": "constant", "latency_in_the_loop": True}, "--latency-in-the-loop is of inferences, and constant"),
+    ({"control": "random", "latency_in_the_loop": True, "board": "raspberry-pi-4"}, "is of inferences, and random"),
     ({"board": "raspberry-pi-4"}, "--board says whose latency counts"), ({"strength": 2.0}, "--strength is of disturb"),
 ])  # fmt: skip
 def test_an_option_that_would_do_nothing_is_refused(bundles: dict[str, Bundle], options: dict[str, object], says: str):

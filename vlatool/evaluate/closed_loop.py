@@ -143,11 +143,16 @@ class ClosedLoop(Measure):
         return super().key(source_hash)
 
     def check(self, source: Bundle | None, profile: Profile | None) -> None:
-        """Environment and tasks are named, the environment may run, and a limit has something to hold against."""
+        """Environment and tasks are named, the environment may run, and options have something that they are of."""
         if self.limit is not None and (not self.baseline or self.control):
             raise UsageError("--limit is the largest drop against a baseline, and none is named.", "add --baseline DIR")
         if self.board and not self.latency_in_the_loop:
             raise UsageError("--board says whose latency counts, and none does.", "add --latency-in-the-loop")
+        if self.control and self.latency_in_the_loop:
+            raise UsageError(
+                f"--latency-in-the-loop is of inferences, and {self.control} actions need none.",
+                "leave --latency-in-the-loop or --control out",
+            )
         if "strength" in self.options() and not self.disturb:
             raise UsageError("--strength is of disturbances, and none is named.", "add --disturb all")
         jobs = self._jobs(source)
