@@ -390,3 +390,24 @@ def test_factors_are_divided_alike():
     factors.divide(third[0], 3)
     factors.unite(one, third)
     assert all(factors.is_frozen(leaf) for leaf in (*factors.leaves(one), *factors.leaves(third)))
+
+
+@pytest.mark.parametrize(("query", "key", "goes"), [
+    (torch.relu, torch.sigmoid, True), (lambda x: x * 2 - x, torch.cos, True), (torch.sigmoid, torch.sigmoid, False),
+    (lambda x: functional.elu(x) + 1, lambda x: functional.elu(x) + 1, False),
+    (lambda x: x.unflatten(-1, (2, 3)).flatten(-2), torch.exp, True), (torch.cos, lambda x: x.clamp(min=0.1), False),
+])  # fmt: skip
+@pytest.mark.parametrize("form", ["matmul", "einsum"])
+def test_a_sum_over_two_values_keeps_units_that_add_to_it_with_weights_of_zero(query, key, goes: bool, form: str):
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.one, self.other, self.last = nn.Linear(4, 6), nn.Linear(4, 6), nn.Linear(4, 2)
+
+        def forward(self, x):
+            one, other = query(self.one(x)), key(self.other(x))
+            similar = one @ other.mT if form == "matmul" else torch.einsum("btd,bsd->bts", one, other)
+            return self.last(torch.softmax(similar, -1) @ x)
+
+    walk = walked(Net(), torch.randn(1, 3, 4))
+    assert bool(units(walk)) == goes
