@@ -432,3 +432,24 @@ def test_a_cut_module_computes_in_the_dtype_that_a_training_asks_for(convert: Ca
     torch.testing.assert_close(small(x), module(x))
     with torch.autocast("cpu", torch.bfloat16):
         torch.testing.assert_close(small(x), module(x), atol=0.02, rtol=0.02)
+
+
+@pytest.mark.parametrize(("query", "key", "goes"), [
+    (torch.relu, torch.sigmoid, True), (lambda x: x * 2 - x, torch.cos, True), (torch.sigmoid, torch.sigmoid, False),
+    (lambda x: functional.elu(x) + 1, lambda x: functional.elu(x) + 1, False),
+    (lambda x: x.unflatten(-1, (2, 3)).flatten(-2), torch.exp, True), (torch.cos, lambda x: x.clamp(min=0.1), False),
+])  # fmt: skip
+@pytest.mark.parametrize("form", ["matmul", "einsum"])
+def test_a_sum_over_two_values_keeps_units_that_add_to_it_with_weights_of_zero(query, key, goes: bool, form: str):
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.one, self.other, self.last = nn.Linear(4, 6), nn.Linear(4, 6), nn.Linear(4, 2)
+
+        def forward(self, x):
+            one, other = query(self.one(x)), key(self.other(x))
+            similar = one @ other.mT if form == "matmul" else torch.einsum("btd,bsd->bts", one, other)
+            return self.last(torch.softmax(similar, -1) @ x)
+
+    walk = walked(Net(), torch.randn(1, 3, 4))
+    assert bool(units(walk)) == goes

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from _pruned import counted
 from torch import nn
 
 from vlatool.boards.torch_workload import torch_workload
@@ -19,11 +21,11 @@ from vlatool.errors import BundleError, FallsShort, RecipeError
 from vlatool.export.onnx import ExportOnnx
 from vlatool.graph.workload import workload
 from vlatool.module.axes import Walk
-from vlatool.module.cut import traced
+from vlatool.module.cut import cut, traced
 from vlatool.module.edits import read_edits
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune._selection import Selection
-from vlatool.prune._units import groups_of
+from vlatool.prune._units import groups_of, rank_units
 from vlatool.prune.structured import Structured
 from vlatool.rebuild.rebuild import rebuild
 from vlatool.runtime import load
@@ -211,3 +213,57 @@ def test_the_command_line_ends_with_5_and_names_what_blocks(tmp_path: Path, caps
 def test_what_has_graphs_cannot_be_pruned(float_bundle: Bundle, tmp_path: Path):
     with pytest.raises(BundleError, match="has no torch modules"):
         run_transform(Structured(), float_bundle, tmp_path / "out", Context())
+
+
+class Experts(nn.Module):
+    """The two best of four experts, as one sum over all of them."""
+
+    def __init__(self):
+        super().__init__()
+        self.gate, self.up, self.down = nn.Linear(8, 4), torch.randn(4, 8, 24), torch.randn(4, 24, 8)
+        self.up, self.down = nn.Parameter(self.up), nn.Parameter(self.down)
+        self.hidden, self.out = nn.Linear(8, 16), nn.Linear(16, 3)
+
+    def forward(self, x):
+        gates = torch.softmax(self.gate(x), -1)
+        best, which = gates.topk(2, -1)
+        gates = torch.zeros_like(gates).scatter(-1, which, best)
+        each = torch.einsum("bteh,ehd->bted", torch.einsum("btd,edh->bteh", x, self.up).relu(), self.down)
+        return self.out(self.hidden((x + (gates[..., None] * each).sum(2)).mean(1)).relu())
+
+
+class Grouped(nn.Module):
+    """A residual around a convolution in groups, which go as a whole."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.grouped = nn.Conv2d(3, 16, 3, padding=1), nn.Conv2d(16, 16, 3, padding=1, groups=4)
+        self.wide, self.out = nn.Conv2d(16, 24, 1), nn.Linear(24, 3)
+
+    def forward(self, x):
+        x = self.first(x).relu()
+        return self.out(self.wide(x + self.grouped(x).relu()).relu().mean((2, 3)))
+
+
+@pytest.mark.parametrize(("make", "shape", "nearly"), [
+    (Experts, (1, 4, 8), 0.35), (Grouped, (1, 3, 6, 6), 0.27),
+])  # fmt: skip
+def test_what_is_said_of_experts_and_groups_is_what_is_reached(
+    make: type[nn.Module], shape: tuple[int, ...], nearly: float
+):
+    """Whether the last step stays, or is put back because nearly enough is gone without it."""
+    torch.manual_seed(0)
+    module, feed = make().eval(), torch.randn(shape)
+    walks, whole = {"main": Walk(traced(module, [feed]))}, counted(module, [feed])
+    said = {}
+    for ratio in (nearly, 0.45, 0.9):
+        groups = groups_of(walks, Selection((), ()), 8, make.__name__)
+        rank_units(groups, "random", {"main": module}, source=None, samples=0)  # type: ignore[arg-type]
+        done = Structured(ratio=ratio, multiple=8).choose(walks, groups, {"main": 1}, Context())
+        left = counted(cut(copy.deepcopy(module), [feed], done.edits), [feed])
+        assert done.record["pruned"]["macs"] == [whole, left]
+        said[ratio] = done.record["pruned"]["reached"]
+        assert said[ratio] == round(1 - left / whole, 4)
+    assert 0.9 * nearly < said[nearly] < nearly, "put back"
+    assert said[0.45] >= 0.45
+    assert said[0.9] < 0.9 * 0.9, "which is refused"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from vlatool.module._silent import Silent
 from vlatool.module.factors import Axis, Factors, Shape
 
 
@@ -32,6 +33,7 @@ class Values:
         self._alike: dict[Any, Axis] = {}
         self.shapes: dict[Any, Any] = {}
         self.stored: set[Any] = set()
+        self._silent = Silent(self.stored)
 
     def shape(self, node: Any) -> Shape | None:
         """Return the axes of a node's value, None where it is no tensor."""
@@ -62,10 +64,19 @@ class Values:
         return result
 
     def contract(self, one: Any, axis: Axis, other: Any, with_axis: Axis) -> None:
-        """Unite two axes over which a product sums, and note of those of weights that they read."""
+        """Unite two axes over which a product sums, and note of those of weights that they read.
+
+        Where neither value is zero when the weights of a unit are, the sum would lose what such a unit adds.
+        """
         for node, summed in ((one, axis), (other, with_axis)):
             self.reads |= set(summed) if node in self.stored else set()
         self.factors.unite(axis, with_axis)
+        if not self.is_silent([one, other]):
+            self.factors.freeze(axis)
+
+    def is_silent(self, nodes: Sequence[Any]) -> bool:
+        """Say whether one of some values is zero where weights are; None is a value that a weight reads."""
+        return any(node is None or self._silent(node) for node in nodes)
 
     def multiply(self, axes: Shape, widths: Sequence[Axis] = ()) -> None:
         """Note a product.

@@ -106,7 +106,7 @@ def _convolved(walk: Values, node: Any, given: Shape, out: Axis, kernel: Shape) 
 
 def _attention(walk: Values, node: Any) -> Shape:
     query, key, value = (walk.needed(each) for each in node.args[:3])
-    walk.factors.unite(query[-1], key[-1])
+    walk.contract(node.args[0], query[-1], node.args[1], key[-1])
     walk.factors.unite(key[-2], value[-2])
     walk.factors.freeze(key[-2])
     if argument(node, "scale") is None:  # the root of the size, which would change
@@ -214,9 +214,10 @@ def _named_axis(walk: Values, name: str, names: Sequence[list[str]], nodes: Sequ
     twice = any(each.count(name) > 1 for each in names)
     (axis,) = walk.broadcast([[walk.needed(node)[number]] for node, number in places])
     full = [(node, number) for node, number in places if walk.factors.size(walk.needed(node)[number]) > 1]
-    if twice or (name not in result and len(full) < 2):
+    summed = name not in result
+    if twice or (summed and (len(full) < 2 or not walk.is_silent([node for node, _ in full]))):
         walk.factors.freeze(axis)
-    if name not in result:
+    if summed:
         walk.reads |= {part for node, number in places if node in walk.stored for part in walk.needed(node)[number]}
     return axis
 
