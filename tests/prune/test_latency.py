@@ -22,6 +22,7 @@ from vlatool.hardware.profile import load_profile
 from vlatool.latency_model.predict import predictions
 from vlatool.module.axes import Member
 from vlatool.module.edits import Edit, apply, read_edits
+from vlatool.module.factors import Atom
 from vlatool.module.torch_policy import load_modules, torch_policy
 from vlatool.prune import latency
 from vlatool.prune._clock import BoardClock, Clock
@@ -352,7 +353,8 @@ def trunk(importance: Sequence[float] = (1.0, 2.0, 3.0), **fields) -> Stack:
 
 
 def group(*weights: str, keep: Sequence[int] = (0, 2)) -> Group:
-    members = [Member(weight, 0, place, (1,) * place + (3,)) for place, weight in enumerate(weights)]
+    atoms = [Atom(0, (place,), slower=(), is_fastest=True) for place in range(len(weights))]
+    members = [Member(weight, 0, atom, False, np.arange(3)) for weight, atom in zip(weights, atoms, strict=True)]
     return Group("main", 0, 3, members, 1, np.ones(3), list(keep))
 
 
