@@ -40,6 +40,10 @@ EXPLODING = """\
 """
 
 
+RECORDINGS = ("calibration.npz", "evaluation.npz")
+"""Of the tiny policy: they hold actions of its own shape."""
+
+
 class Workshop(Place):
     """Makes wrong policies, recordings and environments."""
 
@@ -228,12 +232,12 @@ ROWS = [
         lambda at: at.teacher(("policy.yaml", "[dx, dy]", "[dy, dx]"))),
     Row("a teacher with another chunk", "gives 'action' as tensor [1, 2, 2]", 3, lambda at: at.teacher(
         ("policy.yaml", "shape: [1, 4, 2]", "shape: [1, 2, 2]"), ("policy.yaml", "chunk: 4", "chunk: 2"),
-        ("policy.py", "reshape(1, 4, 2)", "reshape(1, 4, 2)[:, :2]"))),
+        ("policy.py", "reshape(1, 4, 2)", "reshape(1, 4, 2)[:, :2]"), drop=RECORDINGS)),
     Row("a teacher of another action size", "gives 'action' as tensor [1, 4, 3]", 3, lambda at: at.teacher(
         ("policy.yaml", "shape: [1, 4, 2], unit: [m, m], labels: [dx, dy]",
          "shape: [1, 4, 3], unit: [m, m, m], labels: [dx, dy, dz]"),
         ("statistics.json", "[0.05, 0.1]", "[0.05, 0.1, 1.0]"),
-        ("statistics.json", "[0.01, -0.02]", "[0.01, -0.02, 0]"), ("policy.py", FORWARD, WIDER))),
+        ("statistics.json", "[0.01, -0.02]", "[0.01, -0.02, 0]"), ("policy.py", FORWARD, WIDER), drop=RECORDINGS)),
     Row("a teacher with another vocabulary", "have another vocabulary for 'instruction'", 3,
         lambda at: at.teacher(("vocabulary.json", '"red": 5, "blue": 6', '"red": 6, "blue": 5'))),
     Row("a teacher with other statistics of its input", "have another normalisation for 'proprio'", 3,
@@ -243,7 +247,7 @@ ROWS = [
     Row("a teacher that acts in another way", "have another unit or mode for 'action'", 3,
         lambda at: at.teacher(("policy.yaml", "mode: delta", "mode: absolute"))),
     Row("a teacher without one of the inputs", "is given 'proprio' as nothing", 3, lambda at: at.teacher(
-        ("policy.yaml", "- {name: proprio,", "- {name: state,"), drop=("calibration.npz", "evaluation.npz"))),
+        ("policy.yaml", "- {name: proprio,", "- {name: state,"), drop=RECORDINGS)),
     Row("a teacher whose action is not finite", "The teacher gives an action that is not finite", 3,
         lambda at: at.code(WHOLE_FAILS)),
     # ---- the student
@@ -285,11 +289,11 @@ ROWS = [
     Row("a recording that is none", "npz", 3,
         lambda at: at.line(source=at.copied("data/calibration.npz", b"nothing", sealed=True))),
     Row("nothing to learn from", "no observations to train on", 3,
-        lambda at: at.student(drop=("calibration.npz", "evaluation.npz"))),
+        lambda at: at.student(drop=RECORDINGS)),
     Row("nothing to judge with", "--patience needs something to judge with", 3, lambda at: at.student(
-        drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--patience", 1])),
+        drop=RECORDINGS, options=[*ALONE, "--patience", 1])),
     Row("an expert without a recording", "needs an expert's actions, and ... has no recording", 3,
-        lambda at: at.student(drop=("calibration.npz", "evaluation.npz"), options=[*ALONE, "--alpha", 0.5])),
+        lambda at: at.student(drop=RECORDINGS, options=[*ALONE, "--alpha", 0.5])),
     Row("an expert without actions", "A loss against an expert's actions needs them, and ... has none", 3,
         lambda at: [*at.recorded(action=None), "--alpha", 0.5]),
     Row("a control of one observation", "said of another one; there is 1", 3, lambda at: [*at.recorded(

@@ -206,7 +206,8 @@ def namespace() -> list[str]:
 def small_files(at: Workshop, line: Line) -> tuple[int, str]:
     """With a limit on the size of a file, which the kernel enforces; lifted at the exit, where coverage is written."""
     code = """
-import atexit, resource
+import atexit, resource, sys
+sys.dont_write_bytecode = True  # Python would leave half of a module's
 kept = resource.getrlimit(resource.RLIMIT_FSIZE)
 resource.setrlimit(resource.RLIMIT_FSIZE, (3000, kept[1]))
 atexit.register(resource.setrlimit, resource.RLIMIT_FSIZE, kept)"""

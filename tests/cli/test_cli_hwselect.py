@@ -147,7 +147,9 @@ def test_when_no_board_will_do_the_exit_code_is_1_and_each_says_why(vlatool, flo
     assert code == 1
     assert out.startswith("FAIL")
     assert "costs 399 dollars, more than 1" in " ".join(out.split())
-    assert err.splitlines()[-1].startswith("error: No board is certain to run")
+    error, fix = err.splitlines()[-2:]
+    assert error.startswith("error: No board is certain to run")
+    assert fix.startswith("  fix: change the policy, the options or the limit")
 
 
 def test_a_platform_gives_rate_and_watts_where_they_are_not_given(vlatool, float_bundle):

@@ -36,7 +36,7 @@ TOKENS = 6
 class Unquantized(WeightOnly):
     """Streams every tensor and quantizes none."""
 
-    def selected(self, names, bundle):
+    def selected(self, names, bundle, ops=()):
         return set()
 
 

@@ -1,4 +1,4 @@
-"""An option that is given twice, with two values, is refused: one of them would be ignored without a word."""
+"""A flag that is given in both of its forms is refused: one would be ignored. Of others the last value counts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vlatool.errors import UsageError
 
 
 def once(command: Any) -> Any:
-    """Return a click command that refuses such options; of a group, each of its commands does."""
+    """Return a click command that refuses such flags; of a group, each of its commands does."""
     for each in (command, *getattr(command, "commands", {}).values()):
         each.parse_args = partial(_parsed, each, each.parse_args)
     return command
@@ -25,25 +25,22 @@ def _parsed(command: Any, parse: Any, ctx: Any, args: list[str]) -> list[str]:
 
 
 def _refuse_two(option: Any, args: Sequence[str]) -> None:
-    """Refuse words that give one option two values.
+    """Refuse words that turn a flag on and off.
 
     Raises:
         UsageError: naming both.
     """
-    if option.param_type_name != "option" or option.multiple or getattr(option, "count", False):
+    if option.param_type_name != "option" or not option.is_flag or getattr(option, "count", False):
         return
     given = list(dict.fromkeys(_given(option, args)))
     if len(given) > 1:
-        flags = " and ".join(given[:2]) if option.is_flag else f"{option.opts[0]} {given[0]} and {given[1]}"
-        raise UsageError(f"{flags} are given at once; only one of them can be.", f"give {option.opts[0]} once")
+        flags = " and ".join(given[:2])
+        raise UsageError(f"{flags} are given at once; only one of them can be.", f"leave one of them out: {flags}")
 
 
 def _given(option: Any, args: Sequence[str]) -> Iterator[str]:
-    """Yield each value that words give an option: of a flag, the form of it that is typed first of its kind."""
+    """Yield the forms of a flag that are among words: its first name, or the first one that turns it off."""
     words = args[: args.index("--")] if "--" in args else args
-    for at, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        if option.is_flag and word in (*option.opts, *option.secondary_opts):
+    for word in words:
+        if word in (*option.opts, *option.secondary_opts):
             yield option.opts[0] if word in option.opts else option.secondary_opts[0]
-        elif not option.is_flag and name in option.opts:
-            yield value if equals else next(iter(words[at + 1 :]), "")

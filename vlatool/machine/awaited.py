@@ -16,7 +16,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-SIZE = 1 << 12
+SIZE = 1 << 11
+"""Bytes of a page; below limits on the size of files (``ulimit -f``), which count it."""
 HEAD = struct.Struct("<ddI")
 """When the call began (``time.monotonic``; 0 for none), how long it may take, in seconds, and bytes of its words."""
 
@@ -55,7 +56,7 @@ class Page:
 
     def begin(self, waiting: str, whose: str, at: str, fix: str, limit_s: float) -> None:
         """Note a call."""
-        words = json.dumps([waiting, whose, at, fix]).encode()[: SIZE - HEAD.size]
+        words = _fitting([waiting, whose, at, fix])
         if words != self._words:
             self._memory[HEAD.size : HEAD.size + len(words)] = self._words = words
         HEAD.pack_into(self._memory, 0, time.monotonic(), limit_s, len(words))
@@ -81,6 +82,14 @@ class Page:
     def close(self) -> None:
         """Give the page up."""
         self._memory.close()
+
+
+def _fitting(texts: list[str]) -> bytes:
+    """Return texts as JSON that fits on a page, each cut short where they do not: a task may have any name."""
+    length = SIZE
+    while len(words := json.dumps([text[:length] for text in texts]).encode()) > SIZE - HEAD.size:
+        length //= 2
+    return words
 
 
 _page: Page | None = None
