@@ -232,7 +232,10 @@ def test_a_page_is_read_by_another_process_and_nothing_else_is_believed():
     )
     assert noted(lambda page: None) is None
     assert noted(lambda page: (page.begin("a", "b", "c", "d", 2.0), page.end())) is None
-    assert noted(lambda page: page.begin("z" * 9999, "b", "c", "d", 2.0)) is None
+    cut = noted(lambda page: page.begin("\u00e9" * 9999, "b", "c", "d", 2.0))
+    assert cut is not None, "words that are too long are cut short: the limit must hold"
+    assert cut.waiting in "\u00e9" * 999
+    assert (cut.whose, cut.limit_s) == ("b", 2.0)
     assert noted(lambda page: page._memory.__setitem__(slice(0, 99), b"\xff" * 99)) is None
     assert noted(lambda page: page._memory.__setitem__(slice(0, 99), b"\x01" * 99)) is None
 
