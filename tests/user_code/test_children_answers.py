@@ -28,25 +28,9 @@ def test_what_no_child_says_is_nonsense(line: bytes):
     [
         ({"error": "BundleError", "message": "m", "fix": "f"}, BundleError, "^m\n  fix: f$"),
         ({"error": "MissingExtra", "message": "m", "fix": "f"}, MissingExtra, "m"),
-        (
-            {"error": "GateFailed", "message": "m", "fix": "f"},
-            SourceError,
-            "^policy.py failed: GateFailed: m\n  fix: f$",
-        ),
-        (
-            {"error": "Inconclusive", "message": "m", "fix": "f"},
-            SourceError,
-            "^policy.py failed: Inconclusive: m\n  fix: f$",
-        ),
-        (
-            {"error": "VlatoolError", "message": "m", "fix": "f"},
-            SourceError,
-            "^policy.py failed: VlatoolError: m\n  fix: f$",
-        ),
-        (
-            {"error": "UsageError", "message": "m", "fix": "f"},
-            SourceError,
-            "^policy.py failed: UsageError: m\n  fix: f$",
+        *(
+            ({"error": name, "message": "m", "fix": "f"}, SourceError, f"^policy.py failed: {name}: m\n  fix: f$")
+            for name in ("GateFailed", "Inconclusive", "VlatoolError", "UsageError")
         ),
         ({"error": "sys", "message": "m\x1b[2J", "fix": "f"}, SourceError, r"^policy.py failed: m \[2J\n  fix: f$"),
         ({"raised": "X", "message": "m", "ours": True}, SourceError, "the process that runs it failed: X: m"),

@@ -55,6 +55,13 @@ Accept = Annotated[
 Trials = Annotated[
     int | None, typer.Option(min=0, help="policies to prune, train, quantize and try (0; needs the extra 'search')")
 ]
+EnvironmentTimeout = Annotated[
+    float | None, typer.Option(min=0, max=1e6, help="seconds that a call of the environment may take (300)")
+]
+EveryCandidate = Annotated[
+    bool | None,
+    typer.Option("--every-candidate", help="play the episodes of every candidate, not only until one is chosen"),
+]
 StudyPlace = Annotated[
     str | None, typer.Option(help="file or database URL that keeps the trials, so that several machines share them")
 ]
@@ -80,13 +87,8 @@ def optimize(
     study: StudyPlace = None,
     recipe: Annotated[Path | None, typer.Option(help="recipe.yaml: candidates, limits and effort")] = None,
     episodes: Annotated[int | None, typer.Option(min=0, help="closed-loop episodes of each candidate (200)")] = None,
-    environment_timeout: Annotated[
-        float | None, typer.Option(min=0, max=1e6, help="seconds that a call of the environment may take (300)")
-    ] = None,
-    every_candidate: Annotated[
-        bool | None,
-        typer.Option("--every-candidate", help="play the episodes of every candidate, not only until one is chosen"),
-    ] = None,
+    environment_timeout: EnvironmentTimeout = None,
+    every_candidate: EveryCandidate = None,
     iterations: Annotated[int | None, typer.Option(min=20, help="timed inferences of each candidate (200)")] = None,
     threads: Annotated[int | None, typer.Option(min=1, help="threads while timing (1)")] = None,
     workers: Workers = None,
