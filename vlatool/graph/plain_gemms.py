@@ -6,6 +6,9 @@ from typing import Any
 
 from vlatool.errors import require
 
+FACTORS = ("alpha", "beta", "transA")
+"""Attributes of a Gemm that is more than a product with a bias."""
+
 
 def plain_gemms(model: Any) -> int:
     """Give every Gemm alpha and beta of 1 and no transA, in place: nodes before it scale and turn; return how many.
@@ -38,7 +41,7 @@ def _made_plain(node: Any) -> bool:
         _before(node, 0, "Mul", alpha)
     if biased and beta != 1.0:
         _before(node, 2, "Mul", beta)
-    for name in ("alpha", "beta", "transA"):
+    for name in FACTORS:
         node.attributes.pop(name, None)
     return True
 

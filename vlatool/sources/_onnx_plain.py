@@ -10,7 +10,7 @@ import numpy as np
 
 from vlatool.errors import require
 from vlatool.graph.nodes import name_nodes, read_names, reads
-from vlatool.graph.plain_gemms import plain_gemms
+from vlatool.graph.plain_gemms import FACTORS, plain_gemms
 
 MOVERS = ("Identity", "Cast", "Transpose", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Split")
 """Operators through which exporters let a weight go on its way to a layer."""
@@ -55,7 +55,8 @@ def plain(model: Any) -> Any:
     graph.node.extend(nodes)
     _drop_unread(graph)
     name_nodes(model)
-    return _with_plain_gemms(model) if any(node.op_type == "Gemm" and node.attribute for node in graph.node) else model
+    scaled = any(item.name in FACTORS for node in graph.node if node.op_type == "Gemm" for item in node.attribute)
+    return _with_plain_gemms(model) if scaled else model
 
 
 def _fill_sparse(graph: Any) -> None:
