@@ -194,7 +194,7 @@ def test_weights_beside_the_graph_are_found(tmp_path: Path) -> None:
 CHILD = """
 import sys
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 import test_calibrate as tests
 from vlatool.bundle.bundle import Bundle
 def peak():
@@ -212,7 +212,7 @@ print(run(50), run(2000))
 def test_memory_does_not_grow_with_the_samples(tmp_path: Path) -> None:
     """2000 samples of 22 recorded tensors would be 11 MB when they were kept."""
     looping(tmp_path / "bundle")
-    code = CHILD.format(tests=str(Path(__file__).parent), bundle=str(tmp_path / "bundle"))
+    code = CHILD.format(tests=sys.path, bundle=str(tmp_path / "bundle"))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     few, many = (int(part) for part in done.stdout.split())
     assert many - few < 2500, "kB of peak memory"
