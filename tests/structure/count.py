@@ -93,7 +93,7 @@ def closure(folder: Path, module: str) -> dict[Path, None]:
 def table(root: Path = ROOT) -> str:
     """Return what docs/architecture.md says of the counts: what does not change with every commit."""
     held = {what: number for what, number in counts(root).items() if what not in ("modules", "lines", "longest module")}
-    files = {f"files to write for a new {what}": number or ABSENT for what, number in entry_files(root).items()}
+    files = {f"files for a new {what}": number or ABSENT for what, number in entry_files(root).items()}
     return "\n".join(
         ["| count | |", "|---|---|", *(f"| {what} | {number} |" for what, number in (held | files).items())]
     )
@@ -124,7 +124,7 @@ def main() -> None:
     for what, number in counts(given.of).items():
         print(f"{what:52}{number:7}")
     for what, number in entry_files(given.of).items():
-        print(f"{f'files to write for a new {what}':52}{number or ABSENT:>7}")
+        print(f"{f'files for a new {what}':52}{number or ABSENT:>7}")
 
 
 if __name__ == "__main__":
