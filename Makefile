@@ -62,7 +62,7 @@ metaworld: $(BIN)/vlatool  ## install what the sample policies vla-metaworld and
 	@ldconfig -p | grep -q libEGL.so.1 || apt-get install -y -qq $(SYSTEM_PACKAGES) || \
 	  echo "headless rendering needs the system packages $(SYSTEM_PACKAGES)"
 
-test: $(VENV)/.dev  ## run the tests (SET=avx2: as on a processor with AVX2 alone; docs/processors.md)
+test: $(VENV)/.dev  ## run the tests (SET=avx2: as on a processor with AVX2 alone; docs/concepts/processors.md)
 	$(call confine,$(VENV))
 	$(BIN)/python -m pytest -n auto --dist worksteal
 
