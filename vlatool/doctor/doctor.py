@@ -148,7 +148,7 @@ def _engine(
 def arithmetic() -> Iterator[Check]:
     """How each engine that is installed computes int8 products on this processor: measured, not looked up."""
     for name, library in usable_engines().items():
-        if not library.installed():
+        if not library.is_installed():
             continue
         try:
             products = products_apart(name)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 from vlatool.machine.host import gpus, isa
-
-if TYPE_CHECKING:
-    from vlatool.hardware.profile import Profile
 
 
 @dataclass(frozen=True)
@@ -16,12 +13,12 @@ class Target:
     """A board, or this host.
 
     Args:
-        profile: Profile of the board; None for this host.
+        profile: ``vlatool.hardware.profile.Profile`` of the board, which a robot has not got; None for this host.
         devices: Names of what computes there beside the processor.
         features: Features of its processor, as ``/proc/cpuinfo`` names them.
     """
 
-    profile: Profile | None = None
+    profile: Any = None
     devices: tuple[str, ...] = ()
     features: frozenset[str] = frozenset()
 
@@ -30,7 +27,7 @@ class Target:
         return not self.features.isdisjoint(features)
 
 
-def target_of(profile: Profile | None) -> Target:
+def target_of(profile: Any) -> Target:
     """Return the board of a profile as a target; this host for None."""
     if profile is None:
         return Target(None, gpus(), frozenset(isa() or ()))

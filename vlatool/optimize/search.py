@@ -35,7 +35,7 @@ from vlatool.optimize.budget import budget_of
 from vlatool.optimize.plan import transforms
 from vlatool.optimize.recipe import Limits, StageList
 from vlatool.quantize.static_int8 import StaticInt8
-from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, installed
+from vlatool.runtime.engine import DEFAULT_ENGINE, engine_class, engine_names, is_installed
 from vlatool.runtime.policy import refuse_findings
 from vlatool.stage.base import Context
 from vlatool.stage.build import stage_class
@@ -322,7 +322,7 @@ def variants_for(profile: Profile | None, calibrated: bool) -> dict[str, StageLi
     variants: dict[str, StageList] = {}
     target = target_of(profile)
     for name in board:
-        if installed(name):
+        if is_installed(name):
             variants |= engine_class(name).variants(target, calibrated)
     for name in registry.names("quantize"):
         try:

@@ -119,7 +119,7 @@ class Engine:
         return install(cls.extra) if cls.extra else f"pip install {(*cls.substitutes, cls.package)[0]}"
 
     @classmethod
-    def installed(cls) -> bool:
+    def is_installed(cls) -> bool:
         """Return whether the library is installed, without importing it."""
         return importlib.util.find_spec(cls.package) is not None
 
@@ -257,13 +257,13 @@ def computing(dtype: str) -> str:
     )
 
 
-def installed(name: str) -> bool:
+def is_installed(name: str) -> bool:
     """Return whether the library of an engine is installed; not, where another package's engine cannot be imported."""
     library = usable_engines().get(name)
-    return library is not None and library.installed()
+    return library is not None and library.is_installed()
 
 
 def identities() -> dict[str, str]:
     """Return what each installed engine that does not run on the processor alone depends on: name -> ``identity``."""
-    found = {name: library.identity() for name, library in usable_engines().items() if library.installed()}
+    found = {name: library.identity() for name, library in usable_engines().items() if library.is_installed()}
     return {name: identity for name, identity in found.items() if identity}

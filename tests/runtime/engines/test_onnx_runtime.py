@@ -63,15 +63,15 @@ def test_a_provider_that_is_not_there_is_named_with_what_installs_it(path: Path)
         with pytest.raises(MissingExtra, match=r"has no CUDAExecutionProvider on this machine; it has .*CPU") as caught:
             use()
         assert caught.value.fix == "pip install onnxruntime-gpu"
-    assert not absent.installed()
-    assert OrtCpuSession.installed()
+    assert not absent.is_installed()
+    assert OrtCpuSession.is_installed()
 
 
 def test_a_plug_in_that_cannot_be_loaded_is_named(path: Path, tmp_path: Path) -> None:
     library = tmp_path / "libacme.so"
     library.write_bytes(b"not a library")
     broken = engine(("Acme", {}), extra="", provider_library=classmethod(lambda _: library))
-    with pytest.raises(MissingExtra, match=r"cannot load .*libacme.so: "):
+    with pytest.raises(MissingExtra, match=r"has no Acme .*libacme.so cannot be loaded: "):
         broken(path, 1)
 
 

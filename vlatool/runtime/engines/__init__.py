@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import require
 from vlatool.runtime.engines._onnx_runtime import OnnxRuntimeSession as OnnxRuntimeSession
-from vlatool.runtime.engines._onnx_runtime import open_session, profiled
+from vlatool.runtime.engines._onnx_runtime import open_session, profiling_session
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,7 +60,7 @@ def traced(path: Path, scratch: Path) -> OrtProfiled:
     options.log_severity_level = 4
     options.intra_op_num_threads = 1
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    return profiled(ort, path, options, scratch)
+    return profiling_session(ort, path, options, scratch)
 
 
 def node_session(content: bytes) -> Any:

@@ -100,22 +100,16 @@ class OnnxRuntimeSession(Engine):
             MissingExtra: when onnxruntime is not installed, or has not got a provider.
         """
         ort = require("onnxruntime", "ort")
-        missing = cls._missing(ort)
-        library = cls.provider_library() if missing else None
+        cause, library = "", cls.provider_library() if cls._missing(ort) else None
         if library is not None:
             try:
-                ort.register_execution_provider_library(missing[0], str(library))
+                ort.register_execution_provider_library(cls._missing(ort)[0], str(library))
             except Exception as error:  # the seam: every pybind exception type of ONNX Runtime becomes ours
-                raise MissingExtra(
-                    f"ONNX Runtime {ort.__version__} cannot load {library}: {_first_line(error)}", cls.installation()
-                ) from error
-            missing = cls._missing(ort)
-        if missing:
+                cause = f" {library} cannot be loaded: {_first_line(error)}"
+        if missing := cls._missing(ort):
             known = ", ".join(ort.get_available_providers())
-            raise MissingExtra(
-                f"ONNX Runtime {ort.__version__} has no {', '.join(missing)} on this machine; it has {known}.",
-                cls.installation(),
-            )
+            words = f"ONNX Runtime {ort.__version__} has no {', '.join(missing)} on this machine; it has {known}."
+            raise MissingExtra(words + cause, cls.installation())
         return ort
 
     @classmethod
@@ -133,9 +127,9 @@ class OnnxRuntimeSession(Engine):
         return super().distributions() if cls._names() == [CPU] or not cls.substitutes else cls.substitutes
 
     @classmethod
-    def installed(cls) -> bool:
+    def is_installed(cls) -> bool:
         """Return whether ONNX Runtime and the providers are installed, without importing them."""
-        return super().installed() and (cls._names() == [CPU] or bool(versions(cls.distributions())))
+        return super().is_installed() and (cls._names() == [CPU] or bool(versions(cls.distributions())))
 
     @classmethod
     def execution_providers(cls) -> list[str]:
@@ -168,7 +162,7 @@ class OnnxRuntimeSession(Engine):
             GraphError: when ONNX Runtime refuses it.
         """
         ort = cls.onnxruntime()
-        return profiled(ort, path, session_options(ort, threads), scratch, cls.providers)
+        return profiling_session(ort, path, session_options(ort, threads), scratch, cls.providers)
 
     @classmethod
     def node_precision(cls, node: Node) -> str:
@@ -247,20 +241,20 @@ class OnnxRuntimeSession(Engine):
         return "the CPU" if cls._names() == [CPU] else ", ".join(cls._names())
 
     def _check_providers(self, path: Path) -> None:
-        """Refuse a session on other providers: ONNX Runtime leaves out what cannot be loaded, and adds the processor's.
+        """Refuse a session on other providers: ONNX Runtime leaves out those that it cannot load.
 
-        Without that being named, ``NO_CPU_FALLBACK`` sees to it that it runs no node.
+        It always adds the processor's; where that is not named, ``NO_CPU_FALLBACK`` keeps every node off it.
         """
         wanted = self._names()
         opened = [name for name in self._session.get_providers() if name != CPU or CPU in wanted]
-        if opened != wanted:
-            absent = [name for name in wanted if name not in opened]
-            raise GraphError(
-                f"{path} was opened on {', '.join(opened) or CPU}; wanted {', '.join(wanted)}.",
-                f"install the driver and the libraries that {', '.join(absent)} needs: vlatool doctor"
-                if absent and absent != [CPU]
-                else "install onnxruntime alone: another package of it (onnxruntime-gpu) may be in its place",
-            )
+        if opened == wanted:
+            return
+        absent = ", ".join(name for name in wanted if name not in (*opened, CPU))
+        fix = "install onnxruntime alone: another package of it (onnxruntime-gpu) may be in its place"
+        raise GraphError(
+            f"{path} was opened on {', '.join(opened) or CPU}; wanted {', '.join(wanted)}.",
+            f"install the driver and the libraries that {absent} needs" if absent else fix,
+        )
 
     @classmethod
     def _remedy(cls, error: Exception) -> str:
@@ -387,15 +381,8 @@ def open_session(ort: Any, model: Path | bytes, options: Any, providers: Provide
     return session
 
 
-def profiled(ort: Any, path: Path, options: Any, scratch: Path, providers: Providers = ON_CPU) -> OrtProfiled:
-    """Open a graph with ONNX Runtime's trace of every node on.
-
-    Args:
-        ort: The module.
-        path: The ONNX file.
-        options: ``SessionOptions``, which are changed.
-        scratch: Prefix of the files that ONNX Runtime writes.
-        providers: Where it runs.
+def profiling_session(ort: Any, path: Path, options: Any, scratch: Path, providers: Providers = ON_CPU) -> OrtProfiled:
+    """Open a graph with ONNX Runtime's trace of every node on; it writes files whose names begin with ``scratch``.
 
     Raises:
         GraphError: when ONNX Runtime refuses it.
