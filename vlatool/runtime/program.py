@@ -25,8 +25,8 @@ class Session(Protocol):
     def run(self, feeds: Mapping[str, Any]) -> Mapping[str, Any]:
         """Run the graph: input name -> array, output name -> array, both of NumPy and in the memory of the host.
 
-        In whose memory they are meanwhile is the session's affair; later runs do not change what it gave. A session with
-        an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
+        In whose memory they are meanwhile is the session's affair; later runs do not change what it gave. A session
+        with an attribute ``deadline`` raises ``TimeoutError`` when a run goes beyond it.
         """
 
 
