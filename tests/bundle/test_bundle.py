@@ -22,7 +22,7 @@ from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import BundleError
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 
 MANIFEST = Manifest("tiny", "1.0.0", PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0))
 

@@ -18,7 +18,7 @@ from vlatool.episodes.jobs import disturbances_of, run_jobs
 from vlatool.episodes.play import EpisodesJob
 from vlatool.errors import DataError, SourceError
 from vlatool.evaluate.closed_loop import ClosedLoop
-from vlatool.files.work import Store
+from vlatool.files.resumable_work import Store
 from vlatool.machine.awaited import Page, awaited, new_page
 from vlatool.module.description import read_description
 from vlatool.stage.base import Context

@@ -11,9 +11,9 @@ from _tiny import observations
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.evaluate.recorded import Recorded
-from vlatool.files.kept import FILES
-from vlatool.files.locks import hold, release
-from vlatool.files.work import work_directory
+from vlatool.files.blob_store import FILES
+from vlatool.files.locks import acquire, release
+from vlatool.files.resumable_work import work_directory
 from vlatool.graph.stored import LAYOUT, write_workload
 from vlatool.graph.workload import workload
 from vlatool.quantize.dynamic_int8 import DynamicInt8
@@ -132,10 +132,10 @@ def test_a_list_that_names_files_elsewhere_removes_none_there(cache: Path, tmp_p
     folder = cache / "stages" / "quantize.mine-0123456789abcdef"
     (folder / "in").mkdir(parents=True)
     (folder / "in/link.txt").symlink_to(victim)
-    from vlatool.files.written import LEDGER, Listing, _told
+    from vlatool.files.ownership import LEDGER, Listing, _ledger_bytes
 
     names = ("../../../victim.txt", str(victim), "in/link.txt")
-    (folder / LEDGER).write_bytes(_told(Listing.of(dict.fromkeys(names, "0" * 64))))
+    (folder / LEDGER).write_bytes(_ledger_bytes(Listing.of(dict.fromkeys(names, "0" * 64))))
     age(cache)
     prune(cache, older_than_s=0)
     assert victim.read_text() == "mine"
@@ -179,7 +179,7 @@ def test_what_was_just_made_stays(kept: Bundle, cache: Path):
 
 def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle, monkeypatch: pytest.MonkeyPatch):
     """Its folder is as old as the last file in it, but nobody has had the time to lock it."""
-    monkeypatch.setattr("vlatool.files.writing._flush", lambda folder: os.utime(folder, (0, 0)))
+    monkeypatch.setattr("vlatool.files.directory_writer._flush", lambda folder: os.utime(folder, (0, 0)))
     monkeypatch.setattr("vlatool.stage.run.hold", lambda path: False)
     made = cached_transform(DynamicInt8(), float_bundle, cache, Context())
     assert prune(cache, older_than_s=DAY).entries == ()
@@ -188,7 +188,7 @@ def test_what_took_long_to_flush_was_just_made(cache: Path, float_bundle: Bundle
 
 def test_an_entry_that_is_gone_cannot_be_held(kept: Bundle, cache: Path):
     prune(cache, older_than_s=0)
-    assert not hold(kept.path)
+    assert not acquire(kept.path)
 
 
 def test_a_shared_recording_goes_with_the_last_stage_that_holds_it(cache: Path, float_bundle: Bundle, copied: Any):

@@ -14,9 +14,18 @@ from typing import Any
 from vlatool.bundle.manifest import FileRecord, Manifest, check_files
 from vlatool.errors import BundleError
 from vlatool.files.json import read_json
-from vlatool.files.limits import check, limit
-from vlatool.files.sealed import FIX, LITTER, held, open_inside, read_all, read_sealed, unlisted, verify_sealed
-from vlatool.files.written import LEDGER, hash_once
+from vlatool.files.limits import check_limit, limit
+from vlatool.files.ownership import LEDGER, cached_hash
+from vlatool.files.verified_read import (
+    DESKTOP_FILES,
+    FIX,
+    find_unlisted,
+    open_inside,
+    read_all,
+    read_verified,
+    verified_directory,
+    verify_file,
+)
 
 MANIFEST = "manifest.json"
 DIGEST = "manifest.sha256"
@@ -69,7 +78,7 @@ class Bundle:
         """
         root = Path(path)
         bundle = cls(root, Manifest.from_dict(_read_manifest(root)))
-        check("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
+        check_limit("bundle_bytes", bundle.size_bytes, f"{root}: what the manifest records", BundleError)
         return bundle
 
     def verify(self, prefix: str = "", but: str = "") -> None:
@@ -85,7 +94,7 @@ class Bundle:
         self.check_tree()
         names = [name for name in self.manifest.files if name.startswith(prefix) and not (but and name.startswith(but))]
         for name in [name for name in names if name not in self._verified]:
-            verify_sealed(self.path, name, *self._record(name))
+            verify_file(self.path, name, *self._record(name))
 
     def check_tree(self) -> None:
         """Refuse what the manifest does not record, and a manifest that names files which it does not record.
@@ -95,7 +104,7 @@ class Bundle:
         """
         check_files(self.manifest)
         try:
-            stranger = unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
+            stranger = find_unlisted(self.path, set(self.manifest.files), UNRECORDED[1:], REPORTS)
         except OSError as error:
             raise BundleError(
                 f"{self.path} cannot be read: {error.strerror}.",
@@ -122,8 +131,8 @@ class Bundle:
         """
         sha256, size = self._record(name)
         if allowed:
-            check(allowed, size, f"{self.path / name}", BundleError)
-        content = read_sealed(self.path, name, sha256, size)
+            check_limit(allowed, size, f"{self.path / name}", BundleError)
+        content = read_verified(self.path, name, sha256, size)
         self._verified.add(name)
         return content
 
@@ -139,7 +148,7 @@ class Bundle:
             BundleError: when a file is not what the manifest says, or changed before the block ended.
         """
         files = {name: self._record(name) for name in names}
-        with held(self.path, folder, files) as place:
+        with verified_directory(self.path, folder, files) as place:
             yield place
         self._verified.update(files)
 
@@ -188,10 +197,10 @@ def seal(directory: Path, manifest: Manifest) -> Bundle:
     files = {}
     for path in sorted(directory.rglob("*")):
         name = path.relative_to(directory).as_posix()
-        if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in LITTER:
+        if path.is_file() and name.partition("/")[0] not in UNRECORDED and path.name not in DESKTOP_FILES:
             status = path.stat()
             linked = status.st_nlink > 1  # shared among stages of the cache, and read-only
-            files[name] = FileRecord(hash_once(path) if linked else hash_file(path), status.st_size)
+            files[name] = FileRecord(cached_hash(path) if linked else hash_file(path), status.st_size)
     sealed = replace(manifest, files=files)
     write_manifest(directory, sealed)
     return Bundle(directory, sealed)
@@ -240,7 +249,7 @@ def _read_manifest(root: Path) -> Any:
             "make one with: vlatool export SOURCE -o BUNDLE",
         )
     content = _read_small(root, MANIFEST, limit("manifest_bytes"))
-    check("manifest_bytes", len(content), f"{path}", BundleError)
+    check_limit("manifest_bytes", len(content), f"{path}", BundleError)
     _check_digest(root, content)
     return read_json(content, f"{path}", BundleError, "export the policy again", strict=True)
 

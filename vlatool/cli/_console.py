@@ -19,9 +19,9 @@ import typer
 
 from vlatool.cli._document import document, put, report_document, written
 from vlatool.errors import GateFailed, Inconclusive, OutputError, UsageError
+from vlatool.files.directory_writer import write_directory
 from vlatool.files.outputs import REPORT, refuse_inputs, refuse_replacing
-from vlatool.files.printable import one_line, printable, without_password
-from vlatool.files.writing import writing
+from vlatool.files.printable import mask_passwords, one_line, printable
 from vlatool.machine.host import cache_directory
 from vlatool.report import REPORT as REPORT_FILE
 from vlatool.report import Report
@@ -47,7 +47,7 @@ def command_line() -> str:
             shown.append(f"-o{_without_folders(word[2:])}" if word[2:] else word)
         else:
             shown.append(word)
-    return shlex.join(map(without_password, shown))
+    return shlex.join(map(mask_passwords, shown))
 
 
 def _without_folders(path: str) -> str:
@@ -155,7 +155,7 @@ def refuse_existing(
     if out is None:
         return
     refuse_inputs(out, inputs)
-    refuse_replacing(out, force=force, further={"the cache": cache_directory()}, kind=kind)
+    refuse_replacing(out, force=force, protected={"the cache": cache_directory()}, kind=kind)
     if not os.path.lexists(out):
         _refuse_unwritable(out)
 
@@ -235,7 +235,7 @@ def show(
     else:
         put(terminal_text(report))
     if out is not None:
-        with writing(out, force=force) as draft:
+        with write_directory(out, force=force) as draft:
             write_reports(report, draft)
     written(unfinished)
     if out is not None and not as_json:

@@ -13,7 +13,7 @@ import typer
 
 from vlatool.cli._document import document
 from vlatool.cli._options import AsJson
-from vlatool.errors import DataError, UsageError, nearest
+from vlatool.errors import DataError, UsageError, suggest
 from vlatool.files.printable import printable
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _amount(option: str, text: str, units: dict[str, int], example: str) -> floa
         )
     unit = next((name for name in units if name.lower() == match[2].lower()), None)
     if unit is None:
-        raise UsageError(f"{option} is '{text[:40]}'; {nearest(match[2], units)}.", f"write it as {option} {example}")
+        raise UsageError(f"{option} is '{text[:40]}'; {suggest(match[2], units)}.", f"write it as {option} {example}")
     value = float(match[1]) * units[unit]
     if not math.isfinite(value):
         raise UsageError(f"{option} is '{text[:40]}', which is too large.", f"give less, such as {option} {example}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 
 DEPTH = "prune.depth"
 MADE_BY = {"depth": DEPTH, "width": "prune.structured"}
@@ -38,7 +38,7 @@ def student_steps(text: str) -> tuple[tuple[str, dict[str, Any]], ...]:
                 f"write it as {EXAMPLE}",
             )
         if name not in MADE_BY:
-            raise RecipeError(f"--student knows no '{name}'; {nearest(name, MADE_BY)}.", instead(name, MADE_BY))
+            raise RecipeError(f"--student knows no '{name}'; {suggest(name, MADE_BY)}.", fix_for(name, MADE_BY))
         if name in shares:
             raise RecipeError(f"--student names {name} twice: '{text}'.", "name it once")
         shares[name] = _share(name, value)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import SourceError, nearest
+from vlatool.errors import SourceError, suggest
 from vlatool.module.edits import load_tensors, read_tensors
 from vlatool.module.stage import Changed, ModuleStage
 from vlatool.stage.base import Context
@@ -78,7 +78,7 @@ def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], w
     if unknown:
         raise SourceError(
             f"{where} holds {len(unknown)} tensors that the policy has not: '{unknown[0]}'; "
-            f"{nearest(unknown[0], known)}.",
+            f"{suggest(unknown[0], known)}.",
             "save the state_dict() of the policy's own modules, and nothing else",
         )
     for graph, state in held.items():

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vlatool import registry
-from vlatool.errors import GraphError, MissingExtra, PluginError, VlatoolError, install
+from vlatool.errors import GraphError, MissingExtra, PluginError, VlatoolError, pip_install
 from vlatool.files.printable import message_of
 from vlatool.machine import host
 from vlatool.runtime.arithmetic import EXACT
@@ -119,7 +119,7 @@ def engines(
             yield _engine(title, f"{package} {installed[package]}", library, jetson, ask)
             continue
         advice = f" ({library.advice})" if library.advice else ""
-        fix = "" if jetson and advice else f"{install(library.extra)}{advice}"
+        fix = "" if jetson and advice else f"{pip_install(library.extra)}{advice}"
         yield Check(title, "missing", "not installed", fix)
 
 
@@ -168,7 +168,7 @@ def extras(installed: Mapping[str, str]) -> Iterator[Check]:
     for extra, packages in EXTRAS.items():
         absent = [name for name in packages if _present(name, installed) is None]
         if absent:
-            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", install(extra))
+            yield Check(f"extra {extra}", "missing", f"lacks {', '.join(absent)}", pip_install(extra))
         else:
             versions = ", ".join(f"{name} {installed[_present(name, installed) or name]}" for name in packages)
             yield Check(f"extra {extra}", "ok", versions)

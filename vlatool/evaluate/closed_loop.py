@@ -21,7 +21,7 @@ from vlatool.episodes.controls import CONTROLS
 from vlatool.episodes.environment import timeout_of
 from vlatool.episodes.jobs import check_opens, disturbances_of, run_jobs
 from vlatool.episodes.play import EVALUATION_SEEDS, EpisodesJob, jobs_for
-from vlatool.errors import DataError, SourceError, UsageError, instead, nearest
+from vlatool.errors import DataError, SourceError, UsageError, fix_for, suggest
 from vlatool.evaluate._findings import found_wrong
 from vlatool.evaluate._late import late, latency_of
 from vlatool.evaluate._names import BASELINE, names_of
@@ -30,7 +30,7 @@ from vlatool.evaluate._seen import FIX, seen_in_training
 from vlatool.evaluate._sequential import played_until, sentence, with_decision
 from vlatool.evaluate._shown import check_video_of, played_again
 from vlatool.evaluate._told import told
-from vlatool.files.work import Store
+from vlatool.files.resumable_work import Store
 from vlatool.machine.host import cache_directory, fingerprint
 from vlatool.module.description import read_description
 from vlatool.module.factory import factory_file, split_factory
@@ -247,8 +247,8 @@ class ClosedLoop(Measure):
         known = disturbances_of(source, job, context)
         if unknown := [kind for kind in self.disturb if kind not in (*known, ALL)]:
             raise UsageError(
-                f"There is no disturbance '{unknown[0]}'; {nearest(unknown[0], (*known, ALL))}.",
-                instead(unknown[0], (*known, ALL)),
+                f"There is no disturbance '{unknown[0]}'; {suggest(unknown[0], (*known, ALL))}.",
+                fix_for(unknown[0], (*known, ALL)),
             )
         return known if ALL in self.disturb else tuple(dict.fromkeys(self.disturb))
 
@@ -359,7 +359,7 @@ class ClosedLoop(Measure):
             )
         for task in self.tasks:
             if known and task not in known and not self.environment:
-                raise UsageError(f"There is no task '{task}'; {nearest(task, known)}.", instead(task, known))
+                raise UsageError(f"There is no task '{task}'; {suggest(task, known)}.", fix_for(task, known))
         timeout = self.environment_timeout or timeout_of(named)
         job = EpisodesJob(where, str(folder), "", (), self.instruction, self.control, timeout_s=timeout)
         return jobs_for(job, tasks, self.episodes, self.first_seed)

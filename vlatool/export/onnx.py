@@ -14,7 +14,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.data import observations_for
 from vlatool.errors import GraphError, RecipeError, SourceError, require, require_present
-from vlatool.files.typed import shown
+from vlatool.files.validate import short_repr
 from vlatool.graph.as_float32 import ROUNDING, float32_text, written_in_float32
 from vlatool.machine.risky import risky
 from vlatool.module.edits import is_changed
@@ -145,7 +145,7 @@ class ExportOnnx(Transform):
                 with off_the_robot(answered, OF_NOT_FINITE if held else OF_THE_POLICY):
                     return program.run(encoded, finish=action)
             except SourceError as error:
-                texts = [f"{name} {shown(value)}" for name, value in observation.items() if isinstance(value, str)]
+                texts = [f"{name} {short_repr(value)}" for name, value in observation.items() if isinstance(value, str)]
                 asked = f" The policy was asked with {', '.join(texts)}." if texts else ""
                 raise SourceError(error.message + asked, error.fix) from error
 

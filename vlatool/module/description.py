@@ -17,9 +17,9 @@ from vlatool.bundle.program import ProgramStep, check_program, program_from, sin
 from vlatool.bundle.spec import PolicySpec
 from vlatool.data import checked
 from vlatool.data.npz import NpzReader
-from vlatool.errors import MissingExtra, SourceError, SpecError, instead, nearest
-from vlatool.files.kept import carry
-from vlatool.files.printable import one_line, shortened
+from vlatool.errors import MissingExtra, SourceError, SpecError, fix_for, suggest
+from vlatool.files.blob_store import link_or_copy
+from vlatool.files.printable import one_line, truncate
 from vlatool.files.yaml import read_mapping
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
@@ -106,7 +106,7 @@ def read_description(path: Path) -> Description:
     for key in data:
         if key not in KEYS:
             raise SourceError(
-                f"{file} has the unknown key '{key}'; {nearest(str(key), KEYS)}.", instead(str(key), KEYS)
+                f"{file} has the unknown key '{key}'; {suggest(str(key), KEYS)}.", fix_for(str(key), KEYS)
             )
     if data.get("schema", 1) != 1:
         raise SourceError(f"{file} has the schema {data['schema']!r}; this vlatool reads 1.", "upgrade vlatool")
@@ -153,7 +153,7 @@ def _check_label(file: Path, key: str, value: Any) -> None:
     if not (0 < len(label) <= LONGEST and one_line(label, LONGEST) == label):
         raise SourceError(
             f"{file}: '{key}' must be text of 1 to {LONGEST} characters without control characters; got "
-            f"{shortened(label, 40)!r}.",
+            f"{truncate(label, 40)!r}.",
             "give it a short name in one line",
         )
 
@@ -165,7 +165,7 @@ def _check_code(file: Path, data: Mapping[str, Any]) -> None:
         where = str(factory or "").rpartition(":")[0]
         if where.endswith(".py") and not _inside(where):
             raise SourceError(
-                f"{file}: '{key}' names a file outside the folder of the policy: {shortened(str(factory), 200)}.",
+                f"{file}: '{key}' names a file outside the folder of the policy: {truncate(str(factory), 200)}.",
                 "copy or link what runs into the folder, or name an importable package: package.module:make",
             )
 
@@ -294,7 +294,7 @@ def copy_assets(described: Description, out: Path) -> None:
     for key, path in described.recordings().items():
         checked(path, NpzReader().read(path), described.spec)  # while it has the name that the user knows
         (out / "data").mkdir(exist_ok=True)
-        carry(path, out / "data" / f"{key}.npz")
+        link_or_copy(path, out / "data" / f"{key}.npz")
 
 
 def check_assets(described: Description, copies: Path) -> None:

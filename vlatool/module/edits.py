@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, SourceError, nearest, require
+from vlatool.errors import RecipeError, SourceError, require, suggest
 from vlatool.files.json import read_json
 from vlatool.module.cut import cut
 from vlatool.module.edit import AGAIN
@@ -150,7 +150,7 @@ def apply(
             if edit.module not in parts:
                 known = [name for name in parts if name][:MOST_KNOWN]
                 more = f" and {len(parts) - 1 - len(known)} more" if len(parts) - 1 > len(known) else ""
-                says = f"An edit names the module '{edit.module}'; {nearest(edit.module, known)}{more}."
+                says = f"An edit names the module '{edit.module}'; {suggest(edit.module, known)}{more}."
                 raise SourceError(says, AGAIN)
             _CHANGED.add(made[edit.graph])
             (_keep_blocks if edit.axis == BLOCKS else _keep)(parts[edit.module], edit)
@@ -159,7 +159,7 @@ def apply(
 
 def _named(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
     if graph not in modules:
-        raise SourceError(f"An edit names the graph '{graph}'; {nearest(graph, modules)}.", AGAIN)
+        raise SourceError(f"An edit names the graph '{graph}'; {suggest(graph, modules)}.", AGAIN)
     return modules[graph]
 
 
@@ -268,7 +268,7 @@ def load_tensors(graph: str, module: nn.Module, stored: Mapping[str, Any], where
         tensor = next((each for each in found if each is not None), None)
         if tensor is None:
             raise SourceError(
-                f"No tensor of {where} is '{first}' of '{graph}'; {nearest(first, stored)}.",
+                f"No tensor of {where} is '{first}' of '{graph}'; {suggest(first, stored)}.",
                 "store the state_dict of the module that make() gives, with its names",
             )
         if tensor.shape != value.shape:

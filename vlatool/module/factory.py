@@ -12,7 +12,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlatool.errors import InputError, MissingExtra, SourceError, VlatoolError, install, instead, nearest
+from vlatool.errors import (
+    InputError,
+    MissingExtra,
+    SourceError,
+    VlatoolError,
+    fix_for,
+    pip_install,
+    suggest,
+)
 from vlatool.files.printable import message_of
 from vlatool.module.fresh import compile_afresh
 from vlatool.user_code.children import left
@@ -91,7 +99,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
     if not callable(make):
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
         raise SourceError(
-            f"'{where}' has no function '{function}'; {nearest(function, known)}.", instead(function, known)
+            f"'{where}' has no function '{function}'; {suggest(function, known)}.", fix_for(function, known)
         )
     if path is None:
         _check_own(make, factory)
@@ -243,4 +251,4 @@ def _importable(path: Path | None) -> Iterator[None]:
 def _install_hint(package: str) -> str:
     extra = {"torch": "build", "minigrid": "sim", "gymnasium": "sim", "metaworld": "metaworld", "mujoco": "metaworld"}
     known = extra.get(package.partition(".")[0])
-    return install(known) if known else f"pip install {package}"
+    return pip_install(known) if known else f"pip install {package}"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vlatool.bundle.program import ProgramStep
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, require, suggest
 
 
 def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def modules_of(product: Any, graphs: Iterable[str]) -> dict[str, Any]:
     for name in dict.fromkeys(graphs):
         if name not in products:
             raise SourceError(
-                f"The program runs '{name}', which the factory does not give; {nearest(name, products)}.",
+                f"The program runs '{name}', which the factory does not give; {suggest(name, products)}.",
                 "name the graphs of the program as make() names its modules",
             )
         module = products[name]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import SourceError, nearest, require
+from vlatool.errors import SourceError, require, suggest
 from vlatool.module.edits import BLOCKS, holds_weights, is_changed, read_edits
 from vlatool.module.faked import Weightless, weightless
 from vlatool.module.origin import AGAIN, origin_of
@@ -94,7 +94,7 @@ def _locate(graph: str, made: Weightless, shards: Mapping[str, StoredTensor], fi
         tensor = next((each for each in found if each is not None), None)
         if tensor is None:
             raise SourceError(
-                f"No shard holds '{before[0]}', which the module '{graph}' needs; {nearest(before[0], shards)}.",
+                f"No shard holds '{before[0]}', which the module '{graph}' needs; {suggest(before[0], shards)}.",
                 f"names are those of state_dict(); check the weights and the arguments in {file}",
             )
         if tuple(value.shape) != tensor.shape:

@@ -16,11 +16,11 @@ from typing import Any
 from vlatool.accuracy.credibility import Credibility, credibility
 from vlatool.accuracy.moved import with_task_speedup
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import NOT_MADE, DataError, RecipeError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, DataError, RecipeError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.explain.apart import explanation_apart
+from vlatool.files.directory_writer import write_directory
 from vlatool.files.messages import from_json, to_json
-from vlatool.files.writing import writing
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.optimize.budget import budget_of
@@ -89,7 +89,7 @@ def optimize(plan: Plan, out: Path, context: Context, *, force: bool = False) ->
         float32 where none could be judged), ``inconclusive``
         when float32 does no better than actions that do not look at the observation.
     """
-    with writing(out, force=force) as draft:
+    with write_directory(out, force=force) as draft:
         if plan.profile and (confine := plan.board_set.to_set):
             return _confined(plan, plan.profile, confine, draft, context)
         return _optimized(plan, draft, context)
@@ -189,7 +189,7 @@ def _candidates(
             made = candidate(stages, source, baseline, plan, context)
             bundles[name], trained[name] = made[-1], trainings(made)
         except VlatoolError as error:
-            if error.exit_code not in NOT_MADE:
+            if error.exit_code not in NOT_POSSIBLE:
                 raise
             failures.append(Row(name, "failed", error.message))
     if not bundles:

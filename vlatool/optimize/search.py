@@ -27,7 +27,7 @@ from vlatool import registry
 from vlatool.benchmark.latency import Latency
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import recorded_observations
-from vlatool.errors import NOT_MADE, GraphError, PluginError, VlatoolError
+from vlatool.errors import NOT_POSSIBLE, GraphError, PluginError, VlatoolError
 from vlatool.evaluate.recorded import Recorded
 from vlatool.hardware.profile import Profile
 from vlatool.machine.host import isa
@@ -182,7 +182,7 @@ class Search:
             error = self._error(bundle, quiet)
             trial = Trial(name, stages, speedup, error, error <= FINE * self.budget.value, "", engine, fastest)
         except VlatoolError as failure:
-            if failure.exit_code not in NOT_MADE:
+            if failure.exit_code not in NOT_POSSIBLE:
                 raise
             trial = Trial(name, stages, note=failure.message)
         self.trials.append(trial)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from vlatool.accuracy.credibility import Credibility
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import install
+from vlatool.errors import pip_install
 from vlatool.machine.host import fingerprint
 from vlatool.machine.instruction_sets import ENGINE, BoardSet, about_onnx_runtime
 from vlatool.optimize.choice import chosen_of
@@ -118,4 +118,4 @@ def _needs(engine: str) -> tuple[str, ...]:
     """Say what the robot must have installed beside the default engine."""
     if engine == DEFAULT_ENGINE:
         return ()
-    return (f"It runs on the engine {engine}: {install(engine, 'vlatool-runtime')} on the robot.",)
+    return (f"It runs on the engine {engine}: {pip_install(engine, 'vlatool-runtime')} on the robot.",)

@@ -18,7 +18,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.bundle.unexported import no_graph
 from vlatool.data import calibration_recording, observations_for
-from vlatool.errors import BundleError, RecipeError, instead, nearest
+from vlatool.errors import BundleError, RecipeError, fix_for, suggest
 from vlatool.files.scratch import scratch_directory
 from vlatool.graph.files import foreign_errors, load, part_phases, read, save
 from vlatool.graph.layers import Layer, find_layers
@@ -73,8 +73,8 @@ class Quantization(Transform):
         for pattern in self.graphs:
             if not fnmatch.filter(source.manifest.graphs, pattern):
                 raise RecipeError(
-                    f"No graph matches '{pattern}'; {nearest(pattern, source.manifest.graphs)}.",
-                    instead(pattern, source.manifest.graphs),
+                    f"No graph matches '{pattern}'; {suggest(pattern, source.manifest.graphs)}.",
+                    fix_for(pattern, source.manifest.graphs),
                 )
         for name in self.chosen_graphs(source):
             graph = source.manifest.graphs[name]
@@ -197,13 +197,13 @@ class Quantization(Transform):
         for pattern in (*self.include, *self.exclude):
             if not any(meets(name, (pattern,)) for name in candidates):
                 raise RecipeError(
-                    f"No node matches '{pattern}'; {nearest(pattern, candidates[:200])}.",
-                    instead(pattern, candidates[:200]),
+                    f"No node matches '{pattern}'; {suggest(pattern, candidates[:200])}.",
+                    fix_for(pattern, candidates[:200]),
                 )
         parts = bundle.manifest.parts
         for part in self.parts:
             if part not in parts:
-                raise RecipeError(f"The policy has no part '{part}'; {nearest(part, parts)}.", instead(part, parts))
+                raise RecipeError(f"The policy has no part '{part}'; {suggest(part, parts)}.", fix_for(part, parts))
         globs = tuple(pattern for part in self.parts for pattern in parts[part])
         kept = {name for name in candidates if not self.include or meets(name, self.include)}
         if self.parts:
@@ -222,8 +222,8 @@ def check_ops(ops: Iterable[str]) -> None:
     for name in ops:
         if name not in QUANTIZED_OPS:
             raise RecipeError(
-                f"The operator '{name}' cannot be quantized; {nearest(name, QUANTIZED_OPS)}.",
-                instead(name, QUANTIZED_OPS),
+                f"The operator '{name}' cannot be quantized; {suggest(name, QUANTIZED_OPS)}.",
+                fix_for(name, QUANTIZED_OPS),
             )
 
 

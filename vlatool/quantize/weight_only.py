@@ -16,7 +16,7 @@ from vlatool.bundle.manifest import FileRecord, Graph, Manifest
 from vlatool.bundle.unexported import export_command
 from vlatool.data import recorded_observations
 from vlatool.errors import BundleError, DataError, require
-from vlatool.files.work import forget, work_directory
+from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
@@ -111,7 +111,7 @@ class WeightOnly(WeightOptions):
             written = write_records(records, self._identity(plan, bundle), place, _processes(records), context.tell)
             link(written.path, out / WEIGHTS)
             made = self._finish(plan, bundle, out, written, samples, context)
-            forget(place)
+            remove_work(place)
         return made
 
     def _finish(

@@ -12,9 +12,9 @@ from typing import Any, get_args
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, UNRECORDED, Bundle, hash_file
 from vlatool.errors import BundleError, SourceError, VlatoolError
+from vlatool.files.directory_writer import write_directory
+from vlatool.files.ownership import LEDGER
 from vlatool.files.scratch import scratch_directory
-from vlatool.files.writing import writing
-from vlatool.files.written import LEDGER
 from vlatool.machine.version import VERSION
 from vlatool.module.description import read_location
 from vlatool.optimize.pipeline import ROBOT_FOLDERS
@@ -209,7 +209,7 @@ def rebuild(
         left_out = ("accuracy",) if "candidate" in bundle.manifest.made_by else ()
         compared = compare_bundles(bundle, product, left_out)
         if out is not None:
-            with writing(out, force=force) as draft:
+            with write_directory(out, force=force) as draft:
                 shutil.copytree(
                     product.path, draft, dirs_exist_ok=True, ignore=shutil.ignore_patterns(LOCATION, LEDGER)
                 )

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import IO, Any, cast
 
 from vlatool.errors import MissingExtra, TargetError
-from vlatool.files.limits import check, limit
+from vlatool.files.limits import check_limit, limit
 from vlatool.files.printable import one_line, printable
 from vlatool.remote._heard import parsed
 
@@ -247,7 +247,7 @@ class Connection:
         self._came += count
         self._flooded = self._came > limit("target_bytes")
         if not self._closing:
-            check("target_bytes", self._came, f"What {self._target} sends", TargetError)
+            check_limit("target_bytes", self._came, f"What {self._target} sends", TargetError)
 
     def _try(self) -> str:
         return f"see what happens with: ssh {self._target} sh -c true"
@@ -271,10 +271,10 @@ class Connection:
                 _, marked, rest = line.partition(mark)
                 if marked:
                     self._answered = True
-                    check("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
+                    check_limit("target_message_bytes", len(rest), f"A message of {self._target}", TargetError)
                     self._messages.append(parsed(rest, self._target))
         elif mark in self._buffer:
-            check("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
+            check_limit("target_message_bytes", len(self._buffer), f"A message of {self._target}", TargetError)
         elif len(self._buffer) > NOISE:
             self._buffer = self._buffer[-len(mark) :]
         return bool(received)

@@ -10,8 +10,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.manifest import Graph
 from vlatool.errors import BundleError
 from vlatool.files.limits import MIB
-from vlatool.files.sealed import open_inside
-from vlatool.files.typed import outside, shown
+from vlatool.files.validate import path_problem, short_repr
+from vlatool.files.verified_read import open_inside
 from vlatool.machine.risky import risky
 from vlatool.runtime.external_data import OpenFile, external_files
 
@@ -68,10 +68,10 @@ def recorded(bundle: Bundle, file: str, locations: Iterable[str]) -> list[str]:
     files = []
     for location in sorted(locations):
         name = f"{folder}/{location}" if folder else location
-        reason = outside(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
+        reason = path_problem(location) or ("" if name in bundle.manifest.files else "the manifest does not record it")
         if reason:
             raise BundleError(
-                f"The graph {file} of {bundle.path} keeps weights in {shown(location)}: {reason}.",
+                f"The graph {file} of {bundle.path} keeps weights in {short_repr(location)}: {reason}.",
                 "export the policy again",
             )
         files.append(name)

@@ -16,7 +16,7 @@ from vlatool.bundle.manifest import Graph, Manifest
 from vlatool.bundle.program import single_graph
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.data import observations_for
-from vlatool.errors import GraphError, InputError, SourceError, nearest, require
+from vlatool.errors import GraphError, InputError, SourceError, require, suggest
 from vlatool.graph.as_float32 import ROUNDING, as_float32, float32_text
 from vlatool.graph.draws import refuse_drawing_file
 from vlatool.graph.files import save
@@ -271,7 +271,7 @@ def _check_names(model: Any, spec: PolicySpec) -> None:
         for tensor in tensors:
             if tensor.name not in names:
                 raise SourceError(
-                    f"The ONNX file has no '{tensor.name}', which the spec names; {nearest(tensor.name, names)}.",
+                    f"The ONNX file has no '{tensor.name}', which the spec names; {suggest(tensor.name, names)}.",
                     "name inputs and outputs in policy.yaml as the file does",
                 )
 

@@ -108,8 +108,8 @@ def _blamed() -> Iterator[None]:
     except (VlatoolError, OSError, MemoryError):
         raise
     except Exception as error:
-        if owner := registry.blamed(error):
-            raise PluginError(*registry.complaint(owner, type(error).__name__, message_of(error))) from error
+        if owner := registry.package_at_fault(error):
+            raise PluginError(*registry.plugin_failure(owner, type(error).__name__, message_of(error))) from error
         raise
 
 

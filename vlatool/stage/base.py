@@ -19,7 +19,7 @@ from vlatool import registry
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import PluginError, RecipeError
 from vlatool.files.numbers import Numeric
-from vlatool.files.work import Store
+from vlatool.files.resumable_work import Store
 from vlatool.machine.instruction_sets import computed_in
 from vlatool.machine.version import VERSION
 from vlatool.report import Report

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from vlatool import registry
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 from vlatool.stage.base import Stage
 
 AnyStage = TypeVar("AnyStage", bound=Stage)
@@ -25,7 +25,7 @@ def stage_class(name: str) -> type[Stage]:
     kind, _, entry = name.partition(".")
     known = [f"{folder}.{method}" for folder in stage_kinds() for method in registry.names(folder)]
     if name.replace("-", "_") not in known:
-        raise RecipeError(f"Unknown stage '{name}'; {nearest(name, known)}.", instead(name, known))
+        raise RecipeError(f"Unknown stage '{name}'; {suggest(name, known)}.", fix_for(name, known))
     stage: type[Stage] = registry.load(kind, entry)
     return stage
 
@@ -59,7 +59,7 @@ def validated(kind: type[AnyStage], options: Mapping[str, Any], where: str) -> A
 def _problem(item: Mapping[str, Any], kind: type[Stage]) -> str:
     field_name = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        return f"unknown option '{field_name}'; {nearest(field_name, list(kind.model_fields))}"
+        return f"unknown option '{field_name}'; {suggest(field_name, list(kind.model_fields))}"
     problem = f"{field_name} = {item['input']!r}: {str(item['msg'])[:1].lower()}{str(item['msg'])[1:]}"
     ends = _ends(kind, field_name) if set(item.get("ctx", {})) & set(ENDS) else []
     return f"{problem}; allowed: {', '.join(ends)}" if len(ends) > 1 else problem

@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from vlatool.files.edited import DRAFT_NAME, sweep_drafts
-from vlatool.files.kept import DIGEST, FILES, SHIPPED, STAGES, TAG
-from vlatool.files.locks import alone
-from vlatool.files.work import LOCK
-from vlatool.files.writing import sweep
-from vlatool.files.written import LEDGER, hash_once, read_listing
+from vlatool.files.blob_store import DIGEST, FILES, STAGES, TAG, TRANSFERS
+from vlatool.files.locks import exclusive_lock
+from vlatool.files.ownership import LEDGER, cached_hash, read_listing
+from vlatool.files.resumable_work import LOCK
+from vlatool.files.user_files import DRAFT_NAME, remove_stale_drafts
 from vlatool.graph.stored import is_workload
 
 STREAMS, WORKLOADS = "streams", "workloads"
@@ -32,7 +31,7 @@ NAMES = {
     STAGES: re.compile(r"(?P<what>[a-z]+\.[a-z0-9_]+)-[0-9a-f]{16}"),
     STREAMS: re.compile(r"[\w.-]+"),
     WORKLOADS: re.compile(r"[0-9a-f]{32}\.json"),
-    SHIPPED: DIGEST,
+    TRANSFERS: DIGEST,
 }
 STREAM_FILES = re.compile(
     r"lock|data|journal|answer-[0-9a-f]{32}\.json|checkpoint\.safetensors|meeting|round-\d{3}\.json"
@@ -215,7 +214,7 @@ def _entry(cache: Path, folder: str, path: Path) -> Entry | None:
     if named is None or stat.S_ISLNK(status.st_mode):
         return None
     name = path.relative_to(cache).as_posix()
-    if folder in (STAGES, SHIPPED):
+    if folder in (STAGES, TRANSFERS):
         what = named["what"] if folder == STAGES else "files of another machine"
         files = _stage_files(path)
         return Entry(name, what, status.st_mtime, files) if files else None
@@ -258,7 +257,7 @@ def _remove(cache: Path, entry: Entry, dry_run: bool) -> str:
     if _now() - entry.used < NEW_S:
         return RECENT
     lock = path / LOCK if entry.what == "unfinished work" else path
-    with alone(lock) as mine:
+    with exclusive_lock(lock) as mine:
         if not mine:
             return f"{IN_USE} by a running process"
         if dry_run:
@@ -284,7 +283,7 @@ def _sweep(cache: Path, unused: Iterable[str]) -> dict[str, str]:
         with contextlib.suppress(FileNotFoundError):
             if (cache / name).lstat().st_nlink > 1:
                 continue
-            if hash_once(cache / name) != Path(name).name:
+            if cached_hash(cache / name) != Path(name).name:
                 stays[name] = "is not what its name says"
             else:
                 (cache / name).unlink()
@@ -297,10 +296,10 @@ def _drafts(cache: Path) -> Iterator[Path]:
     """Remove drafts of stages whose writers are gone; yield unfinished shared files of such writers."""
     for path in _below(cache / WORKLOADS):
         if final := _draft_of(WORKLOADS, path.name):
-            sweep_drafts(path.with_name(final))
-    for folder in (STAGES, SHIPPED):
+            remove_stale_drafts(path.with_name(final))
+    for folder in (STAGES, TRANSFERS):
         for final in {match["final"] for path in _below(cache / folder) if (match := DRAFT.fullmatch(path.name))}:
-            sweep(cache / folder / final)
+            remove_stale_drafts(cache / folder / final)
     for path in _below(cache / FILES):
         match = PART.fullmatch(path.name)
         with contextlib.suppress(FileNotFoundError):

@@ -15,7 +15,7 @@ import numpy as np
 
 from vlatool.bundle.bundle import REPORTS, Bundle, restate, seal
 from vlatool.bundle.manifest import FileRecord, Graph, Manifest
-from vlatool.files.kept import carry
+from vlatool.files.blob_store import link_or_copy
 from vlatool.machine.risky import risky
 from vlatool.runtime.arithmetic import SATURATING, int8_trouble, is_int8, machine
 from vlatool.runtime.contract import OF_NOT_FINITE, OF_THE_GRAPHS, OF_THE_POLICY, off_the_robot
@@ -109,7 +109,7 @@ def carry_over(source: Bundle, out: Path, folders: Iterable[str] = CARRIED) -> N
                 target = out / file.relative_to(source.path)
                 name = file.relative_to(source.path).as_posix()
                 target.parent.mkdir(parents=True, exist_ok=True)
-                carry(file, target, known[name].sha256 if name in known else "")
+                link_or_copy(file, target, known[name].sha256 if name in known else "")
 
 
 def finish(

@@ -12,11 +12,11 @@ from typing import Any
 
 from vlatool.bundle.bundle import REPORTS, Bundle
 from vlatool.errors import BundleError, DataError, VlatoolError
-from vlatool.files.kept import tag
-from vlatool.files.locks import hold
+from vlatool.files.blob_store import mark_cache
+from vlatool.files.directory_writer import write_directory
+from vlatool.files.locks import acquire
 from vlatool.files.outputs import BUNDLE, refuse_replacing
-from vlatool.files.work import forget_all
-from vlatool.files.writing import writing
+from vlatool.files.resumable_work import remove_all_unused
 from vlatool.machine.host import cache_directory as cache_directory
 from vlatool.report import REPORT, Report, read_report
 from vlatool.stage import tried
@@ -46,7 +46,7 @@ def run_transform(
         out: The new bundle.
         context: For progress.
         force: Replace a directory that vlatool wrote.
-        damaged: See ``vlatool.files.writing.writing``.
+        damaged: See ``vlatool.files.directory_writer.write_directory``.
         reports: Directory of reports of a stage before it, which come along where this one writes none.
 
     Raises:
@@ -58,7 +58,7 @@ def run_transform(
     if apart and not stage.runs(source):
         children.prepare(needed(stage))  # while this process checks
     stage.check(source, None)
-    with writing(out, force=force, damaged=damaged) as draft:
+    with write_directory(out, force=force, damaged=damaged) as draft:
         stage.accept(run_apart(stage, source, draft, context) if apart else stage.run(source, draft, context))
         for report in reports.iterdir() if reports is not None and reports.is_dir() else ():
             (draft / REPORTS).mkdir(exist_ok=True)
@@ -78,14 +78,14 @@ def cached_path(stage: Stage, source_hash: str, cache: Path) -> Path:
 def cached_transform(stage: Transform, source: Bundle | None, cache: Path, context: Context) -> Bundle:
     """Return the stage's bundle from the cache, or run the stage into the cache."""
     path = cached_path(stage, source.hash if source else "", cache)
-    if hold(path):
+    if acquire(path):
         try:
             return Bundle.open(path)
         except BundleError:
             context.tell(f"the cached {stage.name()} is damaged; making it again", None)
-    tag(cache)
+    mark_cache(cache)
     bundle = run_transform(stage, source, path, context, damaged=True)
-    hold(path)
+    acquire(path)
     return bundle
 
 
@@ -140,9 +140,9 @@ def cached_measure(stage: Measure, source: Bundle, cache: Path, context: Context
             context.tell(f"the cached {stage.name()} is damaged; measuring again", None)
     own = replace(context, unfinished=[], notes=[])
     report = replace(measured(stage, source, own), created=datetime.now(timezone.utc).isoformat(timespec="seconds"))
-    tag(cache)
-    with writing(path, damaged=True) as draft:
+    mark_cache(cache)
+    with write_directory(path, damaged=True) as draft:
         (draft / REPORT).write_text(report.to_json(), encoding="utf-8")
     context.notes.extend(own.notes)
-    forget_all(own.unfinished or ())
+    remove_all_unused(own.unfinished or ())
     return report

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
-from vlatool.errors import RecipeError, instead, nearest
+from vlatool.errors import RecipeError, fix_for, suggest
 from vlatool.module.batched import BatchedProgram
 from vlatool.training.flow import CHUNK, check_loops, flow_loss
 from vlatool.training.hinted import with_hints
@@ -50,8 +50,8 @@ class ImitationStage(TrainingStage):
         known = registry.names("losses")
         if self.loss != "auto" and self.loss not in known:
             raise RecipeError(
-                f"Unknown loss '{self.loss}'; {nearest(self.loss, ['auto', *known])}.",
-                instead(self.loss, ["auto", *known]),
+                f"Unknown loss '{self.loss}'; {suggest(self.loss, ['auto', *known])}.",
+                fix_for(self.loss, ["auto", *known]),
             )
         super().check(source, profile)
         if source is not None and self.loss == "kl" and source.manifest.spec.action.kind != "discrete":

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vlatool.errors import DataError, require
-from vlatool.files.edited import whole_file
 from vlatool.files.printable import message_of
+from vlatool.files.user_files import atomic_file
 from vlatool.module.batched import no_gradient
 from vlatool.module.edits import save_tensors, stream_tensors
 from vlatool.training.best import Best
@@ -264,7 +264,7 @@ class Trainer:
             return
         about = {"step": str(self.step), "losses": json.dumps(self.losses), "best": self.best.text(),
                  "looks": json.dumps(self.looks), "seconds": f"{self.seconds:.3f}"}  # fmt: skip
-        with whole_file(self._file) as draft:
+        with atomic_file(self._file) as draft:
             if not shards.several:
                 save_tensors(
                     draft, {f"{kind}.{name}": held.detach().contiguous() for kind, name, held in tensors}, about

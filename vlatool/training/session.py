@@ -18,7 +18,7 @@ from vlatool.data import BEGINS, Recording, kept_rows, recorded_observations
 from vlatool.episodes.jobs import run_jobs
 from vlatool.episodes.play import jobs_for
 from vlatool.errors import require
-from vlatool.files.edited import whole_file
+from vlatool.files.user_files import atomic_file
 from vlatool.module.edits import read_edits
 from vlatool.module.stage import write_changed
 from vlatool.runtime.observation import ObservationEncoder
@@ -264,7 +264,7 @@ class Session:
         return about
 
     def _keep(self, number: int, about: dict[str, Any]) -> None:
-        with whole_file(self._place / ROUND.format(number)) as draft:
+        with atomic_file(self._place / ROUND.format(number)) as draft:
             draft.write_text(json.dumps(about))
 
     def _note(self, number: int) -> None:

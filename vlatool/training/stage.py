@@ -15,7 +15,7 @@ from vlatool.bundle.bundle import MANIFEST, REPORTS, Bundle
 from vlatool.episodes.play import EVALUATION_SEEDS
 from vlatool.errors import OutputError, RecipeError, require
 from vlatool.files.printable import file_of
-from vlatool.files.work import forget, work_directory
+from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.machine import host
 from vlatool.module.description import description_file
 from vlatool.module.edits import is_changed
@@ -322,7 +322,7 @@ class TrainingStage(ModuleStage):
         made = super().run(source, out, context)
         place = self._place(source_of(source, self.name()))
         write_training_report(made, seconds_of(place), context.command)
-        forget(place)
+        remove_work(place)
         return made
 
     def _place(self, source: Bundle) -> Path:

@@ -17,15 +17,15 @@ from typing import Any
 from vlatool import errors
 from vlatool.errors import GraphError, InputError, MissingExtra, SourceError, VlatoolError
 from vlatool.files.json import parse_json
-from vlatool.files.limits import VARIABLE, limit
-from vlatool.files.printable import TOLD, shortened
+from vlatool.files.limits import LIMITS_VARIABLE, limit
+from vlatool.files.printable import MAX_CHARACTERS, truncate
 from vlatool.machine.risky import Deed, crashed
 
 ENDINGS = (errno.EPIPE, errno.ESHUTDOWN, errno.ECONNABORTED, errno.ECONNRESET, errno.ECONNREFUSED)
 """Errors of connections: none of a file, and to this program the sign that nobody reads it any more."""
 
 
-LONGEST = 2 * TOLD
+LONGEST = 2 * MAX_CHARACTERS
 """Characters of a message of a child, which may quote what foreign code says."""
 
 
@@ -111,11 +111,11 @@ def result(answer: Mapping[str, Any], about: str, *, own: bool = False) -> Any:
     if "error" in answer:
         kind = Killed if answer["error"] == Killed.__name__ else getattr(errors, answer["error"], None)
         if isinstance(kind, type) and issubclass(kind, VlatoolError if own else InputError | MissingExtra):
-            raise kind(shortened(answer["message"], LONGEST), shortened(answer["fix"], LONGEST))
+            raise kind(truncate(answer["message"], LONGEST), truncate(answer["fix"], LONGEST))
         name = f"{answer['error']}: " if isinstance(kind, type) and issubclass(kind, VlatoolError) else ""
-        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", shortened(answer["fix"], LONGEST))
+        raise SourceError(f"{about} failed: {plain(name)}{name and ' '}{message}", truncate(answer["fix"], LONGEST))
     if "errno" in answer:
-        raise OSError(answer["errno"], message, answer["file"] and shortened(answer["file"], LONGEST))
+        raise OSError(answer["errno"], message, answer["file"] and truncate(answer["file"], LONGEST))
     name = plain(answer["raised"])
     if own:
         raise RuntimeError(f"{about} failed in its process: {name}: {message}")
@@ -137,7 +137,7 @@ def nonsense(about: str) -> SourceError:
 
 def plain(text: str) -> str:
     """Return a text without what would steer a terminal, shortened where it is very long."""
-    text = shortened(text, LONGEST)
+    text = truncate(text, LONGEST)
     return "".join(character if unicodedata.category(character)[0] != "C" else " " for character in text).rstrip()
 
 
@@ -187,7 +187,9 @@ def _engine_ended(code: int, doing: Deed, said: str) -> GraphError:
     if code == -signal.SIGALRM:
         seconds = limit("engine_seconds")
         error = crashed(doing, f"was ended after {seconds:,} s, which the limit 'engine_seconds' allows,", said)
-        return GraphError(error.message, f"where it needs longer, raise it: {VARIABLE}=engine_seconds={10 * seconds}")
+        return GraphError(
+            error.message, f"if it needs longer, raise it: {LIMITS_VARIABLE}=engine_seconds={10 * seconds}"
+        )
     how = f"with {_signal(code)}" if code < 0 else f"with exit code {code}"
     return crashed(doing, f"ended its process {how}", said)
 

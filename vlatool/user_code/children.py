@@ -24,7 +24,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from vlatool.errors import SourceError
-from vlatool.files.printable import shortened
+from vlatool.files.printable import truncate
 from vlatool.machine.awaited import Page, new_page
 from vlatool.machine.host import MAX_CPU_ISA
 from vlatool.machine.processes import SINGLE, import_path, python_command
@@ -197,7 +197,7 @@ class Apart:
                     what = line["doing"]
                     self._last.doing = what and (plain(what[0]), plain(what[1]), plain(what[2]))
                 elif "warning" in line:
-                    warnings.warn(shortened(line["warning"]), UserWarning, stacklevel=2)
+                    warnings.warn(truncate(line["warning"]), UserWarning, stacklevel=2)
                 else:
                     self._print()
                     return result(line, self.about, own=own)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlatool import registry
-from vlatool.errors import PluginError, UsageError, nearest
+from vlatool.errors import PluginError, UsageError, suggest
 
 KIND = "workers"
 PROCESSES = "processes"
@@ -107,7 +107,7 @@ def asked_for(text: str) -> tuple[str, int]:
     name, _, count = text.partition(":") if not text.isdecimal() else (PROCESSES, "", text)
     if name not in registry.names(KIND):
         raise UsageError(
-            f"--workers is '{text}'; it takes a number of processes, or {nearest(name, _others())}.",
+            f"--workers is '{text}'; it takes a number of processes, or {suggest(name, _others())}.",
             "write --workers 4, or --workers ray:4",
         )
     if ":" in text or count:

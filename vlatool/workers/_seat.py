@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vlatool.errors import VlatoolError
-from vlatool.files.limits import VARIABLE
+from vlatool.files.limits import LIMITS_VARIABLE
 from vlatool.files.messages import from_json, to_json
 from vlatool.files.printable import file_of
 from vlatool.machine.host import MAX_CPU_ISA, OLDER_MAX_CPU_ISA, architecture, versions
@@ -26,7 +26,7 @@ from vlatool.user_code.children import Apart, Killed
 from vlatool.workers import Work
 from vlatool.workers._shipped import Arriving, Parcel, Places
 
-PASSED = (*SINGLE, MAX_CPU_ISA, OLDER_MAX_CPU_ISA, VARIABLE, "VLATOOL_DEBUG")
+PASSED = (*SINGLE, MAX_CPU_ISA, OLDER_MAX_CPU_ISA, LIMITS_VARIABLE, "VLATOOL_DEBUG")
 """Variables that a worker has as the machine has them that sends the work: they change what is computed."""
 MOST_SAID = 1000
 """The last lines of progress of a job that are told; a job says which episodes it begins."""

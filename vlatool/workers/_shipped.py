@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 from vlatool.errors import OutputError, SourceError
-from vlatool.files.kept import SHIPPED, tag
-from vlatool.files.limits import check
-from vlatool.files.locks import hold
-from vlatool.files.writing import writing
-from vlatool.files.written import hash_once
+from vlatool.files.blob_store import TRANSFERS, mark_cache
+from vlatool.files.directory_writer import write_directory
+from vlatool.files.limits import check_limit
+from vlatool.files.locks import acquire
+from vlatool.files.ownership import cached_hash
 from vlatool.machine.host import cache_directory
 from vlatool.user_code.walk import files_below
 from vlatool.workers import Folder
@@ -60,12 +60,13 @@ class Parcel:
     @property
     def place(self) -> Path:
         """Where it is on this machine once it has arrived."""
-        return cache_directory() / SHIPPED / self.digest
+        return cache_directory() / TRANSFERS / self.digest
 
     def is_here(self) -> bool:
         """Say whether every file has arrived, and is what it was; then it stays while this process runs."""
         with contextlib.suppress(OSError):
-            return hold(self.place) and all(hash_once(self.place / file.name) == file.sha256 for file in self.files)
+            held = acquire(self.place)
+            return held and all(cached_hash(self.place / file.name) == file.sha256 for file in self.files)
         return False
 
 
@@ -83,20 +84,21 @@ def parcel_of(folder: Folder) -> Parcel:
         raise SourceError(
             f"{error.filename or root} cannot be sent to the workers: {error.strerror}.", READABLE
         ) from error
-    check("shipped_bytes", sum(file.size for file in files), f"{root}, which is sent to the workers,", SourceError)
+    size = sum(file.size for file in files)
+    check_limit("shipped_bytes", size, f"{root}, which is sent to the workers,", SourceError)
     return Parcel(folder.path, files)
 
 
 def _few(root: Path) -> Iterator[Path]:
     for count, path in enumerate(files_below(root), 1):
-        check("shipped_files", count, f"{root}, which is sent to the workers,", SourceError)
+        check_limit("shipped_files", count, f"{root}, which is sent to the workers,", SourceError)
         yield path
 
 
 def _sent(path: Path, name: str) -> Sent:
     path = path.resolve()
     status = path.stat()
-    return Sent(name, hash_once(path), status.st_size, bool(status.st_mode & stat.S_IXUSR))
+    return Sent(name, cached_hash(path), status.st_size, bool(status.st_mode & stat.S_IXUSR))
 
 
 def blocks(parcel: Parcel) -> Iterator[bytes]:
@@ -133,9 +135,9 @@ class Arriving:
     def __init__(self, parcel: Parcel) -> None:
         self._parcel = parcel
         self._opened = contextlib.ExitStack()
-        tag(cache_directory())
+        mark_cache(cache_directory())
         damaged = os.path.lexists(parcel.place)
-        self._draft: Path = self._opened.enter_context(writing(parcel.place, damaged=damaged))
+        self._draft: Path = self._opened.enter_context(write_directory(parcel.place, damaged=damaged))
         self._files = iter(parcel.files)
         self._stream: BinaryIO | None = None
         self._left = 0

@@ -8,7 +8,7 @@ from statistics import median
 
 from vlatool.bundle.bundle import DIGEST, LOCATION, MANIFEST, Bundle
 from vlatool.data import CALIBRATION, EVALUATION, PLAYED
-from vlatool.files.written import LEDGER
+from vlatool.files.ownership import LEDGER
 from vlatool.gate.config import GrowthClaim, LatencyClaim
 from vlatool.gate.inputs import MEMORY, Inputs
 from vlatool.gate.result import ClaimResult

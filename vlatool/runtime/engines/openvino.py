@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from vlatool.errors import GraphError, instead, nearest, require
+from vlatool.errors import GraphError, fix_for, require, suggest
 from vlatool.machine.host import MAX_CPU_ISA, VNNI, onednn_max_cpu_isa
 from vlatool.machine.risky import REMEDY
 from vlatool.runtime import arithmetic
@@ -310,8 +310,8 @@ def settings_for(threads: int | None, compute: str) -> dict[str, Any]:
     """
     if compute not in HINTS:
         raise GraphError(
-            f"OpenVINO on the CPU does not compute in {compute}; {nearest(compute, filter(None, HINTS))}.",
-            instead(compute, filter(None, HINTS)),
+            f"OpenVINO on the CPU does not compute in {compute}; {suggest(compute, filter(None, HINTS))}.",
+            fix_for(compute, filter(None, HINTS)),
         )
     return {
         "INFERENCE_PRECISION_HINT": HINTS[compute],

@@ -1,4 +1,4 @@
-"""Files below a directory, read without following links, as the very bytes that were hashed."""
+"""Files below a directory, read without following links, as exactly the bytes that were hashed."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from pathlib import Path
 from vlatool.errors import BundleError
 from vlatool.files.limits import limit
 
-LITTER = (".DS_Store", "Thumbs.db", "desktop.ini")
-"""What desktops leave in every directory that they show."""
+DESKTOP_FILES = (".DS_Store", "Thumbs.db", "desktop.ini")
+"""Files that desktop environments leave in directories."""
 FIX = "copy or export the bundle again"
 BLOCK = 1 << 20
 TICK_NS = 20_000_000
-"""Time stamps of files move in ticks of up to 10 ms: what was changed more recently may change again unseen."""
+"""Time stamps of files move in ticks of up to 10 ms: a second change within one tick cannot be detected."""
 
 
-def read_sealed(root: Path, name: str, sha256: str, size: int) -> bytes:
-    """Return the content of a file below ``root`` once it is what was recorded.
+def read_verified(root: Path, name: str, sha256: str, size: int) -> bytes:
+    """Return the content of a file below ``root`` after checking it against what was recorded.
 
     Args:
-        root: The directory; the path to it may hold links, the way from there may not.
-        name: Relative path with ``/``.
-        sha256: Recorded SHA-256 as hex.
-        size: Recorded size in bytes.
+        root: directory; the path to it may contain links, the path below it must not.
+        name: relative path with ``/``.
+        sha256: recorded SHA-256 as hex.
+        size: recorded size in bytes.
 
     Raises:
-        BundleError: when it is missing, a link, of another size, or of another content.
+        BundleError: when it is missing, a link, or has another size or content.
     """
     with open_inside(root, name) as handle:
         check_size(root, name, handle, size)
@@ -41,22 +41,22 @@ def read_sealed(root: Path, name: str, sha256: str, size: int) -> bytes:
     return content
 
 
-def verify_sealed(root: Path, name: str, sha256: str, size: int) -> None:
-    """Check a file as ``read_sealed`` does, a block at a time."""
+def verify_file(root: Path, name: str, sha256: str, size: int) -> None:
+    """Check a file as ``read_verified`` does, block by block."""
     with open_inside(root, name) as handle:
         check_size(root, name, handle, size)
         check_content(root, name, hash_handle(handle), sha256)
 
 
 def check_size(root: Path, name: str, handle: int, size: int) -> None:
-    """Refuse an open file of another size than recorded."""
+    """Refuse an open file whose size differs from the recorded one."""
     got = os.fstat(handle).st_size
     if got != size:
         raise BundleError(f"{root / name} has {got} bytes; the manifest says {size}.", FIX)
 
 
 def check_content(root: Path, name: str, got: str, recorded: str) -> None:
-    """Refuse another SHA-256 than recorded."""
+    """Refuse a SHA-256 that differs from the recorded one."""
     if got != recorded:
         raise BundleError(f"{root / name} has changed: its SHA-256 is not the manifest's.", FIX)
 
@@ -74,7 +74,7 @@ def read_all(handle: int, size: int) -> bytes:
 def hash_handle(handle: int) -> str:
     """Return the SHA-256 of an open file from its start, as hex."""
     digest = hashlib.sha256()
-    buffer, at = bytearray(BLOCK), 0  # one for all blocks: fresh memory takes longer to get than to fill
+    buffer, at = bytearray(BLOCK), 0  # one for all blocks: allocating takes longer than filling
     while count := os.preadv(handle, [buffer], at):
         digest.update(memoryview(buffer)[:count])
         at += count
@@ -86,7 +86,7 @@ def open_inside(root: Path, name: str) -> Iterator[int]:
     """Open a regular file of a bundle as ``open_regular`` does.
 
     Raises:
-        BundleError: when it is missing, a link or no file, or a link leads to it.
+        BundleError: when it is missing or not a regular file, or its path has a link.
     """
     try:
         with open_regular(root, name) as handle:
@@ -97,10 +97,10 @@ def open_inside(root: Path, name: str) -> Iterator[int]:
 
 @contextlib.contextmanager
 def open_regular(root: Path, name: str) -> Iterator[int]:
-    """Open a regular file below ``root`` for reading, following no link, and give its descriptor.
+    """Open a regular file below ``root`` for reading, following no link, and yield its descriptor.
 
     Raises:
-        OSError: when it is missing, a link or no file, or a link leads to it.
+        OSError: when it is missing or not a regular file, or its path has a link.
     """
     folder, _, last = name.rpartition("/")
     with open_folder(root, folder) as parent:
@@ -121,10 +121,10 @@ def _unreadable(root: Path, name: str, error: OSError) -> BundleError:
 
 @contextlib.contextmanager
 def open_folder(root: Path, folder: str) -> Iterator[int]:
-    """Open a directory below ``root``, following no link below it, and give its descriptor.
+    """Open a directory below ``root``, following no link below it, and yield its descriptor.
 
     Raises:
-        OSError: when a part of the path is missing, a link, or no directory.
+        OSError: when a part of the path is missing, a link, or not a directory.
     """
     flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
     handle = os.open(root, flags)
@@ -138,14 +138,14 @@ def open_folder(root: Path, folder: str) -> Iterator[int]:
         os.close(handle)
 
 
-def unlisted(root: Path, listed: set[str], free: tuple[str, ...], folder: str) -> str:
-    """Return a file, link or other thing below ``root`` that is not listed, or nothing.
+def find_unlisted(root: Path, listed: set[str], free: tuple[str, ...], folder: str) -> str:
+    """Return the path of anything below ``root`` that is not listed, or nothing.
 
     Args:
-        root: The directory.
-        listed: Relative paths that may be there.
-        free: Names at the top of regular files that may be there as well.
-        folder: A directory at the top that may hold regular files and directories of any name.
+        root: directory.
+        listed: relative paths that are expected.
+        free: names of further regular files that may be at the top.
+        folder: directory at the top that may contain regular files and directories of any name.
     """
     pending, seen = [""], 0
     while pending:
@@ -158,29 +158,31 @@ def unlisted(root: Path, listed: set[str], free: tuple[str, ...], folder: str) -
                     return name
                 if entry.is_dir(follow_symlinks=False):
                     pending.append(name)
-                elif name not in listed and not (entry.is_file(follow_symlinks=False) and _is_free(name, free, folder)):
+                elif name not in listed and not (
+                    entry.is_file(follow_symlinks=False) and _is_exempt(name, free, folder)
+                ):
                     return name
     return ""
 
 
-def _is_free(name: str, free: tuple[str, ...], folder: str) -> bool:
-    return name in free or name.startswith(f"{folder}/") or name.rpartition("/")[2] in LITTER
+def _is_exempt(name: str, free: tuple[str, ...], folder: str) -> bool:
+    return name in free or name.startswith(f"{folder}/") or name.rpartition("/")[2] in DESKTOP_FILES
 
 
 @contextlib.contextmanager
-def held(root: Path, folder: str, files: dict[str, tuple[str, int]]) -> Iterator[Path]:
-    """Verify large files that an engine opens by name, and give the directory under a name that leads to no other.
+def verified_directory(root: Path, folder: str, files: dict[str, tuple[str, int]]) -> Iterator[Path]:
+    """Verify large files that an engine opens by name, and yield the directory under a path that cannot be replaced.
 
-    When the block ends, files and directories must be what they were when they were hashed: the same inodes under the
-    same names, with the same time stamps.
+    When the block ends, files and directories must be unchanged since they were hashed: the same inodes under the same
+    names, with the same time stamps.
 
     Args:
-        root: The bundle.
-        folder: Where the engine looks.
-        files: Relative path below ``root`` -> SHA-256 and size.
+        root: directory of the bundle.
+        folder: folder in which the engine opens files.
+        files: relative path below ``root`` -> SHA-256 and size.
 
     Raises:
-        BundleError: when a file is not what was recorded, or anything changed before the block ended.
+        BundleError: when a file differs from what was recorded, or anything changed before the block ended.
     """
     with contextlib.ExitStack() as stack:
         folders = {name.rpartition("/")[0] for name in files} | {folder}
@@ -190,31 +192,31 @@ def held(root: Path, folder: str, files: dict[str, tuple[str, int]]) -> Iterator
         except OSError as error:
             raise _unreadable(root, folder, error) from error
         watched = [*handles.values(), *directories.values()]
-        _settled(watched)
-        before = [_stamp(handle) for handle in watched]
+        _wait_for_clock_tick(watched)
+        before = [_file_stamp(handle) for handle in watched]
         for name, (sha256, size) in files.items():
             check_size(root, name, handles[name], size)
             check_content(root, name, hash_handle(handles[name]), sha256)
-        yield _place(root, folder, directories[folder])
-        same = before == [_stamp(handle) for handle in watched]
+        yield _descriptor_path(root, folder, directories[folder])
+        same = before == [_file_stamp(handle) for handle in watched]
         if not same or not all(_still_there(name, handles, directories) for name in files):
             raise BundleError(f"The bundle {root} was changed while {', '.join(files)} was opened.", FIX)
 
 
-def _place(root: Path, folder: str, handle: int) -> Path:
-    """A name for an open directory, whatever is renamed meanwhile."""
-    place = Path(f"/proc/self/fd/{handle}")
-    return place if place.is_dir() else root / folder
+def _descriptor_path(root: Path, folder: str, handle: int) -> Path:
+    """Return a path of an open directory that stays valid when it is renamed."""
+    path = Path(f"/proc/self/fd/{handle}")
+    return path if path.is_dir() else root / folder
 
 
-def _settled(handles: list[int]) -> None:
-    """Wait until another change would be seen in the time stamps."""
+def _wait_for_clock_tick(handles: list[int]) -> None:
+    """Wait until a further change would show in the time stamps."""
     newest = max(max(status.st_mtime_ns, status.st_ctime_ns) for status in map(os.fstat, handles))
     if 0 <= time.time_ns() - newest < TICK_NS:
         time.sleep(TICK_NS / 1e9)
 
 
-def _stamp(handle: int) -> tuple[int, ...]:
+def _file_stamp(handle: int) -> tuple[int, ...]:
     status = os.fstat(handle)
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 

@@ -1,8 +1,8 @@
-"""What vlatool wrote into a directory, file by file: nothing else is ever replaced or removed.
+"""A record of what vlatool wrote into a directory, file by file: nothing else is ever replaced or removed.
 
-Each directory that ``vlatool.files.writing`` makes holds ``.written-by-vlatool.json``: the name and the SHA-256 of
-every file that was written. A directory without it is taken for a bundle when its manifest lists all the rest, with
-these hashes.
+Each directory of ``vlatool.files.directory_writer`` has a ledger, ``.written-by-vlatool.json``: the name and the
+SHA-256 of every file that was written. A directory without one is taken for a bundle if its manifest lists all other
+files with these hashes.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import OutputError
-from vlatool.files.sealed import hash_handle
+from vlatool.files.verified_read import hash_handle
 
 LEDGER = ".written-by-vlatool.json"
 MANIFEST = "manifest.json"
 SCHEMA = 1
-LARGEST = 1 << 28
-"""Bytes of the largest list or manifest that is read."""
-SIDECAR = 4096
-"""Bytes of the largest file beside a manifest that may hold the manifest's hash."""
+MAX_LEDGER_BYTES = 1 << 28
+"""Size of the largest ledger or manifest that is read."""
+MAX_SIDECAR = 4096
+"""Size of the largest file beside a manifest that may contain the manifest's hash."""
 CHANGED = "has been changed since vlatool wrote it"
 NOT_OURS = "was not written by vlatool"
 
-Seen = tuple[int, int, int, int, int]
-"""Device, inode, size, and times of the last change of a file and of its inode, in nanoseconds."""
-_HASHES: dict[Seen, str] = {}
-"""SHA-256 of files that were read in this process."""
+FileStamp = tuple[int, int, int, int, int]
+"""Device, inode, size, and the times of the last change of a file and of its inode in nanoseconds."""
+_HASHES: dict[FileStamp, str] = {}
+"""SHA-256 of files that this process has hashed."""
 
 
 @dataclass(frozen=True)
@@ -45,27 +45,27 @@ class Listing:
 
     @classmethod
     def of(cls, files: dict[str, str], folders: Iterable[str] = ()) -> Listing:
-        """Return the list of files, with every folder that they lie in."""
+        """Return the listing of files and of every folder that contains them."""
         above = {str(parent) for name in files for parent in Path(name).parents}
         return cls(files, frozenset({*above, *folders} - {"."}))
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A file or folder below a directory: its name there, and why it is none that vlatool wrote (empty if it is)."""
+    """A file or folder below a directory: its relative path, and why vlatool did not write it (empty if it did)."""
 
     name: str
     folder: bool = False
     foreign: str = ""
 
 
-def note(directory: Path) -> None:
-    """Write the list of all files below a directory into it.
+def write_ledger(directory: Path) -> None:
+    """Write the ledger of all files below a directory into it.
 
     Raises:
-        OSError: when a file cannot be read, or the list not be written.
+        OSError: when a file cannot be read, or the ledger cannot be written.
     """
-    known = _recorded(directory)
+    known = _manifest_records(directory)
     files, folders = {}, []
     for path in sorted(directory.rglob("*")):
         name, status = path.relative_to(directory).as_posix(), path.lstat()
@@ -73,23 +73,23 @@ def note(directory: Path) -> None:
             folders.append(name)
         elif stat.S_ISREG(status.st_mode) and name != LEDGER:
             digest, size = known.get(name, ("", -1))
-            files[name] = digest if status.st_size == size else hash_once(path)
+            files[name] = digest if status.st_size == size else cached_hash(path)
     _write(directory, Listing.of(files, folders))
 
 
-def note_file(path: Path) -> None:
-    """Add a file that vlatool wrote later to the list of the directory that it lies in, when there is one."""
+def add_to_ledger(path: Path) -> None:
+    """Add a file to the ledger of its directory, if there is one."""
     folder = path.parent
     listing = _read_ledger(folder)
     if listing is not None:
-        _write(folder, Listing.of({**listing.files, path.name: hash_once(path)}, listing.folders))
+        _write(folder, Listing.of({**listing.files, path.name: cached_hash(path)}, listing.folders))
 
 
 def refuse_foreign(directory: Path) -> None:
-    """Look whether vlatool wrote every file below a directory, and nobody changed any.
+    """Check that vlatool wrote every file below a directory, and that none was changed.
 
     Raises:
-        OutputError: naming the first file that is in the way.
+        OutputError: naming the first file that fails the check.
     """
     listing = read_listing(directory)
     if listing is None:
@@ -107,15 +107,15 @@ def refuse_foreign(directory: Path) -> None:
 REMOVE = "choose another output, or move away what you want to keep and remove the rest yourself"
 
 
-def prune(directory: Path, *, changed: bool = False) -> bool:
-    """Remove the files of a directory that vlatool wrote, one by one, and the folders that are empty then.
+def remove_owned(directory: Path, *, changed: bool = False) -> bool:
+    """Remove the files of a directory that vlatool wrote, one by one, and the folders that are then empty.
 
     Args:
-        directory: A directory that was moved aside.
-        changed: Also remove files that vlatool wrote and that hold other bytes now.
+        directory: directory that was moved aside.
+        changed: whether to remove also files that were changed after vlatool wrote them.
 
     Returns:
-        Whether all of it is gone.
+        True when nothing of it is left.
     """
     listing = read_listing(directory)
     entries = [] if listing is None else list(walk(directory, listing))
@@ -135,7 +135,7 @@ def prune(directory: Path, *, changed: bool = False) -> bool:
 
 
 def walk(directory: Path, listing: Listing, below: str = "") -> Iterator[Entry]:
-    """Yield every file and folder below a directory, a folder after what it holds; what is foreign is not entered."""
+    """Yield every file and folder below a directory, folders after their content; foreign folders are not entered."""
     device = os.lstat(directory).st_dev
     try:
         with os.scandir(directory / below) as scanned:
@@ -156,7 +156,7 @@ def walk(directory: Path, listing: Listing, below: str = "") -> Iterator[Entry]:
 
 
 def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
-    """Say why a file is none that vlatool wrote, empty when it is."""
+    """Return why a file is not one that vlatool wrote, empty when it is."""
     if not stat.S_ISREG(mode):
         return "is a link" if stat.S_ISLNK(mode) else "is not a regular file"
     if name == LEDGER:
@@ -164,38 +164,38 @@ def _foreign_file(path: Path, name: str, mode: int, listing: Listing) -> str:
     if name not in listing.files:
         return NOT_OURS
     try:
-        return "" if hash_once(path) == listing.files[name] else CHANGED
+        return "" if cached_hash(path) == listing.files[name] else CHANGED
     except OSError as error:
         return f"cannot be read ({error.strerror})"
 
 
-def hash_once(path: Path) -> str:
-    """Return the SHA-256 of a file as hex; it is not read again in this process while it is the same file.
+def cached_hash(path: Path) -> str:
+    """Return the SHA-256 of a file as hex; an unchanged file is hashed once in a process.
 
     Raises:
         OSError: when it cannot be read, or is a link.
     """
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as stream:
-        seen = _seen(os.fstat(stream.fileno()))
-        if seen not in _HASHES:
+        stamp = _stamp(os.fstat(stream.fileno()))
+        if stamp not in _HASHES:
             digest = hash_handle(stream.fileno())
-            if seen != _seen(os.fstat(stream.fileno())):
+            if stamp != _stamp(os.fstat(stream.fileno())):
                 return digest
-            _HASHES[seen] = digest
-        return _HASHES[seen]
+            _HASHES[stamp] = digest
+        return _HASHES[stamp]
 
 
-def note_seen(path: Path, sha256: str) -> None:
-    """Note the hash of a file that was just hashed and then renamed or linked, which changes the times of its inode."""
-    _HASHES[_seen(os.lstat(path))] = sha256
+def cache_hash(path: Path, sha256: str) -> None:
+    """Remember the hash of a file that was renamed or linked after it was hashed, which changes its inode's times."""
+    _HASHES[_stamp(os.lstat(path))] = sha256
 
 
-def _seen(status: os.stat_result) -> Seen:
+def _stamp(status: os.stat_result) -> FileStamp:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def read_listing(directory: Path) -> Listing | None:
-    """Return what vlatool wrote into a directory, None when it holds nothing that says so."""
+    """Return what vlatool wrote into a directory, None when there is no record of it."""
     return _read_ledger(directory) or _bundle_listing(directory)
 
 
@@ -207,11 +207,11 @@ def _read_ledger(directory: Path) -> Listing | None:
     if not all(isinstance(value, str) for value in (*files.values(), *folders)):
         return None
     listing = Listing.of(files, folders)
-    return listing if content == _told(listing) else None
+    return listing if content == _ledger_bytes(listing) else None
 
 
 def _bundle_listing(directory: Path) -> Listing | None:
-    """Return the files of a bundle without a list: the manifest's, the manifest, and a file that holds its hash."""
+    """Return the files of a bundle without a ledger: the manifest's, the manifest, and a file with its hash."""
     data, content = _read_json(directory / MANIFEST)
     files = _records(data)
     if not files or not {"schema", "name", "spec"} <= set(data):
@@ -221,14 +221,14 @@ def _bundle_listing(directory: Path) -> Listing | None:
     digest = hashlib.sha256(content).hexdigest()
     listed = {name: known for name, (known, _) in files.items()} | {MANIFEST: digest}
     for entry in os.scandir(directory):
-        if entry.name not in listed and entry.is_file(follow_symlinks=False) and entry.stat().st_size <= SIDECAR:
+        if entry.name not in listed and entry.is_file(follow_symlinks=False) and entry.stat().st_size <= MAX_SIDECAR:
             with contextlib.suppress(OSError):
                 if Path(entry.path).read_bytes().split()[:1] == [digest.encode()]:
-                    listed[entry.name] = hash_once(Path(entry.path))
+                    listed[entry.name] = cached_hash(Path(entry.path))
     return Listing.of(listed)
 
 
-def _recorded(directory: Path) -> dict[str, tuple[str, int]]:
+def _manifest_records(directory: Path) -> dict[str, tuple[str, int]]:
     """Return name -> (SHA-256, bytes) of the files that a manifest in the directory records."""
     return _records(_read_json(directory / MANIFEST)[0])
 
@@ -246,18 +246,18 @@ def _records(manifest: dict[str, Any]) -> dict[str, tuple[str, int]]:
 
 
 def _read_json(path: Path) -> tuple[dict[str, Any], bytes]:
-    """Return the mapping of a JSON file and its bytes; nothing when there is none."""
+    """Return the mapping in a JSON file and the bytes of the file; both empty where there is no mapping."""
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as stream:
-            content = stream.read(LARGEST) if stat.S_ISREG(os.fstat(stream.fileno()).st_mode) else b""
+            content = stream.read(MAX_LEDGER_BYTES) if stat.S_ISREG(os.fstat(stream.fileno()).st_mode) else b""
         data = json.loads(content)
     except (OSError, ValueError, RecursionError):
         return {}, b""
     return (data, content) if isinstance(data, dict) else ({}, b"")
 
 
-def _told(listing: Listing) -> bytes:
-    """Return the one way in which a list is written."""
+def _ledger_bytes(listing: Listing) -> bytes:
+    """Return the only valid content of the ledger of a listing."""
     described = {
         "vlatool": "The files that vlatool wrote here, by SHA-256. --force replaces this directory only while it holds "
         "no other file and no file that was changed.",
@@ -270,5 +270,5 @@ def _told(listing: Listing) -> bytes:
 
 def _write(directory: Path, listing: Listing) -> None:
     draft = directory / f"{LEDGER}.{os.getpid()}.part"
-    draft.write_bytes(_told(listing))
+    draft.write_bytes(_ledger_bytes(listing))
     os.replace(draft, directory / LEDGER)

@@ -12,8 +12,8 @@ from _tiny import observations
 from vlatool.bundle.bundle import Bundle, hash_file
 from vlatool.errors import BundleError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.files import kept
-from vlatool.files.kept import FILES, TAG, cache_of, carry, is_cache, tag
+from vlatool.files import blob_store
+from vlatool.files.blob_store import FILES, TAG, cache_containing, is_cache, link_or_copy, mark_cache
 from vlatool.quantize.dynamic_int8 import DynamicInt8
 from vlatool.quantize.weight_only import WeightOnly
 from vlatool.sources.torch_module import TorchModule
@@ -24,13 +24,13 @@ from vlatool.stage.run import cached_path, cached_transform, run_transform
 
 @pytest.fixture(autouse=True)
 def _small_files_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept, "SHARED", 4000)
+    monkeypatch.setattr(blob_store, "MIN_SHARED_BYTES", 4000)
 
 
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
     place = tmp_path / "cache"
-    tag(place)
+    mark_cache(place)
     (place / "stages").mkdir()
     return place
 
@@ -56,8 +56,8 @@ def used(folder: Path) -> int:
 
 def test_a_recording_is_in_the_cache_once(cache: Path, recording: Path):
     first, second = in_stage(cache, "one"), in_stage(cache, "two")
-    carry(recording, first)
-    carry(first, second, hash_file(first))
+    link_or_copy(recording, first)
+    link_or_copy(first, second, hash_file(first))
     assert first.stat().st_ino == second.stat().st_ino != recording.stat().st_ino
     assert second.read_bytes() == recording.read_bytes()
     assert [path.name for path in (cache / FILES).iterdir()] == [hash_file(recording)]
@@ -65,20 +65,20 @@ def test_a_recording_is_in_the_cache_once(cache: Path, recording: Path):
 
 def test_a_source_that_changed_its_code_alone_links_the_same_recording(cache: Path, recording: Path):
     for name in ("one", "two"):
-        carry(recording, in_stage(cache, name))
+        link_or_copy(recording, in_stage(cache, name))
     assert used(cache) < 2 * recording.stat().st_size
 
 
 def test_shared_files_are_read_only_and_the_persons_file_stays_writable(cache: Path, recording: Path):
     before = recording.stat().st_mode
-    carry(recording, in_stage(cache, "one"))
+    link_or_copy(recording, in_stage(cache, "one"))
     assert stat.S_IMODE(in_stage(cache, "one").stat().st_mode) == 0o444
     assert recording.stat().st_mode == before
 
 
 def test_outside_of_the_cache_every_file_is_a_copy_that_may_be_edited(cache: Path, recording: Path, tmp_path: Path):
-    carry(recording, in_stage(cache, "one"))
-    carry(in_stage(cache, "one"), tmp_path / "mine.npz")
+    link_or_copy(recording, in_stage(cache, "one"))
+    link_or_copy(in_stage(cache, "one"), tmp_path / "mine.npz")
     with (tmp_path / "mine.npz").open("r+b") as mine:
         mine.write(b"edited")
     assert in_stage(cache, "one").read_bytes() == recording.read_bytes()
@@ -86,12 +86,12 @@ def test_outside_of_the_cache_every_file_is_a_copy_that_may_be_edited(cache: Pat
 
 def test_a_folder_of_that_name_without_the_mark_is_no_cache(tmp_path: Path, recording: Path):
     (tmp_path / "stages").mkdir()
-    carry(recording, in_stage(tmp_path, "one"))
-    carry(recording, in_stage(tmp_path, "two"))
+    link_or_copy(recording, in_stage(tmp_path, "one"))
+    link_or_copy(recording, in_stage(tmp_path, "two"))
     assert in_stage(tmp_path, "one").stat().st_nlink == 1
     (tmp_path / TAG).write_text("Signature: 8a477f597d28d172789f06886806bc55\n# somebody else's\n")
     assert not is_cache(tmp_path)
-    assert cache_of(in_stage(tmp_path, "one")) is None
+    assert cache_containing(in_stage(tmp_path, "one")) is None
 
 
 @pytest.mark.parametrize("number", [errno.EXDEV, errno.EPERM, errno.EMLINK])
@@ -99,8 +99,8 @@ def test_without_hard_links_it_is_copied(cache: Path, recording: Path, monkeypat
     def refused(_source: Path, _target: Path) -> None:
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(kept.os, "link", refused)
-    carry(recording, in_stage(cache, "one"))
+    monkeypatch.setattr(blob_store.os, "link", refused)
+    link_or_copy(recording, in_stage(cache, "one"))
     assert in_stage(cache, "one").read_bytes() == recording.read_bytes()
 
 
@@ -108,24 +108,24 @@ def test_a_full_disk_is_no_reason_to_copy(cache: Path, recording: Path, monkeypa
     def full(_source: Path, _target: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(kept.os, "link", full)
+    monkeypatch.setattr(blob_store.os, "link", full)
     with pytest.raises(OSError, match="No space"):
-        carry(recording, in_stage(cache, "one"))
+        link_or_copy(recording, in_stage(cache, "one"))
     assert not in_stage(cache, "one").exists()
 
 
 def test_a_kept_file_that_was_damaged_is_not_linked_again(cache: Path, recording: Path):
-    carry(recording, in_stage(cache, "one"))
+    link_or_copy(recording, in_stage(cache, "one"))
     kept = cache / FILES / hash_file(recording)
     kept.chmod(0o644)
     kept.write_bytes(b"x" * 5000)
-    carry(recording, in_stage(cache, "two"))
+    link_or_copy(recording, in_stage(cache, "two"))
     assert in_stage(cache, "two").read_bytes() == recording.read_bytes()
     assert hash_file(kept) == kept.name
 
 
 def test_a_hash_that_is_a_path_leads_nowhere(cache: Path, recording: Path):
-    carry(recording, in_stage(cache, "one"), "../../../stolen")
+    link_or_copy(recording, in_stage(cache, "one"), "../../../stolen")
     assert in_stage(cache, "one").read_bytes() == recording.read_bytes()
     assert not (cache / FILES).exists()
 
@@ -139,14 +139,16 @@ def test_what_a_removed_kept_file_leaves_is_made_again(cache: Path, recording: P
             Path(source).unlink()
         real(source, target)
 
-    monkeypatch.setattr(kept.os, "link", removed_before)
-    carry(recording, in_stage(cache, "one"))
+    monkeypatch.setattr(blob_store.os, "link", removed_before)
+    link_or_copy(recording, in_stage(cache, "one"))
     assert len(times) == 2
     assert in_stage(cache, "one").stat().st_nlink == 2
 
 
 def test_many_threads_keep_one_file(cache: Path, recording: Path):
-    threads = [threading.Thread(target=carry, args=(recording, in_stage(cache, f"s{each}"))) for each in range(8)]
+    threads = [
+        threading.Thread(target=link_or_copy, args=(recording, in_stage(cache, f"s{each}"))) for each in range(8)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:

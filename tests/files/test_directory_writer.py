@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from vlatool.errors import OutputError
-from vlatool.files.moves import exchange, move_new
-from vlatool.files.writing import _is_alive, writing
-from vlatool.files.written import LEDGER
+from vlatool.files.atomic_rename import exchange, rename_to_new
+from vlatool.files.directory_writer import _is_alive, write_directory
+from vlatool.files.ownership import LEDGER
 
 WRITER = """
 import sys
 from pathlib import Path
-from vlatool.files.writing import writing
+from vlatool.files.directory_writer import writing
 with writing(Path(sys.argv[1]), force=True) as draft:
     (draft / "graphs").mkdir()
     (draft / "graphs/main.onnx").write_bytes(b"half of the weights")
@@ -31,7 +31,7 @@ with writing(Path(sys.argv[1]), force=True) as draft:
 KILLED = """
 import os, sys
 from pathlib import Path
-from vlatool.files.writing import writing
+from vlatool.files.directory_writer import writing
 with writing(Path(sys.argv[1])) as draft:
     (draft / "half").touch()
     print(draft.parent, flush=True)
@@ -45,7 +45,7 @@ def kill(*_args, **_options):
     os.kill(os.getpid(), 9)
 replace = module._replace
 def last_rename_is_missing(*arguments):
-    module.move_new = kill
+    module.rename_to_new = kill
     replace(*arguments)
 if sys.argv[2] != "exchange":
     module.exchange = lambda one, other: False
@@ -78,14 +78,14 @@ def content(directory: Path) -> dict[str, bytes]:
 
 def written(directory: Path) -> Path:
     """A directory that vlatool wrote."""
-    with writing(directory) as draft:
+    with write_directory(directory) as draft:
         fill(draft)
     return directory
 
 
 def written_meanwhile(first: Path, final: Path) -> None:
     fill(first)
-    with writing(final) as second:
+    with write_directory(final) as second:
         (second / "second").touch()
         assert first.is_dir()
 
@@ -109,7 +109,7 @@ def writer(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], Path]]:
 
 def test_the_directory_appears_when_the_block_ends_well(tmp_path: Path):
     final = tmp_path / "deep/down/out"
-    with writing(final) as draft:
+    with write_directory(final) as draft:
         assert not final.exists()
         fill(draft)
     assert content(final) == content(fill(tmp_path / "wanted"))
@@ -117,14 +117,14 @@ def test_the_directory_appears_when_the_block_ends_well(tmp_path: Path):
 
 
 def test_nothing_is_left_when_the_block_raises(tmp_path: Path):
-    with pytest.raises(RuntimeError, match="half-way"), writing(tmp_path / "out") as draft:
+    with pytest.raises(RuntimeError, match="half-way"), write_directory(tmp_path / "out") as draft:
         stop_half_way(draft)
     assert os.listdir(tmp_path) == []
 
 
 def test_the_old_content_stays_when_the_block_raises(tmp_path: Path):
     before = content(written(tmp_path / "out"))
-    with pytest.raises(RuntimeError, match="half-way"), writing(tmp_path / "out", force=True) as draft:
+    with pytest.raises(RuntimeError, match="half-way"), write_directory(tmp_path / "out", force=True) as draft:
         stop_half_way(draft)
     assert content(tmp_path / "out") == before
     assert os.listdir(tmp_path) == ["out"]
@@ -132,7 +132,7 @@ def test_the_old_content_stays_when_the_block_raises(tmp_path: Path):
 
 def test_an_existing_output_is_refused(tmp_path: Path):
     before = content(fill(tmp_path / "out"))
-    with pytest.raises(OutputError, match="exists already") as caught, writing(tmp_path / "out"):
+    with pytest.raises(OutputError, match="exists already") as caught, write_directory(tmp_path / "out"):
         pytest.fail("the block must not run")
     assert "--force" in caught.value.fix
     assert content(tmp_path / "out") == before
@@ -140,7 +140,7 @@ def test_an_existing_output_is_refused(tmp_path: Path):
 
 def test_force_replaces_all_of_the_old_content(tmp_path: Path):
     written(tmp_path / "out")
-    with writing(tmp_path / "out", force=True) as draft:
+    with write_directory(tmp_path / "out", force=True) as draft:
         (draft / "new").write_bytes(b"1")
     assert content(tmp_path / "out") == {"new": b"1"}
     assert os.listdir(tmp_path) == ["out"]
@@ -148,14 +148,14 @@ def test_force_replaces_all_of_the_old_content(tmp_path: Path):
 
 def test_force_replaces_no_file(tmp_path: Path):
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(OutputError, match="is not a directory"), writing(tmp_path / "out", force=True):
+    with pytest.raises(OutputError, match="is not a directory"), write_directory(tmp_path / "out", force=True):
         pytest.fail("the block must not run")
     assert (tmp_path / "out").read_text() == "a file"
 
 
 def test_a_relative_output_does_not_follow_a_change_of_directory(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with writing(Path("out")) as draft:
+    with write_directory(Path("out")) as draft:
         (tmp_path / "elsewhere").mkdir()
         os.chdir(tmp_path / "elsewhere")
         (draft / "new").touch()
@@ -165,7 +165,7 @@ def test_a_relative_output_does_not_follow_a_change_of_directory(tmp_path: Path,
 @pytest.mark.parametrize("name", ["out", "run[1]", "*"])
 def test_the_draft_of_a_dead_process_is_swept(tmp_path: Path, name: str):
     assert abandoned(tmp_path / name).is_dir()
-    with writing(tmp_path / name) as draft:
+    with write_directory(tmp_path / name) as draft:
         (draft / "new").touch()
     assert os.listdir(tmp_path) == [name]
 
@@ -174,7 +174,7 @@ def test_a_draft_that_was_only_begun_is_swept(tmp_path: Path):
     begun = tmp_path / ".out.tmp-999999999-0badcafe"
     (begun / "content").mkdir(parents=True)
     (begun / "vlatool-draft.json").touch()
-    with writing(tmp_path / "out") as draft:
+    with write_directory(tmp_path / "out") as draft:
         (draft / "new").touch()
     assert os.listdir(tmp_path) == ["out"]
 
@@ -182,7 +182,7 @@ def test_a_draft_that_was_only_begun_is_swept(tmp_path: Path):
 @pytest.mark.parametrize("name", [".out.tmp-123-abc", ".out.tmp-999999999-0badcafe", ".out.old-0badcafe"])
 def test_a_directory_that_is_only_called_like_a_draft_is_left_alone(tmp_path: Path, name: str):
     before = content(fill(tmp_path / name))
-    with writing(tmp_path / "out") as draft:
+    with write_directory(tmp_path / "out") as draft:
         (draft / "new").touch()
     assert content(tmp_path / name) == before
 
@@ -191,7 +191,7 @@ def test_a_copy_of_a_draft_is_left_alone(tmp_path: Path):
     draft = abandoned(tmp_path / "out")
     copy = tmp_path / ".out.tmp-999999999-0badcafe"
     shutil.copytree(draft, copy)
-    with writing(tmp_path / "out") as own:
+    with write_directory(tmp_path / "out") as own:
         (own / "new").touch()
     assert not draft.exists()
     assert (copy / "content/half").is_file()
@@ -199,7 +199,7 @@ def test_a_copy_of_a_draft_is_left_alone(tmp_path: Path):
 
 def test_the_draft_of_another_output_is_left_alone(tmp_path: Path):
     fill(tmp_path / ".other.tmp-999999999-0badcafe")
-    with writing(tmp_path / "out") as draft:
+    with write_directory(tmp_path / "out") as draft:
         (draft / "new").touch()
     assert sorted(os.listdir(tmp_path)) == [".other.tmp-999999999-0badcafe", "out"]
 
@@ -218,7 +218,7 @@ def test_the_draft_of_a_living_process_is_left_alone(tmp_path: Path, writer):
 
 
 def test_of_two_writers_without_force_exactly_one_ends_well(tmp_path: Path):
-    with pytest.raises(OutputError, match="exists already"), writing(tmp_path / "out") as first:
+    with pytest.raises(OutputError, match="exists already"), write_directory(tmp_path / "out") as first:
         written_meanwhile(first, tmp_path / "out")
     assert content(tmp_path / "out") == {"second": b""}
     assert os.listdir(tmp_path) == ["out"]
@@ -229,7 +229,7 @@ def test_of_many_writers_at_once_exactly_one_ends_well(tmp_path: Path):
 
     def write(number: int) -> str:
         try:
-            with writing(tmp_path / "out") as draft:
+            with write_directory(tmp_path / "out") as draft:
                 (draft / str(number)).touch()
                 together.wait(60)
         except OutputError as error:
@@ -249,7 +249,7 @@ def test_a_killed_writer_leaves_nothing_at_the_output_and_the_next_run_succeeds(
     process.wait()
     assert draft.is_dir()
     assert not (tmp_path / "out").exists()
-    with writing(tmp_path / "out") as own:
+    with write_directory(tmp_path / "out") as own:
         (own / "new").touch()
     assert content(tmp_path / "out") == {"new": b""}
     assert os.listdir(tmp_path) == ["out"]
@@ -270,7 +270,7 @@ def test_what_was_replaced_goes_with_the_next_run_when_the_writer_was_killed(tmp
     assert done.returncode == -signal.SIGKILL
     assert content(tmp_path / "out") == {"new": b""}
     assert len(os.listdir(tmp_path)) == 2
-    with writing(tmp_path / "out", force=True) as draft:
+    with write_directory(tmp_path / "out", force=True) as draft:
         (draft / "newer").touch()
     assert content(tmp_path / "out") == {"newer": b""}
     assert os.listdir(tmp_path) == ["out"]
@@ -281,7 +281,7 @@ def test_a_writer_killed_between_two_renames_has_lost_nothing(tmp_path: Path):
     done = subprocess.run([sys.executable, "-c", KILLED_LATE, str(tmp_path / "out"), "renames", "between"], check=False)
     assert done.returncode == -signal.SIGKILL
     assert not (tmp_path / "out").exists()
-    with pytest.raises(OutputError, match="exists already"), writing(tmp_path / "out"):
+    with pytest.raises(OutputError, match="exists already"), write_directory(tmp_path / "out"):
         pass
     assert content(tmp_path / "out") == before
     assert os.listdir(tmp_path) == ["out"]
@@ -290,7 +290,7 @@ def test_a_writer_killed_between_two_renames_has_lost_nothing(tmp_path: Path):
 def test_a_file_that_came_while_it_was_written_is_never_replaced(tmp_path: Path):
     written(tmp_path / "out")
     message = "out/notes.txt was not written by vlatool"
-    with pytest.raises(OutputError, match=message), writing(tmp_path / "out", force=True) as draft:
+    with pytest.raises(OutputError, match=message), write_directory(tmp_path / "out", force=True) as draft:
         assert (draft / "new").write_text("new") < (tmp_path / "out/notes.txt").write_text("mine")
     assert (tmp_path / "out/notes.txt").read_text() == "mine"
     assert (tmp_path / "out/graphs/main.onnx").is_file()
@@ -304,10 +304,10 @@ def test_what_came_at_the_last_moment_is_kept_beside_it(tmp_path: Path, monkeypa
         (other / "notes.txt").write_text("mine")
         return exchange(one, other)
 
-    monkeypatch.setattr("vlatool.files.writing.exchange", late)
+    monkeypatch.setattr("vlatool.files.directory_writer.exchange", late)
     with (
         pytest.warns(UserWarning, match="was not written by vlatool"),
-        writing(tmp_path / "out", force=True) as draft,
+        write_directory(tmp_path / "out", force=True) as draft,
     ):
         (draft / "new").touch()
     (kept,) = tmp_path.glob("out.kept-*")
@@ -323,11 +323,11 @@ def test_without_an_exchange_the_old_one_comes_back_when_the_new_one_cannot(tmp_
         moves.append(target)
         if len(moves) == 2:  # the first finds that there is something
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        move_new(source, target)
+        rename_to_new(source, target)
 
-    monkeypatch.setattr("vlatool.files.writing.exchange", lambda one, other: False)
-    monkeypatch.setattr("vlatool.files.writing.move_new", fail_once)
-    with pytest.raises(OutputError, match="disk is full"), writing(tmp_path / "out", force=True) as draft:
+    monkeypatch.setattr("vlatool.files.directory_writer.exchange", lambda one, other: False)
+    monkeypatch.setattr("vlatool.files.directory_writer.rename_to_new", fail_once)
+    with pytest.raises(OutputError, match="disk is full"), write_directory(tmp_path / "out", force=True) as draft:
         (draft / "new").touch()
     assert content(tmp_path / "out") == before
     assert os.listdir(tmp_path) == ["out"]
@@ -337,7 +337,7 @@ def test_a_damaged_directory_of_the_cache_is_replaced_and_what_is_not_ours_is_ke
     out = written(tmp_path / "out")
     (out / "graphs/main.onnx").write_bytes(b"damaged")
     (out / "notes.txt").write_text("mine")
-    with pytest.warns(UserWarning, match="was not written by vlatool"), writing(out, damaged=True) as draft:
+    with pytest.warns(UserWarning, match="was not written by vlatool"), write_directory(out, damaged=True) as draft:
         (draft / "new").touch()
     (kept,) = tmp_path.glob("out.kept-*")
     assert content(kept) == {"notes.txt": b"mine"}
@@ -349,7 +349,7 @@ def test_a_damaged_directory_of_the_cache_is_replaced_and_what_is_not_ours_is_ke
     [(errno.ENOSPC, "the disk is full"), (errno.EDQUOT, "the disk quota is used up")],
 )
 def test_a_full_disk_is_told_and_leaves_nothing(tmp_path: Path, number, message):
-    with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: {message}"), writing(tmp_path / "out"):
+    with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: {message}"), write_directory(tmp_path / "out"):
         raise OSError(number, os.strerror(number))
     assert os.listdir(tmp_path) == []
 
@@ -367,21 +367,21 @@ def test_where_the_cache_cannot_be_written_another_cache_helps_and_no_other_outp
     monkeypatch.setattr(Path, "mkdir", refuse)
     with (
         pytest.raises(OutputError, match=f"Cannot write to the cache: .*{message}") as caught,
-        writing(tmp_path / "stages/x", damaged=True),
+        write_directory(tmp_path / "stages/x", damaged=True),
     ):
         pytest.fail("the block must not run")
     assert "VLATOOL_CACHE" in caught.value.fix
 
 
 def test_a_file_elsewhere_that_a_disk_has_no_room_for_is_named(tmp_path: Path):
-    with pytest.raises(OSError, match="elsewhere/file"), writing(tmp_path / "out"):
+    with pytest.raises(OSError, match="elsewhere/file"), write_directory(tmp_path / "out"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "elsewhere/file"))
 
 
 def test_a_copy_that_has_no_room_is_the_fault_of_where_it_goes(tmp_path: Path):
     """The operating system names the source of a copy first."""
     with pytest.raises(OutputError, match=f"Cannot write {tmp_path}/out: the disk is full"), \
-            writing(tmp_path / "out") as draft:  # fmt: skip
+            write_directory(tmp_path / "out") as draft:  # fmt: skip
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "source"), None, str(draft / "file"))
 
 
@@ -391,7 +391,7 @@ def test_a_disk_that_is_full_from_the_first_byte_leaves_nothing(tmp_path: Path, 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OutputError, match="the disk is full"), writing(tmp_path / "out"):
+    with pytest.raises(OutputError, match="the disk is full"), write_directory(tmp_path / "out"):
         pytest.fail("the block must not run")
     assert os.listdir(tmp_path) == []
 
@@ -409,7 +409,7 @@ def test_a_place_that_may_not_be_written_to(tmp_path: Path, monkeypatch, number,
         raise OSError(number, os.strerror(number), str(path))
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(OutputError, match=message) as caught, writing(tmp_path / "out"):
+    with pytest.raises(OutputError, match=message) as caught, write_directory(tmp_path / "out"):
         pytest.fail("the block must not run")
     assert caught.value.fix
 
@@ -417,18 +417,18 @@ def test_a_place_that_may_not_be_written_to(tmp_path: Path, monkeypatch, number,
 @pytest.mark.parametrize("place", ["file/out", "file/deep/out"])
 def test_a_path_under_a_file(tmp_path: Path, place: str):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="a part of the path is a file"), writing(tmp_path / place):
+    with pytest.raises(OutputError, match="a part of the path is a file"), write_directory(tmp_path / place):
         pytest.fail("the block must not run")
 
 
 def test_an_error_of_the_block_that_is_not_about_the_output_stays_itself(tmp_path: Path):
-    with pytest.raises(FileNotFoundError), writing(tmp_path / "out"):
+    with pytest.raises(FileNotFoundError), write_directory(tmp_path / "out"):
         (tmp_path / "absent").read_text()
-    with pytest.raises(PermissionError), writing(tmp_path / "out"):
+    with pytest.raises(PermissionError), write_directory(tmp_path / "out"):
         raise PermissionError(errno.EACCES, "Permission denied", "/somewhere/else")
 
 
 def test_an_input_beside_the_output_that_may_not_be_read_is_not_blamed_on_the_output(tmp_path: Path):
     source = str(tmp_path / "policy/weights.safetensors")
-    with pytest.raises(PermissionError), writing(tmp_path / "out"):
+    with pytest.raises(PermissionError), write_directory(tmp_path / "out"):
         raise PermissionError(errno.EACCES, "Permission denied", source)

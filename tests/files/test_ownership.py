@@ -8,7 +8,7 @@ from vlatool.bundle.bundle import seal
 from vlatool.bundle.manifest import Manifest
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import OutputError
-from vlatool.files.written import LEDGER, note, note_file, prune, read_listing, refuse_foreign
+from vlatool.files.ownership import LEDGER, add_to_ledger, read_listing, refuse_foreign, remove_owned, write_ledger
 
 MANIFEST = Manifest("tiny", "1.0.0", PolicySpec((TensorSpec("x", (1, 2)),), (TensorSpec("y", (1, 2)),), 10.0))
 
@@ -21,7 +21,7 @@ def ours(tmp_path: Path) -> Path:
     (folder / "empty").mkdir()
     (folder / "graphs/main.onnx").write_bytes(b"weights")
     (folder / "report.json").write_text("{}")
-    note(folder)
+    write_ledger(folder)
     return folder
 
 
@@ -31,14 +31,14 @@ def everything(folder: Path) -> dict[str, bytes]:
 
 def test_what_was_written_is_ours_and_can_be_removed(ours: Path):
     refuse_foreign(ours)
-    assert prune(ours)
+    assert remove_owned(ours)
     assert not ours.exists()
 
 
 def test_a_file_that_the_person_removed_is_not_missed(ours: Path):
     (ours / "report.json").unlink()
     refuse_foreign(ours)
-    assert prune(ours)
+    assert remove_owned(ours)
 
 
 FOREIGN = {
@@ -60,7 +60,7 @@ def test_one_foreign_thing_keeps_all_of_it(ours: Path, name: str):
     with pytest.raises(OutputError, match=f"ours/{name} |ours was not written") as caught:
         refuse_foreign(ours)
     assert "move away" in caught.value.fix
-    assert not prune(ours)
+    assert not remove_owned(ours)
     assert os.path.lexists(ours / name)
     assert before is None or everything(ours) == before
 
@@ -70,27 +70,27 @@ def test_a_listed_file_behind_a_link_is_not_entered(ours: Path, tmp_path: Path):
     (ours / "graphs").symlink_to(tmp_path / "graphs")
     with pytest.raises(OutputError, match="graphs is a link"):
         refuse_foreign(ours)
-    assert not prune(ours, changed=True)
+    assert not remove_owned(ours, changed=True)
     assert (tmp_path / "graphs/main.onnx").is_file()
 
 
 def test_what_changed_goes_where_that_is_asked_for_and_what_is_foreign_stays(ours: Path):
     (ours / "report.json").write_text("damaged")
     (ours / "notes.txt").write_text("mine")
-    assert not prune(ours, changed=True)
+    assert not remove_owned(ours, changed=True)
     assert everything(ours) == {"notes.txt": b"mine"}
 
 
 def test_a_file_that_is_written_later_is_noted(ours: Path):
     (ours / "gate.xml").write_text("<testsuites/>")
-    note_file(ours / "gate.xml")
+    add_to_ledger(ours / "gate.xml")
     refuse_foreign(ours)
-    assert prune(ours)
+    assert remove_owned(ours)
 
 
 def test_noting_a_file_makes_no_directory_ours(tmp_path: Path):
     (tmp_path / "gate.xml").write_text("<testsuites/>")
-    note_file(tmp_path / "gate.xml")
+    add_to_ledger(tmp_path / "gate.xml")
     assert os.listdir(tmp_path) == ["gate.xml"]
 
 
@@ -104,7 +104,7 @@ def bundle(tmp_path: Path) -> Path:
 
 def test_a_bundle_without_a_list_is_known_by_its_manifest(bundle: Path):
     refuse_foreign(bundle)
-    assert prune(bundle)
+    assert remove_owned(bundle)
 
 
 @pytest.mark.parametrize("name", ["policy.py", "location.json", "graphs/other.onnx"])
@@ -126,7 +126,7 @@ def test_a_manifest_of_something_else_makes_no_directory_ours(tmp_path: Path, te
     assert read_listing(tmp_path) is None
     with pytest.raises(OutputError, match="was not written by vlatool"):
         refuse_foreign(tmp_path)
-    assert not prune(tmp_path, changed=True)
+    assert not remove_owned(tmp_path, changed=True)
 
 
 @pytest.mark.parametrize(
@@ -146,9 +146,9 @@ def test_an_empty_directory_is_in_nobodys_way(tmp_path: Path):
 def test_a_name_out_of_the_directory_in_a_list_removes_nothing(tmp_path: Path):
     (tmp_path / "precious").write_text("mine")
     (tmp_path / "out").mkdir()
-    note(tmp_path / "out")
+    write_ledger(tmp_path / "out")
     data = json.loads((tmp_path / "out" / LEDGER).read_text())
     data["files"] = {"../precious": "0" * 64}
     (tmp_path / "out" / LEDGER).write_text(json.dumps({**data, "folders": [".."]}, indent=1) + "\n")
-    prune(tmp_path / "out", changed=True)
+    remove_owned(tmp_path / "out", changed=True)
     assert (tmp_path / "precious").is_file()

@@ -1,4 +1,4 @@
-"""Renames that never replace anything, and two directories that change places at once."""
+"""Renames that never replace anything, and the atomic exchange of two directories."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from pathlib import Path
 
 AT_FDCWD = -100
 NOREPLACE, EXCHANGE = 1, 2
-UNKNOWN = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
-"""What the kernel or a file system says that does not know such a rename."""
+UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
+"""Errors of a kernel or file system without such renames."""
 
 
-def move_new(source: Path, target: Path) -> None:
-    """Rename a directory to a name that is free; of several who want the name at once exactly one gets it.
+def rename_to_new(source: Path, target: Path) -> None:
+    """Rename a directory to a path that does not exist; of several concurrent callers exactly one succeeds.
 
     Raises:
-        FileExistsError: when the name is taken.
-        OSError: for anything else.
+        FileExistsError: when the path exists.
+        OSError: for any other failure.
     """
     if _rename(source, target, NOREPLACE):
         return
@@ -33,16 +33,16 @@ def move_new(source: Path, target: Path) -> None:
 
 
 def exchange(one: Path, other: Path) -> bool:
-    """Let two directories change places at once; False when the file system cannot.
+    """Exchange two directories atomically; return False when the file system does not support it.
 
     Raises:
-        OSError: for anything else.
+        OSError: for any other failure.
     """
     return _rename(one, other, EXCHANGE)
 
 
 def _rename(source: Path, target: Path, flags: int) -> bool:
-    """Call ``renameat2``; False when there is none here."""
+    """Call ``renameat2``; return False when it is not supported."""
     try:
         call = ctypes.CDLL(None, use_errno=True).renameat2
     except (AttributeError, OSError):
@@ -50,6 +50,6 @@ def _rename(source: Path, target: Path, flags: int) -> bool:
     if call(AT_FDCWD, os.fsencode(source), AT_FDCWD, os.fsencode(target), ctypes.c_uint(flags)) == 0:
         return True
     number = ctypes.get_errno()
-    if number in UNKNOWN:
+    if number in UNSUPPORTED:
         return False
     raise OSError(number, os.strerror(number), str(source), None, str(target))

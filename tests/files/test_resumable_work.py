@@ -6,7 +6,7 @@ import threading
 import time
 from pathlib import Path
 
-from vlatool.files.work import LOCK, forget, work_directory
+from vlatool.files.resumable_work import LOCK, remove_work, work_directory
 
 
 def test_a_run_that_waited_for_work_that_was_removed_still_keeps_others_out(tmp_path: Path) -> None:
@@ -23,7 +23,7 @@ def test_a_run_that_waited_for_work_that_was_removed_still_keeps_others_out(tmp_
         second.start()
         time.sleep(0.1)  # it waits
         assert inside == []
-        forget(place)
+        remove_work(place)
     while not inside:
         time.sleep(0.01)
     assert (place / LOCK).is_file(), "what it works in is there"

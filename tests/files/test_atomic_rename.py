@@ -4,20 +4,20 @@ from pathlib import Path
 
 import pytest
 
-from vlatool.files import moves
-from vlatool.files.moves import exchange, move_new
+from vlatool.files import atomic_rename
+from vlatool.files.atomic_rename import exchange, rename_to_new
 
 
 @pytest.fixture(params=["renameat2", "without it"])
 def system(request, monkeypatch) -> str:
     if request.param == "without it":
-        monkeypatch.setattr(moves, "_rename", lambda *_arguments: False)
+        monkeypatch.setattr(atomic_rename, "_rename", lambda *_arguments: False)
     return request.param
 
 
 def test_a_directory_moves_to_a_free_name(tmp_path: Path, system):
     (tmp_path / "new/deep").mkdir(parents=True)
-    move_new(tmp_path / "new", tmp_path / "out")
+    rename_to_new(tmp_path / "new", tmp_path / "out")
     assert (tmp_path / "out/deep").is_dir()
     assert os.listdir(tmp_path) == ["out"]
 
@@ -35,15 +35,15 @@ def test_a_name_that_is_taken_is_never_replaced(tmp_path: Path, system, kind: st
     }[kind]()
     before = out.lstat().st_ino
     with pytest.raises(FileExistsError):
-        move_new(tmp_path / "new", out)
+        rename_to_new(tmp_path / "new", out)
     assert out.lstat().st_ino == before
     assert (tmp_path / "new").is_dir()
 
 
 def test_a_move_that_fails_leaves_the_name_free(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(moves, "_rename", lambda *_arguments: False)
+    monkeypatch.setattr(atomic_rename, "_rename", lambda *_arguments: False)
     with pytest.raises(FileNotFoundError):
-        move_new(tmp_path / "absent", tmp_path / "out")
+        rename_to_new(tmp_path / "absent", tmp_path / "out")
     assert os.listdir(tmp_path) == []
 
 
@@ -68,8 +68,8 @@ def test_a_file_system_that_cannot_exchange_says_no(tmp_path: Path, monkeypatch,
     class Library:
         @staticmethod
         def renameat2(*_arguments: object) -> int:
-            moves.ctypes.set_errno(number)
+            atomic_rename.ctypes.set_errno(number)
             return -1
 
-    monkeypatch.setattr(moves.ctypes, "CDLL", lambda *_arguments, **_options: Library)
+    monkeypatch.setattr(atomic_rename.ctypes, "CDLL", lambda *_arguments, **_options: Library)
     assert not exchange(tmp_path / "one", tmp_path / "other")
