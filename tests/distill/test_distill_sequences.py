@@ -13,7 +13,7 @@ from _trainings import Killed, digest, distilled, killed_after, raise_killed, tr
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError, SourceError
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.torch_policy import torch_policy
 from vlatool.report import read_report
 from vlatool.stage.base import Context

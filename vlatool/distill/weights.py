@@ -11,7 +11,7 @@ from pydantic import Field
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, suggest
 from vlatool.module.edits import load_tensors, read_tensors
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.stage.base import Context
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Weights(ModuleStage):
             raise SourceError(f"No such file: {self.file}.", "check the path of the state_dict")
         super().check(source, profile)
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Load the weights.
 
         Raises:
@@ -51,7 +51,7 @@ class Weights(ModuleStage):
         for graph, module in modules.items():
             context.tell(f"loading the weights of {graph}", None)
             load_tensors(graph, module, stored, str(self.file))
-        return Changed()
+        return ModuleChanges()
 
 
 def check_tensors(modules: Mapping[str, nn.Module], stored: Mapping[str, Any], where: str) -> None:

@@ -21,7 +21,7 @@ from vlatool.module.edits import is_changed
 from vlatool.module.folding import fold_weights
 from vlatool.module.memory import refuse_kept_values
 from vlatool.module.origin import factory_of
-from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
+from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_shards, weights_on_demand
 from vlatool.module.to_onnx import (
     EXTERNAL_DATA_BYTES,
     IMPORTS,
@@ -116,14 +116,14 @@ class ExportOnnx(Transform):
         modules = stored.modules if stored else load_modules(bundle)
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in bundle.manifest.program}
         context.tell("running the torch policy", None)
-        with weights_read(stored) if stored else contextlib.nullcontext():
+        with weights_on_demand(stored) if stored else contextlib.nullcontext():
             expected = self._actions(bundle, sessions, observations)
             for session in sessions.values():
                 refuse_kept_values(session.module, session.step, session.last_feeds)
         graphs = {}
         for number, (name, session) in enumerate(sessions.items()):
             context.tell(f"exporting {name}", number / len(sessions))
-            with graph_filled(stored, name) if stored else contextlib.nullcontext():
+            with graph_weights(stored, name) if stored else contextlib.nullcontext():
                 graphs[name] = self._export(name, session, out, beside=stored is not None)
         return expected, graphs
 

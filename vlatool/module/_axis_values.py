@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from vlatool.module._silent import Silent
+from vlatool.module._zero_values import Silent
 from vlatool.module.factors import Axis, Factors, Shape
 
 
@@ -40,7 +40,7 @@ class Values:
         found = self.shapes.get(node)
         return found if isinstance(found, list) and (not found or isinstance(found[0], tuple)) else None
 
-    def needed(self, node: Any) -> Shape:
+    def shape_of(self, node: Any) -> Shape:
         """Return the axes of an argument.
 
         Raises:
@@ -94,7 +94,7 @@ class Values:
         alike = len(set(sizes)) == 1 and not (first and self.factors.inside(first[0])) and node not in self.apart
         if not alike or self.factors.size(first) % len(sizes):
             return self.factors.pieces(axis, sizes)
-        which, piece = self.factors.parted(axis, len(sizes))
+        which, piece = self.factors.split_axis(axis, len(sizes))
         self.factors.freeze(which)
         if not self._is_stuck(piece):
             self._alike[node] = piece
@@ -107,7 +107,7 @@ class Values:
     def _is_stuck(self, axis: Axis) -> bool:
         return all(self.factors.is_frozen(leaf) for leaf in self.factors.leaves(axis))
 
-    def frozen(self, sizes: Sequence[int]) -> Shape:
+    def frozen_axes(self, sizes: Sequence[int]) -> Shape:
         """Return new axes whose elements stay."""
         return [self.factors.new(size, frozen=True) for size in sizes]
 

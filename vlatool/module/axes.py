@@ -161,14 +161,14 @@ class Walk(Values):
     def _visit(self, node: Any) -> None:
         if node.target is operator.getitem:
             whole = self.shapes.get(node.args[0])
-            self.shapes[node] = whole[node.args[1]] if isinstance(whole, list) and whole else self._fresh(node)
+            self.shapes[node] = whole[node.args[1]] if isinstance(whole, list) and whole else self._frozen_outputs(node)
             return
         if not hasattr(node.meta["val"], "shape") and not isinstance(node.meta["val"], list | tuple):
             return  # a size
         self.factors.operator = _name_of(node)
-        self.shapes[node] = self._given(node)
+        self.shapes[node] = self._output_axes(node)
 
-    def _given(self, node: Any) -> Any:
+    def _output_axes(self, node: Any) -> Any:
         """Return the axes of what an operator gives; frozen, as those of what it is given, where no rule says them."""
         rule, counted = rule_for(node.target), len(self.products)
         try:
@@ -186,9 +186,9 @@ class Walk(Values):
         del self.products[counted:], self.widths[counted:]
         self.counts.pop(node, None)
         if macs := macs_of(node) if node in self._live else 0:
-            widths = [axis for each in node.all_input_nodes if each in self.stored for axis in self.needed(each)]
-            self.multiply(self.frozen([macs]), widths)
-        return self._fresh(node)
+            widths = [axis for each in node.all_input_nodes if each in self.stored for axis in self.shape_of(each)]
+            self.multiply(self.frozen_axes([macs]), widths)
+        return self._frozen_outputs(node)
 
     def _fits(self, node: Any, given: Any) -> bool:
         """Check what a rule says against the sizes that torch.export noted."""
@@ -199,14 +199,14 @@ class Walk(Values):
             for each, shape in zip(values, shapes, strict=True)
         )
 
-    def _fresh(self, node: Any) -> Any:
+    def _frozen_outputs(self, node: Any) -> Any:
         """Return frozen axes for what a node gives."""
         value = node.meta.get("val")
         if isinstance(value, list | tuple):
-            return [self._frozen(each) for each in value]
-        return self._frozen(value)
+            return [self._frozen_value(each) for each in value]
+        return self._frozen_value(value)
 
-    def _frozen(self, value: Any) -> Shape | None:
+    def _frozen_value(self, value: Any) -> Shape | None:
         return [self.factors.new(size, frozen=True) for size in sizes_of(value)] if hasattr(value, "shape") else None
 
     def _freeze_all(self, arguments: Any) -> None:

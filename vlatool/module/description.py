@@ -25,7 +25,7 @@ from vlatool.runtime.observation import ObservationEncoder
 from vlatool.runtime.statistics import load_normaliser
 
 FILE = "policy.yaml"
-LONGEST = 100
+MAX_LABEL_CHARACTERS = 100
 """Characters of a policy's name, and of its version."""
 KEYS = (
     "schema", "name", "version", "description", "license", "source", "arguments", "spec", "program", "environment",
@@ -150,9 +150,9 @@ def read_description(path: Path) -> Description:
 def _check_label(file: Path, key: str, value: Any) -> None:
     """Refuse a name or version that could not stand in a line of a report."""
     label = str(value)
-    if not (0 < len(label) <= LONGEST and one_line(label, LONGEST) == label):
+    if not (0 < len(label) <= MAX_LABEL_CHARACTERS and one_line(label, MAX_LABEL_CHARACTERS) == label):
         raise SourceError(
-            f"{file}: '{key}' must be text of 1 to {LONGEST} characters without control characters; got "
+            f"{file}: '{key}' must be text of 1 to {MAX_LABEL_CHARACTERS} characters without control characters; got "
             f"{truncate(label, 40)!r}.",
             "give it a short name in one line",
         )

@@ -2,7 +2,7 @@
 
 ``module/edits.json`` is an ordered list of structural edits, ``module/GRAPH.safetensors`` the weights of a graph's
 module after them. A module is always made in this order: the factory, the edits, the weights. Without the second file
-the weights are those of the policy's shards (``vlatool.module.stored``): blocks that are kept have them already.
+the weights are those of the policy's shards (``module.sharded_weights``): blocks that are kept have them already.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require, suggest
 from vlatool.files.json import read_json
-from vlatool.module.cut import cut
 from vlatool.module.edit import AGAIN
 from vlatool.module.edit import Edit as Edit
 from vlatool.module.feeds import first_feeds
+from vlatool.module.unit_removal import remove_units
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -37,13 +37,13 @@ FORM = (
     "graph and module (names), axis (outputs, inputs, blocks, or 'units A.P' with numbers) and keep (different whole "
     "numbers from 0)"
 )
-MOST_KNOWN = 20
+MAX_LISTED = 20
 """Names of modules that a message lists."""
 SIZES = {"outputs": ("out_features", "out_channels", "num_features"), "inputs": ("in_features", "in_channels")}
 """Axis -> attributes of a module that say its size."""
 
 
-STORED = {"torch.float32": "F32", "torch.float64": "F64", "torch.float16": "F16", "torch.bfloat16": "BF16"}
+SAFETENSORS_DTYPES = {"torch.float32": "F32", "torch.float64": "F64", "torch.float16": "F16", "torch.bfloat16": "BF16"}
 """Type of a weight that is trained -> as safetensors calls it."""
 _CHANGED: weakref.WeakSet[Any] = weakref.WeakSet()
 """Modules that were changed in this process."""
@@ -100,7 +100,7 @@ def _is_edit(value: Any) -> bool:
     return whole and len(set(keep)) == len(keep)
 
 
-def edited(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = True) -> dict[str, nn.Module]:
+def apply_bundle(modules: Mapping[str, nn.Module], bundle: Bundle, *, weights: bool = True) -> dict[str, nn.Module]:
     """Change what the factory made as a bundle says.
 
     Args:
@@ -146,9 +146,9 @@ def apply(
             made = _without_units(made, tuple(group), bundle)
             continue
         for edit in group:
-            parts = dict(_named(made, edit.graph).named_modules())
+            parts = dict(_graph_module(made, edit.graph).named_modules())
             if edit.module not in parts:
-                known = [name for name in parts if name][:MOST_KNOWN]
+                known = [name for name in parts if name][:MAX_LISTED]
                 more = f" and {len(parts) - 1 - len(known)} more" if len(parts) - 1 > len(known) else ""
                 says = f"An edit names the module '{edit.module}'; {suggest(edit.module, known)}{more}."
                 raise SourceError(says, AGAIN)
@@ -157,7 +157,7 @@ def apply(
     return made
 
 
-def _named(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
+def _graph_module(modules: Mapping[str, nn.Module], graph: str) -> nn.Module:
     if graph not in modules:
         raise SourceError(f"An edit names the graph '{graph}'; {suggest(graph, modules)}.", AGAIN)
     return modules[graph]
@@ -168,7 +168,8 @@ def _without_units(modules: Mapping[str, nn.Module], edits: Sequence[Edit], bund
     feeds = first_feeds(modules, bundle)
     made = dict(modules)
     for graph in dict.fromkeys(edit.graph for edit in edits):
-        made[graph] = cut(_named(modules, graph), feeds[graph], [edit for edit in edits if edit.graph == graph])
+        own = [edit for edit in edits if edit.graph == graph]
+        made[graph] = remove_units(_graph_module(modules, graph), feeds[graph], own)
     return made
 
 
@@ -196,7 +197,7 @@ def refuse_traced(bundle: Bundle, what: str, command: str) -> None:
         )
 
 
-def joined_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
+def concatenate_edits(before: Sequence[Edit], after: Sequence[Edit]) -> tuple[Edit, ...]:
     """Return edits that do what those before and those after them do; the units of the latter are of another trace."""
     traces = max((edit.trace for edit in before), default=0)
     return (*before, *(edit.after(traces) for edit in after))
@@ -321,7 +322,7 @@ def stream_tensors(
     end = 0
     for name, (dtype, shape) in forms.items():
         start, end = end, end + math.prod(shape) * dtype.itemsize
-        header[name] = {"dtype": STORED[str(dtype)], "shape": list(shape), "data_offsets": [start, end]}
+        header[name] = {"dtype": SAFETENSORS_DTYPES[str(dtype)], "shape": list(shape), "data_offsets": [start, end]}
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
     with path.open("wb") as stream:
@@ -344,19 +345,19 @@ def write_module(out: Path, edits: Sequence[Edit], modules: Mapping[str, nn.Modu
     (out / EDITS).write_text(json.dumps([asdict(edit) for edit in edits]) + "\n", encoding="utf-8")
     for graph, module in modules.items():
         held = module.state_dict(keep_vars=True)
-        tensors = _apart({first: held[first] for first, _ in names_of_each(held)})
+        tensors = _separate_memory({first: held[first] for first, _ in names_of_each(held)})
         path = out / FOLDER / f"{graph}.safetensors"
         save_tensors(path, tensors)
         path.chmod((out / EDITS).stat().st_mode & 0o777)  # safetensors lets nobody else read it
 
 
-def _apart(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def _separate_memory(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return tensors that share no memory, as a file of them needs; those that share none are not copied."""
     seen: set[int] = set()
     apart = {}
     for name, value in state.items():
         held = value.detach().contiguous()
-        place = held.untyped_storage().data_ptr()
-        apart[name] = held.clone() if place in seen else held
-        seen.add(place)
+        pointer = held.untyped_storage().data_ptr()
+        apart[name] = held.clone() if pointer in seen else held
+        seen.add(pointer)
     return apart

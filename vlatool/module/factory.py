@@ -22,10 +22,10 @@ from vlatool.errors import (
     suggest,
 )
 from vlatool.files.printable import message_of
-from vlatool.module.fresh import compile_afresh
+from vlatool.module.bytecode import ignore_bytecode
 from vlatool.user_code.children import left
 
-RAISED = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
+CORRECT_CODE = "correct what fails; VLATOOL_DEBUG=1 shows where it was raised"
 """What is done about code of a user that raises, where no more is known of it."""
 
 OWN_NAME = "vlatool_source_"
@@ -80,9 +80,9 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         )
     if path is None:
         _check_package(factory)
-    compile_afresh(folder)
+    ignore_bytecode(folder)
     try:
-        with exits_caught(f"importing '{where}'"):
+        with map_user_exceptions(f"importing '{where}'"):
             module = _import_path(path) if path is not None else importlib.import_module(where)
     except VlatoolError:
         raise
@@ -93,7 +93,7 @@ def import_factory(factory: str, folder: Path) -> Callable[..., Any]:
         ) from error
     except Exception as error:  # the seam: user code may raise anything while it is imported
         raise SourceError(
-            f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.", RAISED
+            f"Importing '{where}' failed: {type(error).__name__}: {message_of(error)}.", CORRECT_CODE
         ) from error
     make = getattr(module, function, None)
     if not callable(make):
@@ -113,11 +113,11 @@ def call_factory(factory: str, folder: Path, arguments: dict[str, Any]) -> Any:
         SourceError: when the call raises.
     """
     make = import_factory(factory, folder)
-    with _running(factory, folder, f"the factory '{factory}'"):
+    with _name_function(factory, folder, f"the factory '{factory}'"):
         return make(**arguments)
 
 
-def yielded(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[Any]:
+def iterate_function(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[Any]:
     """Import a function that yields, call it, and yield what it does.
 
     Args:
@@ -129,14 +129,14 @@ def yielded(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[
         SourceError: when it raises, or gives nothing to go through.
     """
     make = import_factory(function, folder)
-    with _running(function, folder, f"'{function}'"):
+    with _name_function(function, folder, f"'{function}'"):
         product = make(**arguments)
         values = iter(product) if isinstance(product, Iterable) else None
     if values is None:
         kind = type(product).__name__
         raise SourceError(f"'{function}' gives a value of type {kind}; it must yield.", "let it yield its values")
     while True:
-        with _running(function, folder, f"'{function}'"):
+        with _name_function(function, folder, f"'{function}'"):
             value = next(values, _END)
         if value is _END:
             return
@@ -144,10 +144,10 @@ def yielded(function: str, folder: Path, arguments: dict[str, Any]) -> Iterator[
 
 
 @contextlib.contextmanager
-def _running(factory: str, folder: Path, what: str) -> Iterator[None]:
+def _name_function(factory: str, folder: Path, what: str) -> Iterator[None]:
     """Turn whatever a user's function raises in this block into an error that names it."""
     try:
-        with _importable(factory_file(factory, folder)), exits_caught(what):
+        with _importable(factory_file(factory, folder)), map_user_exceptions(what):
             yield
     except (VlatoolError, MemoryError):
         raise
@@ -157,11 +157,11 @@ def _running(factory: str, folder: Path, what: str) -> Iterator[None]:
         ) from error
     except Exception as error:  # the seam: user code may raise anything
         about = what[:1].upper() + what[1:]
-        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.", RAISED) from error
+        raise SourceError(f"{about} failed: {type(error).__name__}: {message_of(error)}.", CORRECT_CODE) from error
 
 
 @contextlib.contextmanager
-def exits_caught(what: str) -> Iterator[None]:
+def map_user_exceptions(what: str) -> Iterator[None]:
     """Turn what a user's code raises beside ``Exception`` (``sys.exit``, classes of its own) into an error.
 
     Errors of vlatool that say what input was bad, or what package is absent, pass: its functions raise them where the
@@ -177,7 +177,7 @@ def exits_caught(what: str) -> Iterator[None]:
         raise
     except VlatoolError as error:
         message = message_of(error).partition("\n")[0].rstrip(".")
-        raise SourceError(f"{about} raised {type(error).__name__}: {message}.", RAISED) from error
+        raise SourceError(f"{about} raised {type(error).__name__}: {message}.", CORRECT_CODE) from error
     except Exception:
         raise
     except BaseException as error:  # the seam: user code may raise anything

@@ -18,8 +18,8 @@ from vlatool.files.printable import message_of, one_line
 GUIDE = "docs/guides/your-own-policy.md"
 TOOLS = ("torch", "onnxscript", "onnx_ir", "onnx", "functorch")
 """Packages that export; a line of theirs is not where a policy goes wrong."""
-LONGEST = 300
-SEARCHED = 1 << 20
+MAX_CHARACTERS = 300
+MAX_SEARCHED_CHARACTERS = 1 << 20
 """Characters of an error's text in which a cause is looked for."""
 
 
@@ -148,9 +148,9 @@ def export_error(error: BaseException, graph: str, module: Any) -> GraphError:
     operator = _operator(chain, node)
     where = _of_node(node) if node is not None else _of_frames(chain)
     parts.append(_line(chain))
-    places = [f"operator {operator}"] if operator and operator not in parts[-1] else []
-    places += [where] if where else []
-    return GraphError(f"{': '.join(parts)}{' (' + '; '.join(places) + ')' if places else ''}.", cause.remedy)
+    lines = [f"operator {operator}"] if operator and operator not in parts[-1] else []
+    lines += [where] if where else []
+    return GraphError(f"{': '.join(parts)}{' (' + '; '.join(lines) + ')' if lines else ''}.", cause.remedy)
 
 
 def remedy_for(error: BaseException) -> str:
@@ -185,7 +185,7 @@ def _in_distribution(chain: list[BaseException]) -> bool:
 
 def _cause_in_text(chain: list[BaseException]) -> Cause | None:
     """Return the first cause of the table that the text of an error names."""
-    texts = [f"{type(error).__name__}: {message_of(error, SEARCHED)}" for error in reversed(chain)]
+    texts = [f"{type(error).__name__}: {message_of(error, MAX_SEARCHED_CHARACTERS)}" for error in reversed(chain)]
     for cause in CAUSES:
         if any(re.search(cause.pattern or "", text, re.DOTALL) for text in texts):
             return cause
@@ -196,12 +196,12 @@ def _line(chain: list[BaseException]) -> str:
     """The first line of torch's own message at the root."""
     root = chain[-1]
     lines = [line.strip() for line in message_of(root).splitlines() if line.strip()]
-    text = one_line(lines[0] if lines else "", LONGEST).rstrip(".")
+    text = one_line(lines[0] if lines else "", MAX_CHARACTERS).rstrip(".")
     return f"{type(root).__name__}: {text}" if text else type(root).__name__
 
 
 def _operator(chain: list[BaseException], node: Any) -> str:
-    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1], SEARCHED))
+    match = re.search(r"OpOverload\(op='([\w.]+)'", message_of(chain[-1], MAX_SEARCHED_CHARACTERS))
     if match:
         return match[1]
     return str(node.target) if node is not None and node.op == "call_function" else ""
@@ -228,7 +228,7 @@ def _of_node(node: Any) -> str:
     own = [line for line in lines if not set(TOOLS) & set(Path(line[0]).parts)]
     if own:
         file, number, function = own[-1]
-        parts.append(_place(file, int(number), function))
+        parts.append(_describe_line(file, int(number), function))
     return ", ".join(parts)
 
 
@@ -240,10 +240,10 @@ def _of_frames(chain: list[BaseException]) -> str:
     frame, line = frames[-1]
     owner = frame.f_locals.get("self")
     module = [f"module {type(owner).__name__}"] if hasattr(owner, "named_modules") else []
-    return ", ".join([*module, _place(frame.f_code.co_filename, line, frame.f_code.co_name)])
+    return ", ".join([*module, _describe_line(frame.f_code.co_filename, line, frame.f_code.co_name)])
 
 
-def _place(file: str, number: int, function: str) -> str:
+def _describe_line(file: str, number: int, function: str) -> str:
     parts = Path(file).parts
     packages = [index for index, part in enumerate(parts) if part in ("site-packages", "dist-packages")]
     name = "/".join(parts[packages[-1] + 1 :]) if packages else Path(file).name

@@ -36,7 +36,7 @@ def fold_weights(model: Any) -> int:
             model.graph.register_initializer(new)
             ir.convenience.replace_all_uses_with(value, new)
         model.graph.remove(node, safe=True)
-        _forget(model.graph, weight)
+        _remove_weight(model.graph, weight)
         folded += 1
     return folded
 
@@ -67,7 +67,7 @@ def _free(graph: Any, name: str) -> str:
     return name
 
 
-def _forget(graph: Any, weight: Any) -> None:
+def _remove_weight(graph: Any, weight: Any) -> None:
     """Drop a weight that nothing reads any more."""
     if not list(weight.uses()) and not weight.is_graph_output():
         del graph.initializers[weight.name]

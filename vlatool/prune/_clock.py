@@ -15,8 +15,8 @@ from vlatool.hardware.profile import Profile
 from vlatool.latency_model.predict import predictions
 from vlatool.measurement import agent
 from vlatool.measurement.jobs import LatencyJob
-from vlatool.module.edits import Edit, apply, joined_edits, read_edits
-from vlatool.module.stage import write_changed
+from vlatool.module.edits import Edit, apply, concatenate_edits, read_edits
+from vlatool.module.stage import write_modules
 from vlatool.module.torch_policy import load_modules
 from vlatool.stage.base import Context, Transform
 from vlatool.stage.build import build_stage
@@ -73,8 +73,8 @@ class Clock:
         made.mkdir()
         exported.mkdir()
         modules = apply(load_modules(self._source), edits, self._source)
-        everything = joined_edits(read_edits(self._source), edits)
-        bundle = write_changed(self._source, made, everything, modules, self._made_by)
+        everything = concatenate_edits(read_edits(self._source), edits)
+        bundle = write_modules(self._source, made, everything, modules, self._made_by)
         stage = cast(Transform, build_stage("export.onnx", {}))
         stage.run(bundle, exported, replace(self._context, tell=lambda _what, _share: None))
         return exported

@@ -19,8 +19,8 @@ from vlatool.latency_model.measured import calibrations
 from vlatool.machine.host import fingerprint, matches
 from vlatool.module.blocks import stacks_of
 from vlatool.module.edits import Edit, edits_from
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._clock import BoardClock, Clock
 from vlatool.prune._prices import (
     Stack,
@@ -130,7 +130,7 @@ class LatencyPruning(ModuleStage):
         predicted = f"predicted, not measured: {self.target_ms:g} ms or up to {CLOSE:.0%} less on {self.board}"
         return (*super().lines(bundle), *([predicted] if self.board and not self.chosen else []))
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the blocks and units that stay.
 
         Raises:
@@ -139,7 +139,7 @@ class LatencyPruning(ModuleStage):
             DataError: when the latency is not met: it changes from run to run.
         """
         if self.chosen:
-            return Changed(_edits_chosen(self.chosen))
+            return ModuleChanges(_edits_chosen(self.chosen))
         if self.board:
             self._predict_whole(source, context)
         context.tell("tracing the policy", None)
@@ -148,7 +148,7 @@ class LatencyPruning(ModuleStage):
         if not groups:
             raise nothing(source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
-        context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
+        context.said.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
         rank_units(groups, self.rank, modules, source, self.samples)
         blocks = self.stacks(modules, source)
         work = Work(walks, {step.graph: step.repeat for step in source.manifest.program}, groups)
@@ -156,7 +156,7 @@ class LatencyPruning(ModuleStage):
             clock = self._clock(source, scratch, context)
             edits = self._met(groups, blocks, work, clock, context)
         board = {"board": load_profile(self.board).name} if self.board else {}
-        return Changed(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
+        return ModuleChanges(edits, options={"chosen": json.dumps([asdict(edit) for edit in edits]), **board})
 
     def _predict_whole(self, source: Bundle, context: Context) -> None:
         """Say at once, and not after the ranking, that there is nothing to do."""

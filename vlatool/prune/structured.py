@@ -9,8 +9,8 @@ from pydantic import Field
 
 from vlatool.bundle.bundle import Bundle
 from vlatool.module.axes import Walk
-from vlatool.module.feeds import unrecorded
-from vlatool.module.stage import Changed, ModuleStage
+from vlatool.module.feeds import unrecorded_note
+from vlatool.module.stage import ModuleChanges, ModuleStage
 from vlatool.prune._reached import SHORT, recorded, refuse_short, sentences
 from vlatool.prune._selection import Selection
 from vlatool.prune._units import Group, Rank, Work, groups_of, rank_units, walks_of
@@ -39,7 +39,7 @@ class Structured(ModuleStage):
     include: tuple[str, ...] = Field((), description="globs of weights to prune; all when empty")
     exclude: tuple[str, ...] = Field((), description="globs of weights to leave as they are")
 
-    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> Changed:
+    def change(self, modules: Mapping[str, nn.Module], source: Bundle, context: Context) -> ModuleChanges:
         """Choose the units that stay.
 
         Raises:
@@ -51,13 +51,13 @@ class Structured(ModuleStage):
         groups = groups_of(walks, Selection(self.include, self.exclude), self.multiple, source.manifest.name)
         context.tell(f"ranking the units of {len(groups)} groups", None)
         if groups:
-            context.said.extend(unrecorded(source, self.samples) if self.rank == "gate" else ())
+            context.said.extend(unrecorded_note(source, self.samples) if self.rank == "gate" else ())
             rank_units(groups, self.rank, modules, source, self.samples)
         return self.choose(walks, groups, {step.graph: step.repeat for step in source.manifest.program}, context)
 
     def choose(
         self, walks: Mapping[str, Walk], groups: Sequence[Group], runs: Mapping[str, int], context: Context
-    ) -> Changed:
+    ) -> ModuleChanges:
         """Take units from ranked groups.
 
         Args:
@@ -72,7 +72,7 @@ class Structured(ModuleStage):
         record = recorded(self.ratio, work, whole, left, walks.values())
         context.said.extend(sentences(record))
         edits = tuple(group.edit() for group in groups if group.stays < group.size)
-        return Changed(edits, record={PRUNED: record})
+        return ModuleChanges(edits, record={PRUNED: record})
 
     def accept(self, bundle: Bundle) -> None:
         """Refuse what falls short of the ratio.

@@ -20,7 +20,7 @@ from vlatool.files.resumable_work import remove_work, work_directory
 from vlatool.graph.files import link
 from vlatool.graph.precision import precision_shares
 from vlatool.module.origin import factory_of
-from vlatool.module.stored import takes_shards
+from vlatool.module.sharded_weights import takes_shards
 from vlatool.module.to_onnx import IMPORTS
 from vlatool.quantize._compute import records_of
 from vlatool.quantize._records import Record

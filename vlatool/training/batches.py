@@ -44,9 +44,9 @@ class Batches:
 
     def __call__(self, random: np.random.Generator) -> Iterator[Part]:
         """Yield this process's parts of the batch that the random numbers choose."""
-        places = self._frames.draw(random, self._size)
-        for part in np.array_split(places, self._parts)[self._own]:
-            yield self._frames.weigh(part) / self._frames.weigh(places), partial(self._loss, part)
+        indices = self._frames.draw(random, self._size)
+        for part in np.array_split(indices, self._parts)[self._own]:
+            yield self._frames.row_count(part) / self._frames.row_count(indices), partial(self._loss, part)
 
     def of(self, loss: Loss, frames: Frames) -> Batches:
         """Return batches of other rows, with another loss, in the same parts."""
@@ -54,24 +54,24 @@ class Batches:
         other._of_rows, other._frames = loss, frames
         return other
 
-    def _loss(self, places: NDArray[Any]) -> Tensor:
-        return self._of_rows(self._frames.batch(places))
+    def _loss(self, indices: NDArray[Any]) -> Tensor:
+        return self._of_rows(self._frames.batch(indices))
 
 
-def mean_loss(frames: Frames, places: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
+def mean_loss(frames: Frames, indices: NDArray[Any], loss: Loss, rows: int, device: Device) -> float:
     """Return the mean loss of rows, without gradients.
 
     Args:
         frames: Where they are.
-        places: Of them, as ``Frames.sample`` gives.
+        indices: Of them, as ``Frames.sample`` gives.
         loss: Of a batch.
         rows: At a time.
         device: As in training.
     """
-    total, count = 0.0, frames.weigh(places)
+    total, count = 0.0, frames.row_count(indices)
     with require("torch", "build").no_grad(), device.computing(), device.casting():
-        for part in np.array_split(places, min(len(places), -(-count // rows))):
-            total += float(loss(frames.batch(part))) * frames.weigh(part)
+        for part in np.array_split(indices, min(len(indices), -(-count // rows))):
+            total += float(loss(frames.batch(part))) * frames.row_count(part)
     return total / count
 
 

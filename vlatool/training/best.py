@@ -39,7 +39,7 @@ class Best:
             self.weights = {name: value.detach().clone() for name, value in weights.items()}
         self.scores.append(score)
 
-    def unimproved(self, number: int) -> int:
+    def rounds_without_improvement(self, number: int) -> int:
         """Return how many of the first scores follow the last one that was better than all before it."""
         scores = self.scores[:number]
         return number - 1 - scores.index(max(scores))

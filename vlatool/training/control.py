@@ -9,7 +9,7 @@ import numpy as np
 
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError
-from vlatool.training.frames import BLOCK, Array, new_array
+from vlatool.training.frames import BLOCK_ROWS, Array, new_array
 from vlatool.training.rounds import LABEL
 
 
@@ -32,8 +32,8 @@ def exchange_labels(frames: Path, labels: Sequence[str], seed: Sequence[int]) ->
         said: Array = np.load(file, mmap_mode="r")
         draft = file.with_name(f"exchanged-{file.name}")
         exchanged = new_array(draft, said.dtype, said.shape)
-        for start in range(0, len(said), BLOCK):
-            exchanged[start : start + BLOCK] = said[others[start : start + BLOCK]]
+        for start in range(0, len(said), BLOCK_ROWS):
+            exchanged[start : start + BLOCK_ROWS] = said[others[start : start + BLOCK_ROWS]]
         draft.replace(file)
 
 

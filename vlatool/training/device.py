@@ -15,7 +15,7 @@ from vlatool.machine import host
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-Asked = Literal["auto", "cpu", "cuda"]
+DeviceChoice = Literal["auto", "cpu", "cuda"]
 BFLOAT16 = ("amx_bf16", "avx512_bf16", "bf16")
 """Features of processors that multiply bfloat16 natively: twice as fast as float32 here."""
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
@@ -96,7 +96,7 @@ CPU = Device()
 """A processor, in float32."""
 
 
-def device_of(asked: Asked, precision: str, processes: int = 1, here: int | None = None) -> Device:
+def device_of(asked: DeviceChoice, precision: str, processes: int = 1, here: int | None = None) -> Device:
     """Return what to compute on, and how.
 
     Args:

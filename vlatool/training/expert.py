@@ -13,11 +13,11 @@ from vlatool.bundle.spec import TensorSpec
 from vlatool.data import Recording, calibration_recording
 from vlatool.episodes.frames import file_of
 from vlatool.errors import DataError, require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.runtime.statistics import load_normaliser
-from vlatool.training.frames import BLOCK, Array, Frames, new_array
-from vlatool.training.rounds import EXPERT, NOISE, Counted, next_round, write_recorded
-from vlatool.training.sequences import Sequences, answered, episode_begins, whole_episodes
+from vlatool.training.frames import BLOCK_ROWS, Array, Frames, new_array
+from vlatool.training.rounds import EXPERT, NOISE, Observations, next_round, write_observations
+from vlatool.training.sequences import Sequences, episode_begins, outputs_and_labels, select_episodes
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -32,17 +32,17 @@ class Expert:
     """Recorded observations with the expert's actions, encoded, in a folder of their own.
 
     Args:
-        place: Folder of the training, or of what it holds out.
+        folder: Folder of the training, or of what it holds out.
         frames: Folder -> the rounds in it, as the lesson takes them.
     """
 
-    def __init__(self, place: Path, frames: Callable[[Path], Frames] = Frames) -> None:
-        self.frames = frames(place / FOLDER)
+    def __init__(self, folder: Path, frames: Callable[[Path], Frames] = Frames) -> None:
+        self.frames = frames(folder / FOLDER)
         self.counts: dict[str, int] = {}
 
     def prepare(
         self,
-        recording: Counted | None,
+        recording: Observations | None,
         source: Bundle,
         share: float,
         seed: int,
@@ -65,7 +65,7 @@ class Expert:
             raise DataError(f"A loss against an expert's actions needs them, and {where} has none.", RECORD)
         order = np.random.default_rng((seed, CHOICE)).permutation
         if isinstance(self.frames, Sequences):
-            used = whole_episodes(episode_begins(recording), share, order)
+            used = select_episodes(episode_begins(recording), share, order)
         else:
             used = np.zeros(len(recording), np.bool_)
             used[order(len(recording))[: max(1, round(share * len(recording)))]] = True
@@ -74,7 +74,7 @@ class Expert:
 
         def write(target: Path) -> None:
             action = source.manifest.spec.action
-            write_recorded(encode, chosen, target, chosen.begins())
+            write_observations(encode, chosen, target, chosen.begins())
             np.save(file_of(target, EXPERT + action.name), encoded_actions(action, source, chosen.actions))
             write_noise(source, len(chosen), (seed, CHOICE), target)
 
@@ -107,7 +107,7 @@ def at_most(source: Bundle, most: int, *, whole: bool = False) -> Recording | No
         return None
     if whole:
         order = np.random.default_rng(CHOICE).permutation
-        return recording.only(whole_episodes(episode_begins(recording), most / len(recording), order))
+        return recording.only(select_episodes(episode_begins(recording), most / len(recording), order))
     used = np.zeros(len(recording), np.bool_)
     used[recording.spread(most)] = True
     return recording.only(used)
@@ -126,8 +126,8 @@ def write_noise(source: Bundle, rows: int, seed: Sequence[int], target: Path) ->
     """Write for so many rows what the program draws, if it draws anything."""
     wanted = {name: noise for step in source.manifest.program for name, noise in step.noise.items()}
     random, kept = np.random.default_rng(seed), dict[str, Array]()
-    for start in range(0, rows, BLOCK) if wanted else ():
-        for name, value in drawn(wanted, min(BLOCK, rows - start), random).items():
+    for start in range(0, rows, BLOCK_ROWS) if wanted else ():
+        for name, value in draw_noise(wanted, min(BLOCK_ROWS, rows - start), random).items():
             if name not in kept:
                 kept[name] = new_array(file_of(target, NOISE + name), value.numpy().dtype, (rows, *value.shape[1:]))
             kept[name][start : start + len(value)] = value.numpy()
@@ -150,7 +150,7 @@ def expert_loss(
     student = BatchedProgram(source.manifest.program, modules)
 
     def loss(rows: Mapping[str, Any]) -> Tensor:
-        given, expert = answered(student, rows, action.name, EXPERT)
+        given, expert = outputs_and_labels(student, rows, action.name, EXPERT)
         given = given.float()
         given = given.reshape(len(given), -1, given.shape[-1])[:, : expert.shape[1]]
         if action.kind != "discrete":

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import RecipeError
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.training.device import on_device
 from vlatool.training.rounds import AFTER, BEFORE, LABEL, NOISE, NUMBER, tensors
 

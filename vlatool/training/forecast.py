@@ -33,7 +33,7 @@ class Forecast:
         finally:
             self._paused.append(self._now() - start)
 
-    def left(self, step: int) -> str:
+    def time_left(self, step: int) -> str:
         """Return in words how long it will take from a step on; nothing while that is not known."""
         if step <= self._first:
             self._start = self._now() - sum(self._paused)

@@ -16,7 +16,7 @@ from vlatool.data import BEGINS
 from vlatool.errors import DataError
 
 Array = NDArray[Any]
-BLOCK = 256
+BLOCK_ROWS = 256
 """Rows that are copied at a time."""
 
 
@@ -41,11 +41,11 @@ class Frames:
 
     def has(self, number: int) -> bool:
         """Say whether a round was written whole, by an earlier run too."""
-        return self._place(number).is_dir()
+        return self._round_folder(number).is_dir()
 
     def read(self, number: int) -> None:
         """Use a round that was written, after those before it."""
-        files = sorted({*self._place(number).glob("*.npy")} - {begins_file(self._place(number))})
+        files = sorted({*self._round_folder(number).glob("*.npy")} - {begins_file(self._round_folder(number))})
         self._rounds.append({unquote(file.stem): np.load(file, mmap_mode="r") for file in files})
 
     def draft(self, number: int) -> Path:
@@ -57,9 +57,9 @@ class Frames:
 
     def keep(self, number: int) -> None:
         """Make a draft a round."""
-        (self._folder / f"draft-{number:03d}").rename(self._place(number))
+        (self._folder / f"draft-{number:03d}").rename(self._round_folder(number))
 
-    def places(self, number: int) -> Array:
+    def row_indices(self, number: int) -> Array:
         """Return the numbers over all rounds of the rows of one."""
         sizes = [len(next(iter(arrays.values()))) for arrays in self._rounds]
         return np.arange(sizes[number]) + sum(sizes[:number])
@@ -68,22 +68,22 @@ class Frames:
         """Draw the places of a batch of so many rows."""
         return random.integers(len(self), size=size)
 
-    def weigh(self, places: Array) -> int:
+    def row_count(self, indices: Array) -> int:
         """Return how many rows are at places."""
-        return len(places)
+        return len(indices)
 
     def sample(self, numbers: Sequence[int], most: int) -> Array:
         """Return the places of so many rows of some rounds, or of all, evenly spaced."""
-        rows = np.concatenate([self.places(number) for number in numbers])
-        return rows[spread(len(rows), most)]
+        rows = np.concatenate([self.row_indices(number) for number in numbers])
+        return rows[evenly_spaced(len(rows), most)]
 
-    def batch(self, places: Array) -> Any:
+    def batch(self, indices: Array) -> Any:
         """Return what a loss takes of places: name -> (B, ...)."""
-        return self.rows(places)
+        return self.rows(indices)
 
-    def kept(self, most: int) -> dict[str, Array]:
+    def sample_rows(self, most: int) -> dict[str, Array]:
         """Return so many rows, spread over all rounds: name -> (N, ...)."""
-        return self.rows(spread(len(self), most))
+        return self.rows(evenly_spaced(len(self), most))
 
     def rows(self, rows: Array) -> dict[str, Array]:
         """Return rows by their numbers over all rounds: name -> (B, ...)."""
@@ -97,10 +97,10 @@ class Frames:
 
     def begins(self, number: int) -> Array:
         """Return the numbers over all rounds of the rows of one with which episodes begin."""
-        places: Array = self.places(number)[np.load(begins_file(self._place(number)))]
-        return places
+        indices: Array = self.row_indices(number)[np.load(begins_file(self._round_folder(number)))]
+        return indices
 
-    def _place(self, number: int) -> Path:
+    def _round_folder(self, number: int) -> Path:
         return self._folder / f"round-{number:03d}"
 
 
@@ -109,7 +109,7 @@ def begins_file(folder: Path) -> Path:
     return folder / f"{BEGINS}.npy"
 
 
-def spread(count: int, most: int) -> Array:
+def evenly_spaced(count: int, most: int) -> Array:
     """Return the places of ``most`` of so many rows, or of all, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
 
@@ -126,7 +126,7 @@ def new_array(path: Path, dtype: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def joined(parts: Iterable[Path], target: Path) -> int:
+def concatenate(parts: Iterable[Path], target: Path) -> int:
     """Join the arrays of several folders, ``NAME.npy`` each; return the number of rows.
 
     Raises:
@@ -152,7 +152,7 @@ def joined(parts: Iterable[Path], target: Path) -> int:
 def _blocks(arrays: Iterable[Array]) -> Iterator[tuple[int, Array]]:
     at = 0
     for array in arrays:
-        for start in range(0, len(array), BLOCK):
-            block = array[start : start + BLOCK]
+        for start in range(0, len(array), BLOCK_ROWS):
+            block = array[start : start + BLOCK_ROWS]
             yield at, block
             at += len(block)

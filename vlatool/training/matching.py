@@ -10,7 +10,7 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.module.blocks import block_names, stacks
 from vlatool.module.edits import BLOCKS, Edit, loses_units, read_edits
 from vlatool.module.torch_policy import unedited_modules
-from vlatool.training.taps import Place
+from vlatool.training.taps import BlockName
 from vlatool.training.teacher import Teacher
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ class Pair:
 
     stack: Stack
     numbers: tuple[int, int]
-    ours: Place
-    theirs: Place
+    ours: BlockName
+    theirs: BlockName
 
 
 def pairs_of(modules: Mapping[str, nn.Module], source: Bundle, teacher: Teacher) -> list[Pair]:

@@ -11,7 +11,7 @@ from vlatool.bundle.bundle import ASSETS, MANIFEST, Bundle
 from vlatool.bundle.spec import TensorSpec
 from vlatool.errors import BundleError, RecipeError, SourceError
 from vlatool.machine import host
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.description import description_file
 from vlatool.module.edits import Edit, read_edits
 from vlatool.module.origin import origin_of

@@ -27,14 +27,14 @@ from vlatool.files.printable import message_of, one_line
 from vlatool.machine.version import VERSION
 from vlatool.user_code.children import Apart
 
-NAMES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+VARIABLES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 """What torchrun tells each process."""
 AGENT = "TORCHELASTIC_USE_AGENT_STORE"
-MEETING = "meeting"
+RENDEZVOUS_FILE = "meeting"
 """File in the folder of the training through which processes of one machine find each other; under torchrun it holds
 what shows that a process sees that folder."""
-PRELOAD = ("torch", "vlatool.training.peer")
-LEAVE = "leave"
+PRELOAD = ("torch", "vlatool.training.rank_process")
+LEAVE_CALL = "leave"
 """A call after which a process forgets the training."""
 START_S, LEFT_S, POLL_S = 300.0, 5.0, 0.05
 """Seconds in which another process comes, and goes; and between two looks at the store."""
@@ -61,7 +61,7 @@ class Launch:
     port: int
 
     @property
-    def here(self) -> bool:
+    def on_one_machine(self) -> bool:
         """Whether all processes are on this machine."""
         return self.size == self.local_size or self.address.startswith(LOOPBACK)
 
@@ -87,24 +87,24 @@ class Launch:
         return distributed.PrefixStore(prefix, store)
 
 
-def launched() -> Launch | None:
+def current_launch() -> Launch | None:
     """Return what torchrun says of this process; None where it was not started so, or alone.
 
     Raises:
         RecipeError: when that is incomplete, or no numbers.
     """
-    said = {name: os.environ.get(name, "") for name in NAMES}
+    said = {name: os.environ.get(name, "") for name in VARIABLES}
     if not (said["RANK"] and said["WORLD_SIZE"]) or said["WORLD_SIZE"] == "1":
         return None
     missing = [name for name, value in said.items() if not value]
-    numbers = [name for name in NAMES if name != "MASTER_ADDR" and not said[name].isdecimal()]
+    numbers = [name for name in VARIABLES if name != "MASTER_ADDR" and not said[name].isdecimal()]
     if missing or numbers:
         name = (missing or numbers)[0]
         raise RecipeError(
             f"RANK and WORLD_SIZE are set, as torchrun does, and {name} is {said[name] or 'not set'!r}.",
-            f"torchrun sets {', '.join(NAMES)}; set all of them, or unset RANK and WORLD_SIZE",
+            f"torchrun sets {', '.join(VARIABLES)}; set all of them, or unset RANK and WORLD_SIZE",
         )
-    rank, size, local_rank, local_size = (int(said[name]) for name in NAMES[:4])
+    rank, size, local_rank, local_size = (int(said[name]) for name in VARIABLES[:4])
     if not (rank < size and local_rank < local_size <= size):
         raise RecipeError(
             f"RANK={rank} of WORLD_SIZE={size} (LOCAL_RANK={local_rank} of LOCAL_WORLD_SIZE={local_size}) is no "
@@ -119,10 +119,10 @@ def versions() -> dict[str, str]:
     return {"vlatool": VERSION, "torch": str(require("torch", "build").__version__)}
 
 
-def shown(place: Path) -> dict[str, Any]:
+def write_rendezvous(folder: Path) -> dict[str, Any]:
     """Return what lets other processes check that they see the folder of the training, and run the same code."""
     token = secrets.token_hex(8)
-    (place / MEETING).write_text(token)
+    (folder / RENDEZVOUS_FILE).write_text(token)
     return {"token": token, "versions": versions()}
 
 
@@ -134,7 +134,7 @@ def check_shared(job: Mapping[str, Any]) -> None:
     """
     if "token" not in job:
         return
-    who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], MEETING)
+    who, seen = f"Process {job['rank'] + 1} of {job['size']} on {platform.node()}", Path(job["place"], RENDEZVOUS_FILE)
     for name, theirs in job["versions"].items():
         if (ours := versions()[name]) != theirs:
             raise RecipeError(f"{who} runs {name} {ours}, the first process {theirs}.", "install the same versions")
@@ -147,13 +147,13 @@ def check_shared(job: Mapping[str, Any]) -> None:
                           f"{seen.parent}.", SHARED)  # fmt: skip
 
 
-def meeting_of(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
+def rendezvous_store(job: Mapping[str, Any]) -> tuple[Callable[[], Any], bool]:
     """Return what opens the store of a training's group, and whether all processes are on this machine."""
-    launch = launched()
+    launch = current_launch()
     if launch is not None:
-        return partial(launch.store, f"vlatool-{job['token']}"), launch.here
+        return partial(launch.store, f"vlatool-{job['token']}"), launch.on_one_machine
     store = require("torch.distributed", "build").FileStore
-    return partial(store, str(Path(job["place"]) / MEETING), job["size"]), True
+    return partial(store, str(Path(job["place"]) / RENDEZVOUS_FILE), job["size"]), True
 
 
 class Follower:
@@ -180,7 +180,7 @@ class Follower:
 
     def __exit__(self, kind: object, *_exception: object) -> None:
         if kind is None:
-            self._ask(LEAVE, {})
+            self._send_call(LEAVE_CALL, {})
 
     def call(self, function: str, job: Mapping[str, Any], _tell: Any) -> None:
         """Call a function there, and wait for its end.
@@ -188,13 +188,13 @@ class Follower:
         Raises:
             VlatoolError: what it raised; SourceError when the process is gone.
         """
-        self._wait(f"answer/{self._ask(function, job)}")
+        self._wait(f"answer/{self._send_call(function, job)}")
 
     def end(self) -> None:
         """Wait for it no longer, from any thread."""
         self._lost.set()
 
-    def _ask(self, function: str, job: Mapping[str, Any]) -> int:
+    def _send_call(self, function: str, job: Mapping[str, Any]) -> int:
         number = int(self._store.add(f"{self._rank}/calls", 1))
         self._store.set(f"{self._rank}/call/{number}", json.dumps({"function": function, "job": dict(job)}))
         return number
@@ -204,12 +204,12 @@ class Follower:
         while not self._lost.is_set() and time.monotonic() < until:
             for key in (f"{self._rank}/failed", f"{self._rank}/{name}"):
                 if self._store.check([key]):
-                    self._believe(json.loads(self._store.get(key)))
+                    self._raise_error(json.loads(self._store.get(key)))
                     return
             time.sleep(POLL_S)
         raise SourceError(f"{self._who} of the training does not answer.", AGAIN)
 
-    def _believe(self, answer: Mapping[str, str] | None) -> None:
+    def _raise_error(self, answer: Mapping[str, str] | None) -> None:
         if answer is None:
             return
         found = getattr(errors, answer["error"], None)
@@ -219,7 +219,7 @@ class Follower:
 
 
 @contextlib.contextmanager
-def leading(launch: Launch) -> Iterator[None]:
+def lead(launch: Launch) -> Iterator[None]:
     """Run a command as the first process; the others may end after the block."""
     store = launch.store(host=True)
     try:
@@ -247,24 +247,24 @@ def follow(launch: Launch, about: str, ready: Callable[[], None]) -> None:
     try:
         ready()
     except VlatoolError as error:
-        store.set(f"{launch.rank}/failed", json.dumps(_told(error)))
+        store.set(f"{launch.rank}/failed", json.dumps(_error_record(error)))
         store.set(f"{launch.rank}/left", "1")
         raise
     store.set(f"{launch.rank}/here", "null")
     with contextlib.ExitStack() as opened:
         child: Apart | None = None
-        while call := _next(store, f"{launch.rank}/call/{(number := number + 1)}"):
-            if call["function"] == LEAVE:
+        while call := _next_call(store, f"{launch.rank}/call/{(number := number + 1)}"):
+            if call["function"] == LEAVE_CALL:
                 opened.close()
                 child = None
                 continue
             if child is None:
                 child = opened.enter_context(Apart(f"{about}, process {launch.rank + 1} of {launch.size}", PRELOAD))
-            store.set(f"{launch.rank}/answer/{number}", json.dumps(_answer(child, launch, call)))
+            store.set(f"{launch.rank}/answer/{number}", json.dumps(_run_call(child, launch, call)))
     store.set(f"{launch.rank}/left", "1")
 
 
-def _next(store: Any, name: str) -> Any:
+def _next_call(store: Any, name: str) -> Any:
     """Wait for a call; return None when the first process's command is over."""
     try:
         while True:
@@ -278,14 +278,14 @@ def _next(store: Any, name: str) -> Any:
         raise SourceError("The first process of the training is gone.", AGAIN) from error
 
 
-def _answer(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
+def _run_call(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
     """Call what is asked for; return None, or what came instead."""
     try:
         child.call(call["function"], {**call["job"], "rank": launch.rank}, lambda _what, _share: None)
     except VlatoolError as error:
-        return _told(error)
+        return _error_record(error)
     except (OSError, MemoryError) as error:
-        return _told(
+        return _error_record(
             SourceError(
                 f"{type(error).__name__}: {one_line(message_of(error))}",
                 "run it there with VLATOOL_DEBUG=1 to see where it was raised",
@@ -294,5 +294,5 @@ def _answer(child: Apart, launch: Launch, call: Mapping[str, Any]) -> Any:
     return None
 
 
-def _told(error: VlatoolError) -> dict[str, str]:
+def _error_record(error: VlatoolError) -> dict[str, str]:
     return {"error": type(error).__name__, "message": error.message, "fix": error.fix, "host": platform.node()}

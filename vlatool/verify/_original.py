@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vlatool.bundle.spec import PolicySpec, TensorSpec
 from vlatool.errors import SourceError, VlatoolError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import exits_caught, import_factory
+from vlatool.module.factory import import_factory, map_user_exceptions
 
 Array = NDArray[Any]
 
@@ -94,7 +94,7 @@ class Original:
     ) -> Any:
         where = f"{name}() of '{self._name}'" + (f", on observation {number}," if number >= 0 else "")
         try:
-            with exits_caught(where):
+            with map_user_exceptions(where):
                 return function(*(copy.deepcopy(dict(argument)) for argument in arguments), **more)
         except (VlatoolError, MemoryError):
             raise

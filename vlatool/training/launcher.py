@@ -10,16 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from vlatool.errors import RecipeError, SourceError, VlatoolError
-from vlatool.training.group import AGAIN, LOST, Group, joined_group
-from vlatool.training.torchrun import MEETING, PRELOAD, Follower, Launch, launched, meeting_of, shown
+from vlatool.training.group import AGAIN, LOST, Group, join_group
+from vlatool.training.torchrun import (
+    PRELOAD,
+    RENDEZVOUS_FILE,
+    Follower,
+    Launch,
+    current_launch,
+    rendezvous_store,
+    write_rendezvous,
+)
 from vlatool.user_code.children import Apart
 
-HERE = "vlatool.training.peer"
+MODULE = "vlatool.training.rank_process"
 GRACE_S = 5.0
 """Seconds in which a process that was lost says how, before the others are ended."""
 
 
-class Crew:
+class RankProcesses:
     """Other processes that take the same steps with other rows; none where the training is one process.
 
     Args:
@@ -72,7 +80,7 @@ class Crew:
 
     def _call(self, child: Apart | Follower, function: str, job: Mapping[str, Any]) -> None:
         try:
-            child.call(f"{HERE}:{function}", job, lambda _what, _share: None)
+            child.call(f"{MODULE}:{function}", job, lambda _what, _share: None)
         except BaseException as error:  # told in the first process; the others wait for this one in vain
             self._errors.append(error)
             child.end()
@@ -96,26 +104,28 @@ class Crew:
 
 
 @contextlib.contextmanager
-def crew_of(job: Mapping[str, Any], size: int, place: Path, about: str, device: str = "cpu") -> Iterator[Crew]:
+def launch_processes(
+    job: Mapping[str, Any], size: int, folder: Path, about: str, device: str = "cpu"
+) -> Iterator[RankProcesses]:
     """Yield the crew of a training, each process with the student loaded, and this one among them.
 
     Args:
         job: What ``peer.load`` needs to know.
         size: How many processes there are with this one.
-        place: Folder of the training.
+        folder: Folder of the training.
         about: Whose code they run.
         device: On which they train.
 
     Raises:
         RecipeError: when torchrun started another number of processes.
     """
-    launch = launched()
+    launch = current_launch()
     check_launch(launch, size)
     if size == 1:
-        yield Crew()
+        yield RankProcesses()
         return
-    (place / MEETING).unlink(missing_ok=True)
-    job = {**job, "place": str(place), "size": size, **(shown(place) if launch else {})}
+    (folder / RENDEZVOUS_FILE).unlink(missing_ok=True)
+    job = {**job, "place": str(folder), "size": size, **(write_rendezvous(folder) if launch else {})}
     with contextlib.ExitStack() as opened:
         threads = opened.enter_context(ThreadPoolExecutor(size - 1))
         others: list[Apart | Follower] = []
@@ -123,12 +133,12 @@ def crew_of(job: Mapping[str, Any], size: int, place: Path, about: str, device: 
             other = Follower(launch, rank) if launch else Apart(f"{about}, process {rank + 1} of {size}", PRELOAD)
             opened.enter_context(other)
             others.append(other)
-        crew = Crew(others, threads)
+        crew = RankProcesses(others, threads)
         with crew.calling("load", job):
             pass
-        store, here = meeting_of(job)
+        store, here = rendezvous_store(job)
         with crew.calling("join", job):
-            opened.enter_context(joined_group(store, crew.group, device, here=here))
+            opened.enter_context(join_group(store, crew.group, device, here=here))
         yield crew
 
 

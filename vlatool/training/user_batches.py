@@ -14,27 +14,27 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import DataError, RecipeError
 from vlatool.files.printable import message_of
-from vlatool.module.factory import yielded
+from vlatool.module.factory import iterate_function
 from vlatool.module.origin import origin_of
 from vlatool.runtime.observation import ObservationEncoder
 from vlatool.stage.base import Context
 from vlatool.training.frames import begins_file
-from vlatool.training.rounds import write_recorded
+from vlatool.training.rounds import write_observations
 from vlatool.user_code.children import call
 
-HERE = "vlatool.training.yielded"
-PRELOAD = ("numpy", HERE)
-ROWS = 8192
+MODULE = "vlatool.training.user_batches"
+PRELOAD = ("numpy", MODULE)
+DEFAULT_ROWS = 8192
 """That are taken where nobody says how many."""
 EPISODE = "episode"
 """Of a batch whose rows are steps: the number of the episode of each; where it changes, the policy is reset."""
-BATCH = 256
+MAX_BATCH_ROWS = 256
 """Rows of a batch that the function is asked for, at most."""
 GUIDE = "docs/guides/your-own-policy.md shows one"
-Tell = Callable[[str, float | None], None]
+Progress = Callable[[str, float | None], None]
 
 
-def rows_asked(asked: int | None, source: Bundle, plays: bool) -> int:
+def requested_rows(asked: int | None, source: Bundle, plays: bool) -> int:
     """Return how many rows are taken from the policy's function.
 
     Args:
@@ -52,10 +52,10 @@ def rows_asked(asked: int | None, source: Bundle, plays: bool) -> int:
             f"{source.manifest.name} names none.",
             "add training: train.py:batches to it, or leave --from-batches out",
         )
-    return (ROWS if named and not plays else 0) if asked is None else asked
+    return (DEFAULT_ROWS if named and not plays else 0) if asked is None else asked
 
 
-def write_yielded(
+def write_user_batches(
     source: Bundle, count: int, seed: int, target: Path, context: Context, *, along: bool = False
 ) -> None:
     """Write encoded observations that the policy's function yields, as a part of a round.
@@ -72,21 +72,21 @@ def write_yielded(
         DataError: when it yields something else than batches of observations, or too few.
         SourceError: when it fails, ends its process, or may not run.
     """
-    place = {"source": str(source.path.absolute()), "target": str(target.absolute())}
-    job = {**place, "count": count, "seed": seed, "along": along}
-    call(f"{HERE}:write", job, context.tell, origin_of(source).training.rpartition(":")[0], PRELOAD)
+    paths = {"source": str(source.path.absolute()), "target": str(target.absolute())}
+    job = {**paths, "count": count, "seed": seed, "along": along}
+    call(f"{MODULE}:write", job, context.tell, origin_of(source).training.rpartition(":")[0], PRELOAD)
 
 
-def write(job: Mapping[str, Any], tell: Tell) -> None:
-    """Do what ``write_yielded`` says, in this process."""
+def write(job: Mapping[str, Any], tell: Progress) -> None:
+    """Do what ``write_user_batches`` says, in this process."""
     source = Bundle.open(Path(job["source"]), verify=False)
     origin = origin_of(source)
     origin.check((".py",))
-    size = min(BATCH, job["count"])
-    batches = yielded(origin.training, origin.folder, {"seed": job["seed"], "size": size})
+    size = min(MAX_BATCH_ROWS, job["count"])
+    batches = iterate_function(origin.training, origin.folder, {"seed": job["seed"], "size": size})
     encode = ObservationEncoder(source.manifest.spec, source)
     rows = _Rows(batches, origin.training, encode, job["count"], size, tell, along=job["along"])
-    write_recorded(rows.encode, rows, Path(job["target"]))
+    write_observations(rows.encode, rows, Path(job["target"]))
     if job["along"]:
         np.save(begins_file(Path(job["target"])), np.diff(rows.episodes, prepend=rows.episodes[0] - 1) != 0)
 
@@ -111,7 +111,7 @@ class _Rows:
         encode: ObservationEncoder,
         count: int,
         size: int,
-        tell: Tell,
+        tell: Progress,
         *,
         along: bool,
     ) -> None:
@@ -154,35 +154,35 @@ class _Rows:
         except DataError as error:
             raise DataError(f"{self._row}: {error.message}", error.fix) from error
 
-    def _columns(self, place: str, batch: Any) -> dict[str, Any]:
+    def _columns(self, name: str, batch: Any) -> dict[str, Any]:
         """Return the inputs of a batch, each with a row for each observation."""
         takes = f"the policy takes {', '.join(self._encode.names)}."
         if EPISODE in self._names and isinstance(batch, Mapping) and EPISODE not in batch:
             raise DataError(
-                f"Batch {place} has no '{EPISODE}', and the policy keeps values from step to step: rows are steps of "
+                f"Batch {name} has no '{EPISODE}', and the policy keeps values from step to step: rows are steps of "
                 "episodes.",
                 f"yield the rows of an episode one after the other, each with the number of its episode: '{EPISODE}'",
             )
         if not isinstance(batch, Mapping):
             raise DataError(
-                f"Batch {place} is a {type(batch).__name__}; it must be a mapping of names to arrays: {takes}", GUIDE
+                f"Batch {name} is a {type(batch).__name__}; it must be a mapping of names to arrays: {takes}", GUIDE
             )
-        if missing := [name for name in self._names if name not in batch]:
+        if missing := [key for key in self._names if key not in batch]:
             has = ", ".join(map(str, batch)) or "nothing"
-            raise DataError(f"Batch {place} has no '{missing[0]}' (it has: {has}); {takes}", GUIDE)
-        columns = {name: _array(f"'{name}' in batch {place}", batch[name]) for name in self._names}
+            raise DataError(f"Batch {name} has no '{missing[0]}' (it has: {has}); {takes}", GUIDE)
+        columns = {key: _array(f"'{key}' in batch {name}", batch[key]) for key in self._names}
         if EPISODE in columns and (columns[EPISODE].ndim != 1 or columns[EPISODE].dtype.kind not in "iu"):
             got = f"{columns[EPISODE].dtype} {list(columns[EPISODE].shape)}"
-            raise DataError(f"'{EPISODE}' in batch {place} is {got}; wanted a whole number for each row.", GUIDE)
-        rows = {name: len(column) for name, column in columns.items()}
+            raise DataError(f"'{EPISODE}' in batch {name} is {got}; wanted a whole number for each row.", GUIDE)
+        rows = {key: len(column) for key, column in columns.items()}
         if len(set(rows.values())) > 1:
-            told = ", ".join(f"{name} {count}" for name, count in rows.items())
+            sizes = ", ".join(f"{key} {count}" for key, count in rows.items())
             raise DataError(
-                f"Batch {place} has different numbers of rows: {told}.", "each input needs a row an observation"
+                f"Batch {name} has different numbers of rows: {sizes}.", "each input needs a row an observation"
             )
         if not 1 <= (count := next(iter(rows.values()))) <= self._size:
             raise DataError(
-                f"Batch {place} has {count} rows; allowed: 1 to {self._size}, the 'size' that it was asked for.",
+                f"Batch {name} has {count} rows; allowed: 1 to {self._size}, the 'size' that it was asked for.",
                 "yield batches of 'size' rows or fewer, and none that is empty",
             )
         return columns

@@ -11,21 +11,21 @@ import numpy as np
 from vlatool import registry
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import RecipeError, SourceError, require
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.module.feeds import recorded_inputs
 from vlatool.training.device import device_in_use
-from vlatool.training.lesson import Lesson
 from vlatool.training.matching import Pair, Stack, pairs_of
+from vlatool.training.objective import Objective
 from vlatool.training.rounds import NOISE, tensors
-from vlatool.training.taps import Form, Place, Taps
+from vlatool.training.taps import BlockName, Form, Taps
 from vlatool.training.teacher import Teacher
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-ALONG = "(hints)"
+PROJECTIONS = "(hints)"
 """Under what the projections are trained, beside the graphs of the student."""
-Forms = Mapping[Place, Form]
+Forms, Outputs = Mapping[BlockName, Form], Mapping[BlockName, "Tensor"]
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class Hint:
     left_out: Mapping[Stack, str]
     projections: nn.ModuleDict
 
-    def __call__(self, ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Any:
+    def __call__(self, ours: Outputs, theirs: Outputs) -> Any:
         """Return the mean over all pairs, times the weight."""
-        terms = [self._far(str(number), pair, ours, theirs) for number, pair in enumerate(self.pairs)]
+        terms = [self._distance(str(number), pair, ours, theirs) for number, pair in enumerate(self.pairs)]
         return self.weight * sum(terms) / len(terms)
 
-    def _far(self, number: str, pair: Pair, ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Tensor:
+    def _distance(self, number: str, pair: Pair, ours: Outputs, theirs: Outputs) -> Tensor:
         student, teacher = ours[pair.ours], theirs[pair.theirs]
         if number in self.projections:
             student = self.projections[number](student)
@@ -73,14 +73,14 @@ class Hint:
 
 
 def with_hints(
-    lesson: Lesson, weights: Mapping[str, float], student: BatchedProgram, source: Bundle, teacher: Teacher, seed: int
-) -> Lesson:
+    base: Objective, weights: Mapping[str, float], student: BatchedProgram, source: Bundle, teacher: Teacher, seed: int
+) -> Objective:
     """Return a lesson with further terms; the lesson itself where all weights are 0.
 
     The teacher runs on the same rows and the same noise as the student, in the same precision, without gradients.
 
     Args:
-        lesson: Its loss runs the student once on the rows that it is given.
+        base: Its loss runs the student once on the rows that it is given.
         weights: Name of a hint -> its weight in the loss.
         student: What the lesson runs.
         source: The student's bundle.
@@ -93,7 +93,7 @@ def with_hints(
     """
     asked = {name: weight for name, weight in weights.items() if weight}
     if not asked:
-        return lesson
+        return base
     pairs = pairs_of(student.modules, source, teacher)
     if not pairs:
         raise RecipeError(
@@ -108,29 +108,29 @@ def with_hints(
 
     def loss(rows: Mapping[str, Any]) -> Tensor:
         size = len(next(iter(rows.values())))
-        _look(rows, student, teacher.program)
+        _probe_batching(rows, student, teacher.program)
         with ours.open(size):
-            far = lesson.loss(rows)
+            far = base.loss(rows)
         with require("torch", "build").no_grad(), theirs.open(size):
             teacher.program.run(tensors(rows), tensors(rows, NOISE))
-        whole: Tensor = far + _sum(hints, ours.taken(size), theirs.taken(size))
+        whole: Tensor = far + _sum(hints, ours.take(size), theirs.take(size))
         return whole
 
     nn = require("torch", "build").nn
-    along = {ALONG: nn.ModuleDict({hint.name: hint.projections for hint in hints})}
-    name = ", ".join([lesson.name, *(f"{hint.weight:g} {hint.name}" for hint in hints)])
+    along = {PROJECTIONS: nn.ModuleDict({hint.name: hint.projections for hint in hints})}
+    name = ", ".join([base.name, *(f"{hint.weight:g} {hint.name}" for hint in hints)])
     about = {"hints": {hint.name: hint.about() for hint in hints}}
-    return replace(lesson, name=name, loss=loss, judged=lesson.loss, along=along, about={**lesson.about, **about})
+    return replace(base, name=name, loss=loss, judged=base.loss, along=along, about={**base.about, **about})
 
 
-def _look(rows: Mapping[str, Any], *programs: BatchedProgram) -> None:
+def _probe_batching(rows: Mapping[str, Any], *programs: BatchedProgram) -> None:
     """Let programs find out in float32 whether they take batches, before anything is kept of them."""
     with device_in_use().casting(enabled=False):
         for program in programs:
             program.look(tensors(rows), tensors(rows, NOISE))
 
 
-def _sum(hints: Sequence[Hint], ours: Mapping[Place, Tensor], theirs: Mapping[Place, Tensor]) -> Any:
+def _sum(hints: Sequence[Hint], ours: Outputs, theirs: Outputs) -> Any:
     with device_in_use().casting(enabled=False):
         return sum(hint(ours, theirs) for hint in hints)
 
@@ -138,7 +138,7 @@ def _sum(hints: Sequence[Hint], ours: Mapping[Place, Tensor], theirs: Mapping[Pl
 def _forms(ours: Taps, theirs: Taps, source: Bundle) -> tuple[Forms, Forms]:
     """Return what the blocks of student and teacher give for one observation."""
     inputs = recorded_inputs(source, 1)[0]
-    noise = drawn(ours.program.noise, 1, np.random.default_rng(0))
+    noise = draw_noise(ours.program.noise, 1, np.random.default_rng(0))
     return ours.forms(inputs, noise), theirs.forms(inputs, noise)
 
 
@@ -151,7 +151,7 @@ def _hint(name: str, weight: float, pairs: Sequence[Pair], forms: tuple[Forms, F
     kind = registry.load("hints", name)()
     left_out: dict[Stack, str] = {}
     for pair in pairs:
-        if why := _why_not(forms[0][pair.ours], forms[1][pair.theirs], kind):
+        if why := _mismatch(forms[0][pair.ours], forms[1][pair.theirs], kind):
             left_out.setdefault(pair.stack, why)
     compared = [pair for pair in pairs if pair.stack not in left_out]
     if not compared:
@@ -161,7 +161,7 @@ def _hint(name: str, weight: float, pairs: Sequence[Pair], forms: tuple[Forms, F
     return Hint(name, weight, kind, compared, left_out, projections)
 
 
-def _why_not(ours: Form, theirs: Form, kind: Any) -> str:
+def _mismatch(ours: Form, theirs: Form, kind: Any) -> str:
     """Return why what two blocks give cannot be compared, empty where it can."""
     if not ours.calls or not theirs.calls:
         return "its blocks are not called as modules"

@@ -41,9 +41,9 @@ class Resizer:
         name = getattr(node.target, "_opname", "")
         try:
             if name in SIZED and self._walk.shape(node) is not None:
-                self._stated(node, SIZED[name])
+                self._resize_list(node, SIZED[name])
             elif node in self._walk.counts:
-                self._counted(node)
+                self._resize_counts(node)
             elif name in SPLITS:
                 self._split(node)
         except (IndexError, KeyError, TypeError, ValueError) as error:
@@ -60,21 +60,21 @@ class Resizer:
             for leaf in factors.leaves(axis)
         )
 
-    def _stated(self, node: Any, place: int) -> None:
+    def _resize_list(self, node: Any, argument_index: int) -> None:
         """Change the sizes in a list; those that are given for a batch of any size too."""
-        if not isinstance(node.args[place], list | tuple):  # of another kind, such as view(dtype)
+        if not isinstance(node.args[argument_index], list | tuple):  # of another kind, such as view(dtype)
             return
-        shape, stated = self._walk.needed(node), list(node.args[place])
-        first = node.args[1] % (len(shape) - len(stated) + 1) if place == 2 else 0
+        shape, stated = self._walk.shape_of(node), list(node.args[argument_index])
+        first = node.args[1] % (len(shape) - len(stated) + 1) if argument_index == 2 else 0
         for number, size in enumerate(stated):
             axis = shape[number + first]
             if hasattr(size, "op"):
-                stated[number] = self._scaled(node, size, self.size(axis))
+                stated[number] = self._scale(node, size, self.size(axis))
             elif size > 0:
                 stated[number] = self.size(axis)
-        node.args = (*node.args[:place], stated, *node.args[place + 1 :])
+        node.args = (*node.args[:argument_index], stated, *node.args[argument_index + 1 :])
 
-    def _scaled(self, node: Any, size: Any, wanted: int) -> Any:
+    def _scale(self, node: Any, size: Any, wanted: int) -> Any:
         """Return a node for a size that is computed, such as that of the batch times the heads.
 
         What it depends on is the batch alone, in proportion: what it is in the trace says what is left of it.
@@ -91,17 +91,17 @@ class Resizer:
             made.meta = {**node.meta, "val": size.meta["val"]}
         return less
 
-    def _counted(self, node: Any) -> None:
+    def _resize_counts(self, node: Any) -> None:
         """Change numbers that an operator states, such as that of its groups, wherever they stand."""
         names = [stated.name for stated in node.target._schema.arguments]
-        for (name, place), axes in self._walk.counts[node].items():
+        for (name, index), axes in self._walk.counts[node].items():
             number, whole = (sum(size(axis) for axis in axes) for size in (self.size, self._walk.factors.size))
             if number == whole:
                 continue
             value: Any = number
-            if place is not None:
+            if index is not None:
                 value = list(argument(node, name))
-                value[place] = number
+                value[index] = number
             if (at := names.index(name)) < len(node.args):
                 node.args = (*node.args[:at], value, *node.args[at + 1 :])
             else:

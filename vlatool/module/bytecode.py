@@ -16,10 +16,10 @@ from vlatool.user_code import trust
 VARIABLE = "PYTHONPYCACHEPREFIX"
 _folders: dict[str, bool] = {}
 """Folder -> whether it was trusted before: then what it has links to is no more cached than what is in it."""
-_usual = SourceFileLoader.get_code
+_original_get_code = SourceFileLoader.get_code
 
 
-def compile_afresh(folder: Path) -> None:
+def ignore_bytecode(folder: Path) -> None:
     """Keep this process from reading ``__pycache__`` below a policy's folder, however its files are imported.
 
     Where the folder was trusted before, everything outside of Python's own directories is compiled afresh, and
@@ -35,20 +35,20 @@ def compile_afresh(folder: Path) -> None:
 def _get_code(self: SourceFileLoader, fullname: str) -> CodeType | None:
     path = self.get_filename(fullname)
     if not _is_own(os.path.dirname(path)):
-        return _usual(self, fullname)
+        return _original_get_code(self, fullname)
     return self.source_to_code(self.get_data(path), path)
 
 
-def _is_own(place: str) -> bool:
+def _is_own(directory: str) -> bool:
     """Return whether a directory holds a policy's code, and not what is installed."""
-    places = {os.path.abspath(place), os.path.realpath(place)}
-    inside = {remembered for folder, remembered in _folders.items() if any(_below(path, folder) for path in places)}
-    library = any(_below(os.path.realpath(place), folder) for folder in _libraries())
+    paths = {os.path.abspath(directory), os.path.realpath(directory)}
+    inside = {remembered for folder, remembered in _folders.items() if any(_is_below(path, folder) for path in paths)}
+    library = any(_is_below(os.path.realpath(directory), folder) for folder in _libraries())
     return True in inside or (not library and (bool(inside) or any(_folders.values())))
 
 
-def _below(place: str, folder: str) -> bool:
-    return place == folder or place.startswith(folder.rstrip(os.sep) + os.sep)
+def _is_below(directory: str, folder: str) -> bool:
+    return directory == folder or directory.startswith(folder.rstrip(os.sep) + os.sep)
 
 
 @lru_cache(1)

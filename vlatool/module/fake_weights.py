@@ -13,8 +13,8 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.bundle.program import ProgramStep
 from vlatool.data import observations_for
 from vlatool.errors import require
-from vlatool.module.edits import edited, loses_units, read_edits
-from vlatool.module.factory import exits_caught
+from vlatool.module.edits import apply_bundle, loses_units, read_edits
+from vlatool.module.factory import map_user_exceptions
 from vlatool.module.modules import modules_of, outputs_of
 from vlatool.module.origin import origin_of
 from vlatool.runtime.contract import sources_of
@@ -30,7 +30,7 @@ Visit = Callable[[ProgramStep, Any, list[Any], dict[str, Any]], contextlib.Abstr
 
 
 @dataclass(frozen=True)
-class Weightless:
+class MetaModules:
     """A policy's modules with every parameter on torch's meta device, changed by the edits of its bundle.
 
     Args:
@@ -43,13 +43,13 @@ class Weightless:
     made: dict[str, list[tuple[str, Any]]]
 
 
-def faked_modules(bundle: Bundle) -> dict[str, Any]:
+def meta_float32_modules(bundle: Bundle) -> dict[str, Any]:
     """Call the factory of a source bundle, every parameter on torch's meta device: graph name -> float32 module.
 
     Raises:
         SourceError: when code has changed, the factory fails, or a graph has no module.
     """
-    return as_float32(weightless(bundle).modules)
+    return as_float32(make_meta_modules(bundle).modules)
 
 
 def as_float32(modules: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,7 +57,7 @@ def as_float32(modules: Mapping[str, Any]) -> dict[str, Any]:
     return {name: module.float() for name, module in modules.items()}
 
 
-def weightless(bundle: Bundle) -> Weightless:
+def make_meta_modules(bundle: Bundle) -> MetaModules:
     """Call the factory of a source bundle so that no parameter takes memory, and change its structure as it says.
 
     Raises:
@@ -72,13 +72,13 @@ def weightless(bundle: Bundle) -> Weightless:
     modules = modules_of(product, (step.graph for step in bundle.manifest.program))
     kept = {} if traced else modules
     made = {graph: list(module.state_dict(keep_vars=True).items()) for graph, module in kept.items()}
-    modules = edited(modules, bundle, weights=False)
+    modules = apply_bundle(modules, bundle, weights=False)
     for module in modules.values() if traced else ():
         _to_meta(torch, module)
-    return Weightless(modules, made)
+    return MetaModules(modules, made)
 
 
-def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
+def run_on_fake_tensors(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
     """Run the program once with fake tensors; ``visit`` is called before each step's module, under the fake mode.
 
     Raises:
@@ -94,7 +94,7 @@ def run_faked(bundle: Bundle, modules: Mapping[str, Any], visit: Visit) -> None:
             given = [values[value] for value in step.feeds.values()]
             feeds = [torch.empty(shape, dtype=getattr(torch, str(dtype)), device="cpu") for shape, dtype in given]
             within = visit(step, module, feeds, real) or contextlib.nullcontext()
-            with within, torch.inference_mode(False), torch.no_grad(), exits_caught("the policy's forward()"):
+            with within, torch.inference_mode(False), torch.no_grad(), map_user_exceptions("the policy's forward()"):
                 outputs = outputs_of(module(*feeds), step)
         for value, tensor in zip(step.gives.values(), outputs, strict=True):
             values[value] = (tuple(tensor.shape), np.dtype(str(tensor.dtype).removeprefix("torch.")))
@@ -122,13 +122,13 @@ def _parameters_on_meta(torch: Any) -> Iterator[None]:
 
     kind.register_parameter = register
     try:
-        with _nothing_drawn(torch):
+        with _skip_drawing(torch):
             yield
     finally:
         kind.register_parameter = original
 
 
-def _nothing_drawn(torch: Any) -> Any:
+def _skip_drawing(torch: Any) -> Any:
     """Return a context in which random numbers are not drawn into tensors on the meta device: there is no place."""
     from torch.overrides import TorchFunctionMode
 
@@ -151,7 +151,7 @@ def _fake(module: Any) -> Iterator[dict[str, Any]]:
     from torch._subclasses import FakeTensorMode
 
     real = {name: buffer for name, buffer in module.named_buffers() if not buffer.is_meta}
-    places = [
+    fields = [
         (held, key, value)
         for part in module.modules()
         for held in (part._parameters, part._buffers)
@@ -161,14 +161,14 @@ def _fake(module: Any) -> Iterator[dict[str, Any]]:
     fakes: dict[int, Any] = {}
     mode = FakeTensorMode(allow_non_fake_inputs=True)
     try:
-        for held, key, value in places:
+        for held, key, value in fields:
             if id(value) not in fakes:
                 fakes[id(value)] = _like(mode, value)
             held[key] = fakes[id(value)]
         with mode:
             yield real
     finally:
-        for held, key, value in places:
+        for held, key, value in fields:
             held[key] = value
 
 

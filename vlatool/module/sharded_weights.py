@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from vlatool.bundle.bundle import Bundle
 from vlatool.errors import SourceError, require, suggest
 from vlatool.module.edits import BLOCKS, holds_weights, is_changed, read_edits
-from vlatool.module.faked import Weightless, weightless
+from vlatool.module.fake_weights import MetaModules, make_meta_modules
 from vlatool.module.origin import AGAIN, origin_of
 from vlatool.weights.shards import NUMPY_NAMES, Reader, StoredTensor, read_shards, reading, sampled_hash, shard_files
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PART_BYTES = 1 << 24
 """Bytes that are read of a tensor at once, in addition to the tensor itself."""
-Places = dict[str, dict[str, StoredTensor]]
+Locations = dict[str, dict[str, StoredTensor]]
 """Graph name -> name in ``state_dict()`` of the edited module -> where the bytes are."""
 
 
@@ -35,17 +35,17 @@ class StoredModules:
 
     Args:
         modules: Graph name -> module, parameters on torch's meta device.
-        places: Where each parameter and saved buffer is.
+        locations: Where each parameter and saved buffer is.
     """
 
     modules: dict[str, nn.Module]
-    places: Places
+    locations: Locations
 
     @property
     def nbytes(self) -> int:
         """Bytes of all weights in the shards, each counted once."""
-        tensors = {(each.file, each.offset): each.nbytes for named in self.places.values() for each in named.values()}
-        return sum(tensors.values())
+        tensors = (tensor for graph in self.locations.values() for tensor in graph.values())
+        return sum({(tensor.file, tensor.offset): tensor.nbytes for tensor in tensors}.values())
 
 
 def policy_weights(bundle: Bundle) -> tuple[Path, str]:
@@ -72,12 +72,12 @@ def stored_modules(bundle: Bundle) -> StoredModules:
     recorded = bundle.manifest.source.get("shards")
     if is_changed(bundle) and recorded != sampled_hash(shard_files(folder, pattern)):
         raise SourceError(f"The weights in {folder} have changed since {bundle.path} was made.", AGAIN)
-    made = weightless(bundle)
-    places = {graph: _locate(graph, made, shards, folder / "policy.yaml") for graph in made.modules}
-    return StoredModules(made.modules, places)
+    made = make_meta_modules(bundle)
+    locations = {graph: _locate(graph, made, shards, folder / "policy.yaml") for graph in made.modules}
+    return StoredModules(made.modules, locations)
 
 
-def _locate(graph: str, made: Weightless, shards: Mapping[str, StoredTensor], file: Path) -> dict[str, StoredTensor]:
+def _locate(graph: str, made: MetaModules, shards: Mapping[str, StoredTensor], file: Path) -> dict[str, StoredTensor]:
     """Return where the bytes of every parameter and saved buffer are: name -> tensor.
 
     Raises:
@@ -86,7 +86,7 @@ def _locate(graph: str, made: Weightless, shards: Mapping[str, StoredTensor], fi
     names: dict[int, list[str]] = {}
     for name, value in made.made[graph]:
         names.setdefault(id(value), []).append(name)
-    places = {}
+    locations = {}
     for name, value in made.modules[graph].state_dict(keep_vars=True).items():
         known = names[id(value)]
         before = [name, *known] if name in known else known
@@ -103,8 +103,8 @@ def _locate(graph: str, made: Weightless, shards: Mapping[str, StoredTensor], fi
                 f"factory wants {list(value.shape)}.",
                 "check the factory's arguments in policy.yaml",
             )
-        places[name] = tensor
-    return places
+        locations[name] = tensor
+    return locations
 
 
 def read_tensor(reader: Reader, stored: StoredTensor, dtype: Any) -> Tensor:
@@ -126,14 +126,14 @@ def read_tensor(reader: Reader, stored: StoredTensor, dtype: Any) -> Tensor:
     return whole  # type: ignore[no-any-return]
 
 
-def filled(stored: StoredModules) -> dict[str, nn.Module]:
+def fill_modules(stored: StoredModules) -> dict[str, nn.Module]:
     """Read all weights into the modules, one tensor after the other."""
     _replace(stored, stored.modules, _read(_values(stored, stored.modules)))
     return stored.modules
 
 
 @contextlib.contextmanager
-def graph_filled(stored: StoredModules, graph: str) -> Iterator[None]:
+def graph_weights(stored: StoredModules, graph: str) -> Iterator[None]:
     """Within this, the module of one graph has its weights; afterwards it has none, as before."""
     weights = _read(_values(stored, (graph,)))
     _replace(stored, (graph,), weights)
@@ -175,11 +175,11 @@ def _values(stored: StoredModules, graphs: Iterable[str]) -> Iterator[tuple[Tens
         for name, value in stored.modules[graph].state_dict(keep_vars=True).items():
             if id(value) not in seen:
                 seen.add(id(value))
-                yield value, stored.places[graph][name]
+                yield value, stored.locations[graph][name]
 
 
 @contextlib.contextmanager
-def weights_read(stored: StoredModules) -> Iterator[None]:
+def weights_on_demand(stored: StoredModules) -> Iterator[None]:
     """Run modules within this: a function that is given a weight gets it from its shard, for that call alone."""
     torch = require("torch", "build")
     from torch.overrides import TorchFunctionMode
@@ -187,13 +187,13 @@ def weights_read(stored: StoredModules) -> Iterator[None]:
 
     with reading() as reader:
         values = list(_values(stored, stored.modules))
-        places = {id(value): tensor for value, tensor in values if value.is_meta}
+        locations = {id(value): tensor for value, tensor in values if value.is_meta}
         _read((value, tensor) for value, tensor in values if not value.is_meta)
 
         def load(value: Any) -> Any:
-            if id(value) not in places:
+            if id(value) not in locations:
                 return value
-            return read_tensor(reader, places[id(value)], value.dtype)
+            return read_tensor(reader, locations[id(value)], value.dtype)
 
         class Reading(TorchFunctionMode):
             def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

@@ -11,10 +11,10 @@ import numpy as np
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
-from vlatool.module.cut import RETRACE
-from vlatool.module.factory import exits_caught
+from vlatool.module.factory import map_user_exceptions
 from vlatool.module.failures import remedy_for
 from vlatool.module.modules import outputs_of
+from vlatool.module.unit_removal import RETRACE
 from vlatool.runtime.program import draw
 
 if TYPE_CHECKING:
@@ -110,38 +110,38 @@ class BatchedProgram:
         if size == 1 or self._batches:
             return run(inputs, others)
         rows = [run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(size)]
-        return _together(rows)
+        return _concatenate(rows)
 
     def look(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> None:
         """Find out with a first batch whether the modules take batches; where runs are changed, look before that."""
         if len(next(iter(inputs.values()))) > 1 and self._batches is None:
             self._batches = self._takes_batches(inputs, noise)
 
-    def together(self, size: int) -> bool:
+    def runs_at_once(self, size: int) -> bool:
         """Return whether a batch of that size runs at once, and not row by row; ``look`` at one before."""
         return size > 1 and bool(self._batches)
 
     def modules_for(self, size: int) -> dict[str, nn.Module]:
         """Return what runs for a batch of that size: graph name -> module, traced anew where it must be."""
-        return {graph: self._module(graph, size if self.together(size) else 1) for graph in self.modules}
+        return {graph: self._module(graph, size if self.runs_at_once(size) else 1) for graph in self.modules}
 
     def _takes_batches(self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor]) -> bool:
         """Say whether two rows together give what each gives alone; of what is kept, too, once it is not zero."""
         drawn = {name: value for name, value in noise.items() if name not in self.kept}
         with require("torch", "build").no_grad():
-            first = self._alone(inputs, drawn)
+            first = self._run_single_rows(inputs, drawn)
             again = {**drawn, **self.kept_of(first)}
-            wanted = [(drawn, first), *([(again, self._alone(inputs, again))] if self.kept else [])]
+            wanted = [(drawn, first), *([(again, self._run_single_rows(inputs, again))] if self.kept else [])]
             sizes = [len(kept["shape"]) for kept in self.kept.values()]
             for self._axis in range(max(sizes, default=1)):
                 if all(self._is_same(_rows(inputs, 0, 2), others, values) for others, values in wanted):
                     return True
         return False
 
-    def _alone(self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _run_single_rows(self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return what the first two rows give, each for itself."""
         rows = [self._run(_rows(inputs, row, row + 1), _rows(others, row, row + 1)) for row in range(2)]
-        return _together(rows)
+        return _concatenate(rows)
 
     def _is_same(
         self, inputs: Mapping[str, Tensor], others: Mapping[str, Tensor], wanted: Mapping[str, Tensor]
@@ -159,32 +159,32 @@ class BatchedProgram:
         self, inputs: Mapping[str, Tensor], noise: Mapping[str, Tensor], *, keeps_path: bool = False
     ) -> dict[str, Tensor]:
         size = len(next(iter(inputs.values())))
-        values = {**inputs, **noise, **self._fed(noise, size)}
+        values = {**inputs, **noise, **self._kept_inputs(noise, size)}
         for step in self.steps:
             carried = tuple(step.carry.values()) if keeps_path and step is self.loop else ()
             path = {name: [values[name]] for name in carried}
             for turn in range(step.repeat):
-                values |= self._scheduled(step, turn, values)
+                values |= self._schedule_values(step, turn, values)
                 values |= self._step(step, values)
                 for name, before in path.items():
                     before.append(values[name])
             values |= {PATH + name: require("torch", "build").stack(points, 1) for name, points in path.items()}
-        return values | {name: self._held(name, values[name], size) for name in self.kept}
+        return values | {name: self._kept_output(name, values[name], size) for name in self.kept}
 
     def _turn(self, inputs: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
         torch = require("torch", "build")
-        turns, values = start[TURN], {**inputs, **start, **self._fed(start, len(start[TURN]))}
+        turns, values = start[TURN], {**inputs, **start, **self._kept_inputs(start, len(start[TURN]))}
         for step in self.steps:
             if step is self.loop:
                 for name, numbers in step.schedule.items():
                     values[name] = torch.tensor(numbers, dtype=_dtype_of(numbers))[turns]
                 return values | self._step(step, values)
             for turn in range(step.repeat):
-                values |= self._scheduled(step, turn, values)
+                values |= self._schedule_values(step, turn, values)
                 values |= self._step(step, values)
         raise ValueError("the program has no loop")
 
-    def _fed(self, others: Mapping[str, Tensor], size: int) -> dict[str, Tensor]:
+    def _kept_inputs(self, others: Mapping[str, Tensor], size: int) -> dict[str, Tensor]:
         """Return what is kept as modules take it; as it is after ``reset`` where it is not given."""
         torch, fed = require("torch", "build"), dict[str, Any]()
         for name, kept in self.kept.items():
@@ -194,7 +194,7 @@ class BatchedProgram:
             fed[name] = value.squeeze(axis + 1).movedim(0, axis) if size > 1 else value[0]
         return fed
 
-    def _held(self, name: str, value: Tensor, size: int) -> Tensor:
+    def _kept_output(self, name: str, value: Tensor, size: int) -> Tensor:
         """Return what a module gave for a kept value, with the batch before its shape.
 
         Raises:
@@ -226,7 +226,7 @@ class BatchedProgram:
             )
         return next((axis for axis in ones if axis >= self._axis), ones[-1])
 
-    def _scheduled(self, step: ProgramStep, turn: int, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _schedule_values(self, step: ProgramStep, turn: int, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the numbers of one turn for each row."""
         torch, size = require("torch", "build"), len(next(iter(values.values())))
         return {name: torch.full((size,), numbers[turn], dtype=_dtype_of(numbers))
@@ -257,7 +257,7 @@ def _dtype_of(numbers: Sequence[float]) -> Any:
     return torch.int64 if all(isinstance(number, int) for number in numbers) else torch.float32
 
 
-def _together(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+def _concatenate(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """Put single rows behind each other, whatever their dtype: autocast refuses float16 on a processor."""
     torch = require("torch", "build")
     with torch.autocast("cpu", enabled=False):
@@ -276,7 +276,7 @@ def run_module(module: nn.Module, step: ProgramStep, arguments: list[Tensor]) ->
     """
     torch = require("torch", "build")
     try:
-        with exits_caught("the policy's forward()"):
+        with map_user_exceptions("the policy's forward()"):
             result = module(*arguments)
     except SourceError:
         raise
@@ -308,7 +308,7 @@ def _remedy_of_casting(error: Exception) -> str:
     return "train in float32: --precision float32" if cast and about else ""
 
 
-def drawn(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.Generator) -> dict[str, Tensor]:
+def draw_noise(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.Generator) -> dict[str, Tensor]:
     """Draw a batch of what a program draws.
 
     Args:
@@ -323,7 +323,7 @@ def drawn(noise: Mapping[str, Mapping[str, Any]], size: int, random: np.random.G
     }
 
 
-def no_gradient(fix: str) -> SourceError:
+def no_gradient_error(fix: str) -> SourceError:
     """Return the error of a policy whose action does not depend on its weights."""
     return SourceError(
         "The policy gives its action without gradients: forward() detaches it, or runs under torch.no_grad().", fix

@@ -13,7 +13,14 @@ from tests.distill._trainings import Killed, distilled, killed_after, raise_kill
 from vlatool.bundle.bundle import Bundle
 from vlatool.training.device import CPU
 from vlatool.training.frames import Frames
-from vlatool.training.unseen import BEFORE, KEY, MOST, NEW, unseen_lines, unseen_losses
+from vlatool.training.generalization_gap import (
+    LOSS_KEY,
+    MAX_ROWS,
+    NEW_ROUND,
+    PREVIOUS_ROUND,
+    gap_lines,
+    last_round_losses,
+)
 
 PLAYS = {"steps": 12, "every": 4, "episodes": 4, "student_episodes": 2, "threads": 1}
 
@@ -39,10 +46,13 @@ def mean(rows: Any) -> torch.Tensor:
 def test_the_losses_are_means_over_the_last_two_rounds(tmp_path: Path):
     first, second, third = (np.arange(size, dtype=np.float32) + 100 * size for size in (5, 7, 11))
     frames = rounds_of(tmp_path, first, second, third)
-    assert frames.places(1).tolist() == list(range(5, 12))
-    losses = unseen_losses(frames, 2, mean, 4, CPU)
-    assert losses == {NEW: pytest.approx(float(third.mean())), BEFORE: pytest.approx(float(second.mean()))}
-    assert set(unseen_losses(rounds_of(tmp_path / "two", first, second), 1, mean, 4, CPU)) == {NEW}
+    assert frames.row_indices(1).tolist() == list(range(5, 12))
+    losses = last_round_losses(frames, 2, mean, 4, CPU)
+    assert losses == {
+        NEW_ROUND: pytest.approx(float(third.mean())),
+        PREVIOUS_ROUND: pytest.approx(float(second.mean())),
+    }
+    assert set(last_round_losses(rounds_of(tmp_path / "two", first, second), 1, mean, 4, CPU)) == {NEW_ROUND}
 
 
 def test_of_a_long_round_some_rows_are_looked_at(tmp_path: Path):
@@ -53,30 +63,30 @@ def test_of_a_long_round_some_rows_are_looked_at(tmp_path: Path):
         return mean(rows)
 
     frames = rounds_of(tmp_path, np.zeros(3, np.float32), np.arange(5000, dtype=np.float32))
-    unseen_losses(frames, 1, loss, 100, CPU)
-    assert len(seen) == MOST
+    last_round_losses(frames, 1, loss, 100, CPU)
+    assert len(seen) == MAX_ROWS
     assert (seen[0], seen[-1]) == (0, 4999)
 
 
 @pytest.mark.parametrize(("losses", "told"), [
     ([], ()),
-    ([{NEW: 1.0}], ()),
-    ([{NEW: 1.0}, {NEW: 0.1234567, BEFORE: 0.1}],
+    ([{NEW_ROUND: 1.0}], ()),
+    ([{NEW_ROUND: 1.0}, {NEW_ROUND: 0.1234567, PREVIOUS_ROUND: 0.1}],
      ("loss on new episodes of the student's 0.1235, on those before, trained on since, 0.1",)),
-    ([{NEW: 0.3, BEFORE: 0.1}, {NEW: 0.2, BEFORE: 0.1}],
+    ([{NEW_ROUND: 0.3, PREVIOUS_ROUND: 0.1}, {NEW_ROUND: 0.2, PREVIOUS_ROUND: 0.1}],
      ("loss on new episodes of the student's 0.2, on those before, trained on since, 0.1; more episodes may help "
       "(--episodes, --student-episodes)",)),
 ])  # fmt: skip
 def test_more_episodes_are_advised_where_new_ones_are_harder(losses: list[dict[str, float]], told: tuple[str, ...]):
-    assert unseen_lines([{}, *({KEY: each} for each in losses)]) == told
+    assert gap_lines([{}, *({LOSS_KEY: each} for each in losses)]) == told
 
 
 @pytest.mark.usefixtures("in_this_process")
 def test_rounds_of_a_training_tell_both_and_a_kill_changes_nothing(pruned_once: Bundle, tmp_path: Path):
     made = distilled(pruned_once, tmp_path / "out", **PLAYS)
     rounds = training_of(made)["rounds"]
-    assert [set(about.get(KEY, {})) for about in rounds] == [set(), {NEW}, {NEW, BEFORE}]
-    assert all(loss > 0 for about in rounds for loss in about.get(KEY, {}).values())
+    assert [set(about.get(LOSS_KEY, {})) for about in rounds] == [set(), {NEW_ROUND}, {NEW_ROUND, PREVIOUS_ROUND}]
+    assert all(loss > 0 for about in rounds for loss in about.get(LOSS_KEY, {}).values())
     assert "loss, not trained on" in (made.path / "reports/report.md").read_text()
     for step in (5, 9):
         with pytest.raises(Killed), killed_after(step, raise_killed):

@@ -12,7 +12,7 @@ import numpy as np
 from vlatool.bundle.bundle import Bundle
 from vlatool.data import Moment, calibration_recording, synthetic_observations
 from vlatool.errors import require
-from vlatool.module.batched import BatchedProgram
+from vlatool.module.batched_program import BatchedProgram
 from vlatool.module.feeds import recorded_inputs
 from vlatool.runtime.observation import ObservationEncoder
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Values = Mapping[str, "Tensor"]
-LEADING = 16
+LEADING_OBSERVATIONS = 16
 """Observations, the one that counts with them, through which gradients and changes of the policy pass."""
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from vlatool.errors import SourceError, require
 from vlatool.files.printable import message_of
-from vlatool.module._resized import Resizer
+from vlatool.module._resizer import Resizer
 from vlatool.module.axes import Walk
 from vlatool.module.edit import AGAIN
 from vlatool.module.factors import Shape
-from vlatool.module.factory import exits_caught
+from vlatool.module.factory import map_user_exceptions
 from vlatool.module.to_onnx import quiet_exporter
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ RETRACE = "vlatool_retrace"
 """Attribute of a cut module that takes one batch size alone: gives the same module for another size."""
 
 
-def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
+def trace_module(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
     """Trace a module with torch.export.
 
     Args:
@@ -42,7 +42,7 @@ def traced(module: nn.Module, feeds: Sequence[Tensor]) -> Any:
     named = _named_arguments(module, len(feeds))
     free = axes if named == len(feeds) else (*axes[:named], axes[named:])
     try:
-        with quiet_exporter(), torch.no_grad(), exits_caught("the policy's forward()"):
+        with quiet_exporter(), torch.no_grad(), map_user_exceptions("the policy's forward()"):
             return torch.export.export(module, tuple(feeds), dynamic_shapes=free, strict=False)
     except SourceError:
         raise
@@ -61,7 +61,7 @@ def _named_arguments(module: nn.Module, count: int) -> int:
     return min(count, kinds.index(several)) if several in kinds else count
 
 
-def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn.Module:
+def remove_units(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn.Module:
     """Return a module without the elements that edits do not keep.
 
     Args:
@@ -77,12 +77,12 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
     free = _for_any_batch(module, feeds, wanted)
     if free is not None:
         return free
-    kept = _cut(module, feeds, wanted)
+    kept = _remove_units(module, feeds, wanted)
     _run(kept, feeds)
 
     def retrace(size: int) -> nn.Module:
         again = getattr(module, RETRACE, None)  # of one that lost units before
-        other = _cut(again(size) if again else module, _repeated(feeds, size), wanted)
+        other = _remove_units(again(size) if again else module, _repeat(feeds, size), wanted)
         _share(kept, other)
         return other
 
@@ -93,12 +93,12 @@ def cut(module: nn.Module, feeds: Sequence[Tensor], edits: Iterable[Edit]) -> nn
 def _for_any_batch(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module | None:
     """Return the cut module for batches of any size, None where its code fixes the size."""
     torch = require("torch", "build")
-    calls = exits_caught("the policy's forward()")
+    calls = map_user_exceptions("the policy's forward()")
     with contextlib.suppress(Exception), torch.no_grad(), calls:  # the seam: a user's module raises what it likes
-        module(*_repeated(feeds, 2))
-        made = _cut(module, _repeated(feeds, 2), edits)
+        module(*_repeat(feeds, 2))
+        made = _remove_units(module, _repeat(feeds, 2), edits)
         for size in (1, 3):
-            made(*_repeated(feeds, size))
+            made(*_repeat(feeds, size))
         return made
     return None
 
@@ -118,14 +118,14 @@ def _run(module: nn.Module, feeds: Sequence[Tensor]) -> None:
         raise RuntimeError(f"what pruning left of the module cannot run: {type(error).__name__}: {reason}") from error
 
 
-def _repeated(feeds: Sequence[Tensor], size: int) -> list[Tensor]:
+def _repeat(feeds: Sequence[Tensor], size: int) -> list[Tensor]:
     return [feed.expand(size, *feed.shape[1:]).contiguous() if len(feed.shape) and len(feed) == 1 else feed
             for feed in feeds]  # fmt: skip
 
 
-def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module:
+def _remove_units(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> nn.Module:
     torch = require("torch", "build")
-    program = traced(module, feeds)
+    program = trace_module(module, feeds)
     walk = Walk(program)
     keep = {_leaf(walk, edit): edit.keep for edit in edits}
     resizer = Resizer(walk, keep)
@@ -139,7 +139,7 @@ def _cut(module: nn.Module, feeds: Sequence[Tensor], edits: Sequence[Edit]) -> n
         holder = state if name in state else program.constants
         value = holder[name]
         if id(value) not in cut_once:  # a tensor with several names stays one
-            cut_once[id(value)] = _indexed(walk, value, shape, keep)
+            cut_once[id(value)] = _index_weight(walk, value, shape, keep)
         holder[name] = cut_once[id(value)]
     with quiet_exporter():
         made: nn.Module = torch.export.unflatten(program)
@@ -164,7 +164,7 @@ def _leaf(walk: Walk, edit: Edit) -> int:
     return leaf
 
 
-def _indexed(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[int]]) -> Any:
+def _index_weight(walk: Walk, value: Any, shape: Shape, keep: Mapping[int, Sequence[int]]) -> Any:
     """Return a weight without what goes."""
     torch = require("torch", "build")
     smaller = value.detach()

@@ -18,9 +18,9 @@ from vlatool.bundle.bundle import Bundle
 from vlatool.data import observations_for
 from vlatool.errors import SourceError
 from vlatool.export.onnx import ExportOnnx
-from vlatool.module import stage, stored
+from vlatool.module import sharded_weights, stage
 from vlatool.module.edits import apply, holds_weights, read_edits
-from vlatool.module.stored import graph_filled, stored_modules, takes_shards, weights_read
+from vlatool.module.sharded_weights import graph_weights, stored_modules, takes_shards, weights_on_demand
 from vlatool.module.torch_policy import load_modules, policy_of, torch_policy, unedited_modules
 from vlatool.prune.depth import Depth
 from vlatool.prune.neurons import Neurons
@@ -71,7 +71,7 @@ class Held:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = self.most = self.reads = 0
-        original = stored.read_tensor
+        original = sharded_weights.read_tensor
 
         def read(*arguments):
             tensor = original(*arguments)
@@ -81,7 +81,7 @@ class Held:
             weakref.finalize(tensor, self.free, tensor.nbytes)
             return tensor
 
-        monkeypatch.setattr(stored, "read_tensor", read)
+        monkeypatch.setattr(sharded_weights, "read_tensor", read)
 
     def free(self, size: int) -> None:
         self.now -= size
@@ -103,7 +103,7 @@ def test_the_modules_are_those_that_are_made_in_memory(whole: Bundle, pruned: Bu
 
 def test_running_from_shards_is_running_in_memory(pruned: Bundle, monkeypatch):
     held, modules = Held(monkeypatch), stored_modules(pruned)
-    with weights_read(modules):
+    with weights_on_demand(modules):
         got = action(pruned, policy_of(pruned, modules.modules, 0))
     assert held.most == LARGEST
     assert modules.nbytes > 5 * LARGEST
@@ -114,7 +114,7 @@ def test_running_from_shards_is_running_in_memory(pruned: Bundle, monkeypatch):
 def test_what_is_exported_is_what_is_exported_from_memory(whole: Bundle, pruned: Bundle, tmp_path, monkeypatch):
     (tmp_path / "memory").mkdir()
     modules = apply(unedited_modules(whole), read_edits(pruned))
-    memory = stage.write_changed(whole, tmp_path / "memory", read_edits(pruned), modules, {"stage": "prune.depth"})
+    memory = stage.write_modules(whole, tmp_path / "memory", read_edits(pruned), modules, {"stage": "prune.depth"})
     assert holds_weights(memory)
     assert not takes_shards(memory)
     one = run_transform(ExportOnnx(samples=1), memory, tmp_path / "one", Context())
@@ -141,7 +141,7 @@ def test_weight_only_quantizes_the_blocks_that_are_kept(whole: Bundle, pruned: B
 
 def test_a_choice_without_a_run_reads_nothing(whole: Bundle, tmp_path, monkeypatch):
     held = Held(monkeypatch)
-    monkeypatch.setattr(stage, "RUN_BELOW", 0)
+    monkeypatch.setattr(stage, "MAX_RUN_BYTES", 0)
     (tmp_path / "even").mkdir()
     made = Depth(rank="even", include=STACK).run(whole, tmp_path / "even", Context())
     assert [edit.keep for edit in read_edits(made)] == [(0, 2, 4)]
@@ -244,7 +244,7 @@ def test_modules_of_every_kind_run_from_shards(odd: Bundle, tmp_path):
     made = run_transform(run, odd, tmp_path / "out", Context())
     assert [edit.keep for edit in read_edits(made)] == [(0, 3), (0, 3)]
     modules = stored_modules(made)
-    with weights_read(modules):
+    with weights_on_demand(modules):
         got = action(made, policy_of(made, modules.modules, 0))
     wanted = load_modules(made)["main"]
     assert wanted.table.weight is wanted.out.weight
@@ -252,14 +252,14 @@ def test_modules_of_every_kind_run_from_shards(odd: Bundle, tmp_path):
     stored_state = load_file(tmp_path / "odd/model.safetensors")
     assert torch.equal(wanted.norm.running_mean, stored_state["norm.running_mean"])
     assert torch.equal(wanted.second[1].weight, stored_state["second.3.weight"])
-    with graph_filled(modules, "main"):
+    with graph_weights(modules, "main"):
         assert torch.equal(modules.modules["main"].mixing, stored_state["mixing"])
     assert modules.modules["main"].mixing.is_meta
 
 
 @pytest.mark.parametrize("limit", [0, 1 << 30])
 def test_stacks_that_go_together_must_be_cut_together(odd: Bundle, tmp_path, monkeypatch, limit):
-    monkeypatch.setattr(stage, "RUN_BELOW", limit)
+    monkeypatch.setattr(stage, "MAX_RUN_BYTES", limit)
     (tmp_path / "out").mkdir()
     with pytest.raises(SourceError, match="IndexError: list index out of range"):
         Depth(keep=(0, 1), include=("first",)).run(odd, tmp_path / "out", Context())
@@ -270,7 +270,7 @@ def test_a_stage_that_changes_weights_writes_them(pruned: Bundle, tmp_path):
         def change(self, modules, source, context):
             with torch.no_grad():
                 modules["main"].head.weight.zero_()
-            return stage.Changed()
+            return stage.ModuleChanges()
 
     made = Zeros().run(pruned, _new(tmp_path / "out"), Context())
     assert holds_weights(made)

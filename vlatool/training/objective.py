@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Lesson:
+class Objective:
     """What a student is trained to make small.
 
     Args:
@@ -52,12 +52,12 @@ class Lesson:
         return Frames(folder) if self.unroll is None else Sequences(folder, self.unroll)
 
     @property
-    def examined(self) -> Callable[[Mapping[str, Any]], Tensor]:
+    def validation(self) -> Callable[[Mapping[str, Any]], Tensor]:
         """What says how good the student is."""
         return self.judged or self.loss
 
     @property
-    def trained(self) -> dict[str, nn.Module]:
+    def trainable(self) -> dict[str, nn.Module]:
         """Everything that is trained."""
         return {**self.modules, **self.along}
 

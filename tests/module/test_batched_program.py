@@ -9,7 +9,7 @@ from torch import nn
 
 from vlatool.bundle.program import ProgramStep
 from vlatool.errors import SourceError
-from vlatool.module.batched import BatchedProgram, drawn
+from vlatool.module.batched_program import BatchedProgram, draw_noise
 from vlatool.module.torch_policy import TorchSession
 from vlatool.runtime.program import Program
 
@@ -45,7 +45,7 @@ def test_it_is_the_runtimes_program(alone: bool):
     batched = BatchedProgram(STEPS, modules)
     random = np.random.default_rng(0)
     x = random.standard_normal((4, 3)).astype(np.float32)
-    noise = drawn(batched.noise, 4, random)
+    noise = draw_noise(batched.noise, 4, random)
     ours = batched.run({"x": torch.from_numpy(x)}, noise)["next"]
     for row in range(4):
         sessions = {step.graph: TorchSession(modules[step.graph], step) for step in STEPS}
@@ -67,12 +67,12 @@ def test_a_module_that_fails_is_named():
 def test_noise_is_drawn_as_declared():
     wanted = {"a": {"shape": [1, 500]}, "b": {"shape": [1, 500], "distribution": "uniform"},
               "c": {"shape": [1, 2], "distribution": "zeros"}}  # fmt: skip
-    found = drawn(wanted, 4, np.random.default_rng(0))
+    found = draw_noise(wanted, 4, np.random.default_rng(0))
     assert found["a"].shape == (4, 500)
     assert float(found["a"].std()) == pytest.approx(1.0, abs=0.1)
     assert float(found["b"].abs().max()) <= 1.0
     assert not bool(found["c"].any())
-    again = drawn(wanted, 4, np.random.default_rng(0))
+    again = draw_noise(wanted, 4, np.random.default_rng(0))
     assert torch.equal(found["a"], again["a"])
 
 
@@ -112,7 +112,7 @@ def test_what_is_kept_goes_from_run_to_run_as_in_the_runtime(of_batch: str):
         values = batched.run({"x": torch.from_numpy(now)}, kept)
         kept = batched.kept_of(values)
         ours.append(values["y"])
-    assert batched.together(3) == (not of_batch)
+    assert batched.runs_at_once(3) == (not of_batch)
     assert kept["memory"].shape == (3, 2, 1, 4)
     assert kept["count"].reshape(-1).tolist() == [5, 5, 5]
     for row in range(3):

@@ -17,28 +17,28 @@ from vlatool.stage.build import build_stage
 from vlatool.training.batches import Batches, draw_of
 from vlatool.training.expert import Expert
 from vlatool.training.frames import Frames
-from vlatool.training.group import Group, joined_group
+from vlatool.training.group import Group, join_group
 from vlatool.training.held_out import HeldOut
-from vlatool.training.lesson import Lesson
 from vlatool.training.loop import Draw, Trainer
+from vlatool.training.objective import Objective
 from vlatool.training.stage import TrainingStage
-from vlatool.training.torchrun import check_shared, launched, meeting_of
+from vlatool.training.torchrun import check_shared, current_launch, rendezvous_store
 
-Tell = Callable[[str, float | None], None]
-PATIENCE_S = 120.0
+Progress = Callable[[str, float | None], None]
+FILE_SYSTEM_TIMEOUT_S = 120.0
 """Seconds in which a shared file system shows what the first process wrote."""
 
 
 @dataclass
-class Peer:
+class RankState:
     """What a process has loaded, and keeps between calls."""
 
     stage: TrainingStage
-    place: Path
+    folder: Path
     group: Group
     frames: Frames
     expert: Expert
-    lesson: Lesson
+    objective: Objective
     batches: Draw
     opened: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     trainer: Trainer | None = None
@@ -51,87 +51,88 @@ class Peer:
         return self.trainer
 
 
-_peer: list[Peer] = []
+_state: list[RankState] = []
 
 
-def load(job: Mapping[str, Any], _tell: Tell) -> None:
+def load(job: Mapping[str, Any], _tell: Progress) -> None:
     """Load the student; ``join`` follows."""
-    stage, place = build_stage(job["stage"], job["options"]), Path(job["place"])
+    stage, folder = build_stage(job["stage"], job["options"]), Path(job["place"])
     if not isinstance(stage, TrainingStage):
         raise RecipeError(f"The stage {job['stage']} trains nothing.", "name a stage that trains")
     check_shared(job)
     require("torch", "build").set_num_threads(job["threads"])
     source, opened = Bundle.open(Path(job["source"]), verify=False), contextlib.ExitStack()
-    group, frames, expert = Group(job["rank"], job["size"]), Frames(place), Expert(place)
-    teacher, lesson = stage.prepared(load_modules(source), source)
-    device, launch = stage.settings().device, launched()
+    group, frames, expert = Group(job["rank"], job["size"]), Frames(folder), Expert(folder)
+    teacher, objective = stage.prepare_objective(load_modules(source), source)
+    device, launch = stage.settings().device, current_launch()
     if device.name != "cpu":  # else nothing keeps the teacher, unless the lesson does
         device.choose(launch.local_rank if launch else job["rank"])
-        opened.enter_context(device.holding(lesson.trained, teacher.program.modules))
-    batches = Batches(lesson.loss, frames, stage.batch, stage.accumulate, group)
-    draw = draw_of(batches, stage.supervision().alpha, lesson.expert, expert.frames)
-    _peer[:] = [Peer(stage, place, group, frames, expert, lesson, draw, opened)]
+        opened.enter_context(device.holding(objective.trainable, teacher.program.modules))
+    batches = Batches(objective.loss, frames, stage.batch, stage.accumulate, group)
+    draw = draw_of(batches, stage.supervision().alpha, objective.expert, expert.frames)
+    _state[:] = [RankState(stage, folder, group, frames, expert, objective, draw, opened)]
 
 
-def join(job: Mapping[str, Any], _tell: Tell) -> None:
+def join(job: Mapping[str, Any], _tell: Progress) -> None:
     """Become one of the group, whose other processes do so at the same time."""
-    peer, (store, here) = _peer[0], meeting_of(job)
-    peer.opened.enter_context(joined_group(store, peer.group, peer.stage.settings().device.name, here=here))
+    peer, (store, here) = _state[0], rendezvous_store(job)
+    peer.opened.enter_context(join_group(store, peer.group, peer.stage.settings().device.name, here=here))
 
 
-def prepare(_job: Mapping[str, Any], _tell: Tell) -> None:
+def prepare(_job: Mapping[str, Any], _tell: Progress) -> None:
     """Find out where the training stands, and hold a part of the weights where that is asked for."""
-    peer = _peer[0]
-    peer.trainer = Trainer(peer.lesson.trained, peer.stage.settings(), peer.place, peer.group, peer.lesson.constraint)
+    peer, objective = _state[0], _state[0].objective
+    settings = peer.stage.settings()
+    peer.trainer = Trainer(objective.trainable, settings, peer.folder, peer.group, objective.constraint)
 
 
-def train(job: Mapping[str, Any], _tell: Tell) -> None:
+def train(job: Mapping[str, Any], _tell: Progress) -> None:
     """Take the steps until one of them, on so many rounds of rows."""
-    peer = _peer[0]
+    peer = _state[0]
     for number in range(peer.frames.count, job["rounds"]):
-        if _seen(peer.frames, number):
+        if _wait_for_round(peer.frames, number):
             peer.frames.read(number)
     peer.expert.read()
     if len(peer.frames) != job["rows"]:
         raise DataError(
             f"The first process trains on {job['rows']} rows, process {peer.group.rank + 1} sees {len(peer.frames)} "
-            f"of them in {peer.place}.",
+            f"of them in {peer.folder}.",
             "let all processes see the same folder (VLATOOL_CACHE)",
         )
-    peer.training.look(partial(peer.lesson.look, peer.frames, peer.expert.frames))
+    peer.training.look(partial(peer.objective.look, peer.frames, peer.expert.frames))
     peer.training.train(job["until"], peer.batches, lambda _step, _loss: None)
     peer.training.save()
 
 
-def _seen(frames: Frames, number: int) -> bool:
+def _wait_for_round(frames: Frames, number: int) -> bool:
     """Wait until a round is seen that the first process has written; say whether it is."""
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + FILE_SYSTEM_TIMEOUT_S
     while not frames.has(number) and time.monotonic() < end:
         time.sleep(0.1)
     return frames.has(number)
 
 
-def show(_job: Mapping[str, Any], _tell: Tell) -> None:
+def show(_job: Mapping[str, Any], _tell: Progress) -> None:
     """Give this process's part of the averaged weights, which are about to act."""
-    with _peer[0].training.averaged(), _peer[0].training.whole():
+    with _state[0].training.averaged_weights(), _state[0].training.whole():
         pass
 
 
-def examine(_job: Mapping[str, Any], _tell: Tell) -> None:
+def examine(_job: Mapping[str, Any], _tell: Progress) -> None:
     """Compute the held-out loss, as the first process does."""
-    peer, held_out = _peer[0], HeldOut(_peer[0].place)
+    peer, held_out = _state[0], HeldOut(_state[0].folder)
     held_out.read()
-    with peer.training.averaged():
-        terms = peer.stage.supervision().alpha, peer.lesson.examined, peer.lesson.expert
-        held_out.mixed(*terms, peer.stage.batch, peer.stage.settings().device)
+    with peer.training.averaged_weights():
+        terms = peer.stage.supervision().alpha, peer.objective.validation, peer.objective.expert
+        held_out.mixture_loss(*terms, peer.stage.batch, peer.stage.settings().device)
 
 
-def judge(job: Mapping[str, Any], _tell: Tell) -> None:
+def judge(job: Mapping[str, Any], _tell: Progress) -> None:
     """Remember how well the averaged weights did."""
-    _peer[0].training.judge(job["score"])
-    _peer[0].training.save()
+    _state[0].training.judge(job["score"])
+    _state[0].training.save()
 
 
-def finish(_job: Mapping[str, Any], _tell: Tell) -> None:
+def finish(_job: Mapping[str, Any], _tell: Progress) -> None:
     """Give this process's part of the result."""
-    _peer[0].training.finish()
+    _state[0].training.finish()
